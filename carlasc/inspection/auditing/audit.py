@@ -208,7 +208,7 @@ def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> I
 def _actors_of(one: MatchedGrids, first: int, last: int, run: Run, notes: list[str]) -> MovingActors:
     """Return what moves near some frames of a recording: by its fields, and if it has none by free space."""
     if layout.POSES not in one.scans.documents():
-        notes.append(f"{one.path}: the scans have no poses: what moves, and drift, cannot be told")
+        notes.append(f"{one.pair}: the scans have no poses.txt: what moves, and drift, cannot be told")
         return MovingActors()
     frames = one.scans.frames("points")
     far = frames[(frames < first - 2 * _REACH) | (frames > last + 2 * _REACH)].tolist()

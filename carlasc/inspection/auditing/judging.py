@@ -71,9 +71,10 @@ class _Judge:
         if self.stretches.stacked("returns") is None:
             yield self._say("false free", "undetermined", "the files do not tell free from unknown space")
         else:
-            what = "returns of these scans, which may have made the grids," if self.window is None else "returns of the frame's own scan"  # fmt: skip
-            advice, classes = "scans meet what the grids call free", self.one.scans.metadata.classes
-            yield self._by_class("returns", "false free", f"{what} are in free voxels", (_FREE, _FREE_OF_CLASS), classes, advice)  # fmt: skip
+            by = "scans that may have made the grids" if self.window is None else "the frame's own scan"
+            what, advice = f"returns of {by} are in voxels called free", "the grids call free what scans meet"
+            classes = self.one.scans.metadata.classes
+            yield self._by_class("returns", "false free", what, (_FREE, _FREE_OF_CLASS), classes, advice)
         if self.window is not None:
             yield self._held_out()
         what, advice = "occupied voxels are crossed by rays", "rays pass through what is not there"
@@ -99,8 +100,11 @@ class _Judge:
         shares = {i: share_of(of_class[:, row, 1], of_class[:, row, 0]) for row, i in enumerate(classes)}
         worst = sorted(((share, _name(table, i)) for i, share in shares.items() if share is not None), reverse=True)
         wrong = [f"{share[0]:.0%} of {name}" for share, name in worst if share[1] > limits[1]]
-        text = f"{_percent(found)} of {what}" if check == "false free" else f"{_percent(found)} of the {what}"
-        text += f"; {', '.join(wrong[:_SHOWN])}" if wrong else ""
+        text = f"{_percent(found)} of the {what}{': ' if wrong else ''}{', '.join(wrong[:_SHOWN])}"
+        if wrong and check == "false free":
+            advice = (
+                "thin things are lost where rays that pass beside them outvote their returns: use more scans or sensors"
+            )
         near = [
             f"from {low:.0f} m {n[1] / n[0]:.1%}"
             for low, n in zip(BANDS_M, total.sum(axis=(0, 2)), strict=False)
