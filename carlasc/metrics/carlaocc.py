@@ -26,7 +26,7 @@ class CarlaOccGrids(GridFrames):
         grid: name of the folder in `occupancy/`.
     """
 
-    classes, benchmark = CARLAOCC, "carlaocc"
+    classes = CARLAOCC
 
     def __init__(self, folder: Path, grid: str) -> None:
         self.path, self.location = sequence_name(folder), str(folder / "occupancy" / grid)

@@ -221,6 +221,7 @@ def test_the_command_prints_writes_a_page_and_tells_by_its_exit_code(town, tmp_p
     assert "http" not in text.replace("http-equiv", "")
 
 
+@pytest.mark.slow
 def test_one_sensor_loses_thin_things_and_the_finding_says_so(tmp_path):
     dense = Lidar(channels=48, points=40_000)
     capture = carlasc.captures.SimulatedCapture(

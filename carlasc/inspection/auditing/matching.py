@@ -26,6 +26,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.tables import remaps_between
 from carlasc.core.wording import count, first_names
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, reading
+from carlasc.metrics.carlaocc import CarlaOccGrids
 from carlasc.metrics.grids import GridFrames, SequenceGrid
 from carlasc.metrics.pairs import Place, TokenFrames, open_grids
 from carlasc.storage import as_source, layout
@@ -108,7 +109,7 @@ class MatchedGrids:
     @property
     def _many_to_one(self) -> bool:
         """Whether several classes of the grids are one of the scans, so that the labels of the grids are mapped and not those of the scans."""
-        return self.grids.benchmark == "carlaocc" and self.scans.metadata.classes != CARLAOCC
+        return isinstance(self.grids, CarlaOccGrids) and self.scans.metadata.classes != CARLAOCC
 
     @property
     def classes(self) -> ClassTable | None:
