@@ -181,10 +181,12 @@ def test_a_part_counts_and_the_last_part_judges(town, tmp_path):
 
 @pytest.mark.slow
 def test_a_frame_that_cannot_be_read_is_reported_and_the_rest_is_judged(town, tmp_path):
-    grids = planted.write_grids(town, tmp_path)
+    grids, scans = planted.write_grids(town, tmp_path / "grids"), tmp_path / "scans"
+    shutil.copytree(town, scans)
     next(grids.rglob("000005.label")).write_bytes(b"short")
-    result = carlasc.audit(grids, town)
-    assert [failure.frame for failure in result.failures] == ["5"]
+    next(scans.rglob("velodyne/000007.bin")).write_bytes(b"short")
+    result = carlasc.audit(grids, scans)
+    assert [failure.frame for failure in result.failures] == ["5", "7"]
     assert not result.ok
     assert result.faults == ()
 

@@ -156,10 +156,7 @@ class FrameCounter:
         """Return (N, 3) points of a scan inside the grid, about as many of each place; none if it cannot be read."""
         if frame not in self._spread:
             spec, edge = self.matched.spec, float(self.matched.spec.voxel_size[[0, 2]].min()) / 2
-            try:
-                scan = self._scan(frame) if self._row(frame) is not None else None
-            except CarlascError:  # which is reported where it is the frame's own scan
-                scan = None
+            scan = self._other(frame)
             some = np.empty((0, 3), np.float32) if scan is None else thin(scan.points[_are_returns(scan)], _SPREAD)
             points = self.matched.place(some[first_of_cells(np.floor(some / edge).astype(np.int64))])
             self._spread[frame] = thin(points[spec.flat_index(points) >= 0], self._most)
@@ -168,6 +165,13 @@ class FrameCounter:
         return self._spread[frame]
 
     # Scans at other times
+
+    def _other(self, frame: int) -> Scan | None:
+        """Return the scan of another frame; None without one, or if it cannot be read, which is reported where it is the frame's own."""
+        try:
+            return None if self._row(frame) is None else self._scan(frame)
+        except (CarlascError, OSError):
+            return None
 
     def _row(self, frame: int) -> int | None:
         frames = self.matched.trajectory[0]
@@ -183,14 +187,13 @@ class FrameCounter:
 
     def _standing(self, frame: int, other: int) -> NDArray[np.float64] | None:
         """Return (N, 3) returns of another scan inside the grid of a frame, of what cannot move as far as labels say; None without it."""
-        row, grid_T_world, poses = self._row(other), self._grid_T_world(frame), self.matched.trajectory[2]
-        if row is None or grid_T_world is None or poses is None:
+        grid_T_world, poses = self._grid_T_world(frame), self.matched.trajectory[2]
+        if grid_T_world is None or poses is None or (scan := self._other(other)) is None:
             return None
-        scan = self._scan(other)
         keep = _are_returns(scan)
         if scan.labels is not None:
             keep &= ~np.isin(scan.labels, sorted(self.matched.scans.metadata.classes.movable))
-        placed = transform_points(grid_T_world @ poses[row], thin(scan.points[keep], _SPREAD))
+        placed = transform_points(grid_T_world @ poses[self._row(other)], thin(scan.points[keep], _SPREAD))
         return placed[self.matched.spec.flat_index(placed) >= 0]
 
     def _add_held_out(self, sums: Sums, seen: _Frame) -> None:
