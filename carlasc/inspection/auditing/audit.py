@@ -42,17 +42,11 @@ _VERSION = 2  # of what is counted: it changes when the same input gives other s
 _STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and stretches of a sequence at least
 _DRAWN = 50  # stretches that are drawn at most: neighbours are drawn together where there are more
 _SHOWN = 4  # frames that are drawn
-_REACH, _BLOCK = (
-    30,
-    400,
-)  # frames before and after a stretch in which actors matter, and for which they are found together
-_SUMS, _WORST, _KEY = (
-    "audit",
-    "worst",
-    "key",
-)  # names of the files that keep sums, and of what is in them beside the sums
+_REACH = 30  # frames before and after a stretch in which actors matter
+_BLOCK = 400  # frames for which actors are found together
+_SUMS, _WORST, _KEY = "audit", "worst", "key"  # names of the files that keep sums, and of what else is in them
 
-Row = tuple[str, int, int, int]  # of the worst frames: path, frame of the grid, frame of the scan, wrong voxels
+_Row = tuple[str, int, int, int]  # of the worst frames: path, frame of the grid, frame of the scan, wrong voxels
 
 
 @dataclass(frozen=True)
@@ -224,13 +218,13 @@ def _actors_of(one: MatchedGrids, first: int, last: int, run: Run, notes: list[s
 
 def _count_all(
     stretches: list[_Stretch], run: Run, notes: list[str]
-) -> tuple[dict[str, list[Sums]], list[Row], list[AuditFailure], bool]:
+) -> tuple[dict[str, list[Sums]], list[_Row], list[AuditFailure], bool]:
     """Count the stretches of this part, and read those of others: sums by sequence, frames, failures, and whether all are there."""
     own = run.part.take(range(len(stretches)))
     steps = RunProgress(run.progress, 0, sum(len(stretch.frames) for stretch in stretches))
     lengths = Counter(stretch.counter.matched.path for stretch in stretches)
     sums = {path: [Sums() for _ in range(min(length, _DRAWN))] for path, length in lengths.items()}
-    worst, failures, is_whole, rows = list[Row](), list[AuditFailure](), True, Counter[str]()
+    worst, failures, is_whole, rows = list[_Row](), list[AuditFailure](), True, Counter[str]()
     tasks = _with_actors((stretches[index] for index in own), run, notes)
     with closing(run_all(_Stretch.count, tasks, run, lost=_fail)) as results:
         for index, stretch in enumerate(stretches):

@@ -102,14 +102,9 @@ class _Judge:
         wrong = [f"{share[0]:.0%} of {name}" for share, name in worst if share[1] > limits[1]]
         text = f"{_percent(found)} of the {what}{': ' if wrong else ''}{', '.join(wrong[:_SHOWN])}"
         if wrong and check == "false free":
-            advice = (
-                "thin things are lost where rays that pass beside them outvote their returns: use more scans or sensors"
-            )
-        near = [
-            f"from {low:.0f} m {n[1] / n[0]:.1%}"
-            for low, n in zip(BANDS_M, total.sum(axis=(0, 2)), strict=False)
-            if n[0]
-        ]
+            advice = "these are lost; thin things are outvoted by rays that pass beside them: use more scans or sensors"
+        bands = zip(BANDS_M, total.sum(axis=(0, 2)), strict=False)
+        near = [f"from {low:.0f} m {n[1] / n[0]:.1%}" for low, n in bands if n[0]]
         levels = [f"layer {k + 1} of {HEIGHTS} {n[1] / n[0]:.1%}" for k, n in enumerate(total.sum(axis=(0, 1))) if n[0]]
         named = [f"{name} {share[0]:.1%} ({share[1]:.1%} to {share[2]:.1%})" for share, name in worst]
         said = self._say(check, found[1] > limits[0] or bool(wrong), text, found, advice)
