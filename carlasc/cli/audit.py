@@ -24,7 +24,7 @@ def audit(
     grids: Annotated[
         str,
         place_argument(
-            "Grids: a data set, a sequence, the folder of a grid, or files of SemanticKITTI, SSCBench, Occ3D or OpenOccupancy.",
+            "Grids: a data set, a sequence, the folder of a grid, or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc.",
             "GRIDS",
         ),
     ],
@@ -54,19 +54,15 @@ def audit(
 
     Exit code 0: sound, as far as the drives tell. 1: a fault, or a frame that cannot be read.
     """
-    from carlasc.inspection import write_audit_page
-
     window = None if made_from is None else parse_window(made_from, "made_from")
     with work.spread("Auditing", usual=1) as run:
         result = carlasc.audit(grids, scans, grid=grid, made_from=window, frames=frames, keep=keep, run=run)
-    if html is not None and result.is_whole:
-        write_audit_page(result, html)
+    if html is not None and result.verdicts:
+        carlasc.inspection.write_audit_page(result, html)
     if as_json:
         print_json(result.to_dict())
     else:
         _print(result, everything=everything)
-        if html is not None and result.is_whole:
-            echo(f"page: {html}")
     for failure in result.failures:
         echo(f"{failure.where}: frame {failure.frame}: {failure.message}", err=True)
     if not result.ok:
@@ -77,17 +73,15 @@ def _print(result: AuditResult, *, everything: bool) -> None:
     out = console()
     for note in result.notes:
         echo(f"note: {note}", err=True)
-    if not result.is_whole:
+    if not result.verdicts:
         echo("counted; other parts have still to be counted before anything is judged")
         return
     for path, verdicts in result.verdicts.items():
-        out.print(
-            line(f"{path}: {result.frames[path]} frames, in the frame of {result.placed[path]}", "bold"), soft_wrap=True
-        )
+        title = f"{path}: {count(result.frames[path], 'frame')}, in the frame of {result.placed[path]}"
+        out.print(line(title, "bold"), soft_wrap=True)
         for verdict in verdicts:
             if everything or verdict.state != "sound":
-                advice = f": {verdict.advice}" if verdict.advice else ""
-                text = f"  {verdict.state:<12} {verdict.check}: {verdict.text}{advice}"
+                text = f"  {verdict.state:<12} {verdict.sentence}"
                 out.print(line(text, _COLORS[verdict.state]), soft_wrap=True)
     state = "sound, as far as the drives tell" if result.ok else f"not sound ({count(len(result.faults), 'fault')})"
     out.print(line(f"{result.grids}: {state}", "bold"), soft_wrap=True)

@@ -114,7 +114,7 @@ def evaluate(
         str,
         place_argument(
             "Predictions: a data set, a sequence, the folder of a grid, a folder of .label files, or files of SemanticKITTI,"
-            " SSCBench, Occ3D or OpenOccupancy."
+            " SSCBench, Occ3D, OpenOccupancy or CarlaOcc."
         ),
     ],
     truth: Annotated[str, place_argument("Ground truth: likewise.", "TRUTH")],

@@ -1,10 +1,12 @@
-"""Between right-handed axes (y to the left) and CarlaSC's left-handed ones (y to the right): y changes its sign.
+"""Between right-handed axes (y to the left) and CarlaSC's left-handed ones (y to the right): y changes its sign; and all choices of axes.
 
 Mirroring is its own inverse, so each function serves both directions.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -19,6 +21,18 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 _SIGNS = np.array([1, -1, 1, 1], np.float32)
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def choices_of_axes() -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Yield the 48 choices of axes: what the new x, y, z are in the old ones, such as "-y, x, z", and the (3, 3) matrix; the old ones first."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            yield (
+                ", ".join(f"{'-' if s < 0 else ''}{'xyz'[axis]}" for s, axis in zip(signs, order, strict=True)),
+                matrix,
+            )
 
 
 def mirror_points(points: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,12 +1,12 @@
-"""The classes of other benchmarks, and maps to them: Occ3D-nuScenes, OpenOccupancy and SSCBench. Scores and exports use the same maps."""
+"""The classes of other benchmarks, and maps to and from them: Occ3D-nuScenes, OpenOccupancy, SSCBench and CarlaOcc, for scores and exports."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from carlasc.core.classes import ClassTable
-from carlasc.core.tables import SEMANTICKITTI, SEMANTICKITTI19
+from carlasc.core.classes import ClassTable, Color, Remap
+from carlasc.core.tables import CARLA, SEMANTICKITTI, SEMANTICKITTI19, remap_named
 
 IGNORED = -1
 """Target of the classes that a benchmark leaves out: voxels of such a class do not count."""
@@ -69,3 +69,26 @@ SSCBENCH_TO_RAW: Mapping[int, int] = MappingProxyType(
     dict(enumerate((0, 10, 11, 15, 18, 20, 30, 40, 44, 48, 49, 50, 51, 70, 72, 80, 81, 52, 99)))
 )
 """Class of SSCBench -> raw id of SemanticKITTI in its files."""
+
+_TAGS: tuple[tuple[str, Color], ...] = (  # tags of CARLA 0.9.14 and later, in order, and CarlaOcc's Rock
+    ("None", (255, 255, 255)), ("Road", (128, 64, 128)), ("Sidewalk", (244, 35, 232)), ("Building", (70, 70, 70)),
+    ("Wall", (102, 102, 156)), ("Fence", (100, 40, 40)), ("Pole", (153, 153, 153)), ("TrafficLight", (250, 170, 30)),
+    ("TrafficSign", (220, 220, 0)), ("Vegetation", (107, 142, 35)), ("Terrain", (145, 170, 100)), ("Sky", (70, 130, 180)),
+    ("Pedestrian", (220, 20, 60)), ("Rider", (255, 0, 0)), ("Car", (0, 0, 142)), ("Truck", (0, 0, 70)), ("Bus", (0, 60, 100)),
+    ("Train", (0, 80, 100)), ("Motorcycle", (0, 0, 230)), ("Bicycle", (119, 11, 32)), ("Static", (110, 190, 160)),
+    ("Dynamic", (170, 120, 50)), ("Other", (55, 90, 80)), ("Water", (45, 60, 150)), ("RoadLine", (157, 234, 50)),
+    ("Ground", (81, 0, 81)), ("Bridge", (150, 100, 100)), ("RailTrack", (230, 150, 140)), ("GuardRail", (180, 165, 180)),
+    ("Rock", (180, 130, 70)),
+)  # fmt: skip
+CARLAOCC = ClassTable(
+    "carlaocc",
+    {tag: name for tag, (name, _) in enumerate(_TAGS)},
+    {tag: color for tag, (_, color) in enumerate(_TAGS)},
+    movable=frozenset(range(12, 20)),
+    deformable=frozenset({12}),
+    ground=frozenset({1, 2, 10, 23, 24, 25, 26, 27}),
+    geometry_only=22,  # Other
+)
+CARLAOCC_TO_CARLA = Remap(
+    "carlaocc_to_carla", CARLAOCC, CARLA, {**remap_named("carla0914_to_carla").mapping, 29: CARLA.id_of("Terrain")}
+)

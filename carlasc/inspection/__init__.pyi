@@ -1,5 +1,5 @@
 from .auditing.audit import audit as audit
-from .auditing.audit_page import write_audit_page as write_audit_page
+from .auditing.page import write_audit_page as write_audit_page
 from .auditing.verdicts import AuditFailure as AuditFailure
 from .auditing.verdicts import AuditResult as AuditResult
 from .auditing.verdicts import Verdict as Verdict

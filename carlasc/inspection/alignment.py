@@ -17,6 +17,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.axes import choices_of_axes
 from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.inspection.pose_quality import PoseQuality, measure_poses
 from carlasc.inspection.structure import VOXEL_M, occupancy, overlap
@@ -331,15 +332,10 @@ def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
         ("camera-frame poses with y mirrored", camera_advice, mirrored @ camera_of_kitti @ mirrored),
     ]
     known = [np.eye(3), *(matrix for _, _, matrix in mistakes)]
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            if not any(np.array_equal(matrix, other) for other in known):
-                names = ", ".join(
-                    f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for sign, axis in zip(signs, order, strict=True)
-                )
-                kind = "camera-frame poses" if order[2] == 0 else "poses in other axes than the scans"
-                advice = camera_advice if order[2] == 0 else "convert them to the axes of the scans"
-                mistakes.append((f"{kind} (x, y, z are {names})", advice, matrix))
+    for names, matrix in choices_of_axes():
+        if not any(np.array_equal(matrix, other) for other in known):
+            is_camera = names[-1] == "x"
+            kind = "camera-frame poses" if is_camera else "poses in other axes than the scans"
+            advice = camera_advice if is_camera else "convert them to the axes of the scans"
+            mistakes.append((f"{kind} (x, y, z are {names})", advice, matrix))
     return mistakes

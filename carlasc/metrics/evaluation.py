@@ -243,7 +243,7 @@ def evaluate(
 
     Args:
         source: the predictions: anything that `carlasc.open` opens, the folder of one grid, a folder of `.label` files, or files of
-            SemanticKITTI, SSCBench, Occ3D or OpenOccupancy.
+            SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc.
         truth: the ground truth, likewise.
         convention: the benchmark whose rules are used: a Convention or a name in `carlasc.metrics.CONVENTIONS`. It says which voxels
             count, in which classes, and how the mean is taken. "own" scores the unchanged classes of the data. None takes the benchmark

@@ -1,6 +1,6 @@
 """Opening the grids that are scored, also in the files of other benchmarks, and matching the predicted ones with the true ones.
 
-The other files are Occ3D's `.npz`, OpenOccupancy's `.npy`, and the folders of SemanticKITTI and SSCBench.
+The other files are Occ3D's and CarlaOcc's `.npz`, OpenOccupancy's `.npy`, and the folders of SemanticKITTI and SSCBench.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.tables import SEMANTICKITTI
 from carlasc.core.wording import first_names
 from carlasc.errors import FormatError, MissingDataError
+from carlasc.metrics.carlaocc import find_carlaocc
 from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
@@ -150,6 +151,7 @@ def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "t
             yield OpenOccupancyScene(scene, scene.name, files)
     if (folder / "gts").is_dir():
         yield from foreign_grids(folder / "gts", grid, role)
+    yield from find_carlaocc(folder, grid)
     # a folder without predictions is scored as it is: an export, or another ground truth
     names = (grid,) if grid else {"prediction": ("predictions", "voxels"), "truth": ("voxels",)}[role]
     for pattern, benchmark in (("sequences/*", "semantickitti"), ("data_2d_raw/*", "sscbench")):

@@ -16,38 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory, VoxelContent
-from carlasc.core.classes import ClassTable, Color, Remap
+from carlasc.core.benchmarks import CARLAOCC, CARLAOCC_TO_CARLA
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
-from carlasc.core.tables import CARLA, remap_named
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size
-from carlasc_converters.files import opening, read_arrays, read_text
+from carlasc.metrics.carlaocc import CARLAOCC_GRIDS, read_geometry, read_voxels, sequence_name
+from carlasc_converters.files import opening, read_text
 from carlasc_converters.ply import PlyVertices
 
-_TAGS: tuple[tuple[str, Color], ...] = (  # tags of CARLA 0.9.14 and later, in order, and CarlaOcc's Rock
-    ("None", (255, 255, 255)), ("Road", (128, 64, 128)), ("Sidewalk", (244, 35, 232)), ("Building", (70, 70, 70)),
-    ("Wall", (102, 102, 156)), ("Fence", (100, 40, 40)), ("Pole", (153, 153, 153)), ("TrafficLight", (250, 170, 30)),
-    ("TrafficSign", (220, 220, 0)), ("Vegetation", (107, 142, 35)), ("Terrain", (145, 170, 100)), ("Sky", (70, 130, 180)),
-    ("Pedestrian", (220, 20, 60)), ("Rider", (255, 0, 0)), ("Car", (0, 0, 142)), ("Truck", (0, 0, 70)), ("Bus", (0, 60, 100)),
-    ("Train", (0, 80, 100)), ("Motorcycle", (0, 0, 230)), ("Bicycle", (119, 11, 32)), ("Static", (110, 190, 160)),
-    ("Dynamic", (170, 120, 50)), ("Other", (55, 90, 80)), ("Water", (45, 60, 150)), ("RoadLine", (157, 234, 50)),
-    ("Ground", (81, 0, 81)), ("Bridge", (150, 100, 100)), ("RailTrack", (230, 150, 140)), ("GuardRail", (180, 165, 180)),
-    ("Rock", (180, 130, 70)),
-)  # fmt: skip
-CLASSES = ClassTable(
-    "carlaocc",
-    {tag: name for tag, (name, _) in enumerate(_TAGS)},
-    {tag: color for tag, (_, color) in enumerate(_TAGS)},
-    movable=frozenset(range(12, 20)),
-    deformable=frozenset({12}),
-    ground=frozenset({1, 2, 10, 23, 24, 25, 26, 27}),
-    geometry_only=22,  # Other
-)
 _PERIOD_S = 0.1  # the simulation runs at 10 frames per second, and the set's own loader gives frame i the time 0.1 i
-_GRIDS = ("vs_0_4_surround_view", "vs_0_2_forward_view", "vs_0_1")  # the first that exists is the default
 _SCANS, _PROPERTIES = "semantic_lidar", ("x", "y", "z", "ObjIdx", "ObjTag")
-_COPY = "the file is incomplete: copy it again"
 
 
 class CarlaOcc(Converter):
@@ -58,10 +36,8 @@ class CarlaOcc(Converter):
         "Y. Feng et al., An Instance-Centric Panoptic Occupancy Prediction Benchmark for Autonomous Driving, CVPR 2026"
     )
     simulated = True
-    classes = CLASSES
-    to_carla = Remap(
-        "carlaocc_to_carla", CLASSES, CARLA, {**remap_named("carla0914_to_carla").mapping, 29: CARLA.id_of("Terrain")}
-    )
+    classes = CARLAOCC
+    to_carla = CARLAOCC_TO_CARLA
     sensor = "simulated semantic LiDAR, 32 channels"
     min_range_m = 2.5
     max_range_m = 70.0
@@ -96,7 +72,7 @@ class CarlaOcc(Converter):
         existing = sorted({path.name for folder in folders for path in folder.glob("occupancy/*") if path.is_dir()})
         if self.voxels is not None and self.voxels not in existing:
             raise ArgumentError("voxels", expected=f"one of {', '.join(existing) or 'no grids'}", found=self.voxels)
-        grid = self.voxels or next((name for name in (*_GRIDS, *existing) if name in existing), None)
+        grid = self.voxels or next((name for name in (*CARLAOCC_GRIDS, *existing) if name in existing), None)
         return [CarlaOccRecording(folder, splits.get(folder.name, "Train"), grid) for folder in folders]
 
 
@@ -113,7 +89,7 @@ class CarlaOccRecording(Recording):
 
     def __init__(self, folder: Path, split: Split, grid: str | None) -> None:
         self.folder, self.split, self.location = folder, split, str(folder)
-        self.name = f"CARLAOCC_{folder.name.replace('_', '-')}"  # what follows the last "_" selects a sequence
+        self.name = sequence_name(folder)
         self.grid = grid if grid is not None and (folder / "occupancy" / grid).is_dir() else None
 
     @cached_property
@@ -133,7 +109,7 @@ class CarlaOccRecording(Recording):
     @cached_property
     def voxels(self) -> GridSpec | None:  # type: ignore[override]
         """The geometry that the first file of the grids gives; None if there are none."""
-        return next((_read_geometry(path) for path in self._grid_files.values()), None)
+        return next((read_geometry(path) for path in self._grid_files.values()), None)
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
         """Return poses/lidar.txt: the number of a frame and 16 numbers per line, right-handed.
@@ -199,7 +175,7 @@ class CarlaOccFrame(FrameHandle):
         for column, name in enumerate("xyz"):
             points[:, column] = rows[name]
         labels = rows["ObjTag"].astype(np.uint32)
-        moves = np.isin(labels, sorted(CLASSES.movable))
+        moves = np.isin(labels, sorted(CARLAOCC.movable))
         instances = np.where(moves, np.maximum(rows["ObjIdx"], 0), 0).astype(np.uint32)
         return (Cloud(points, labels, instances),)
 
@@ -211,34 +187,14 @@ class CarlaOccFrame(FrameHandle):
         """
         if self.grid is None:
             return None
-        spec, expected = _read_geometry(self.grid), _read_geometry(self.reference)
+        spec, expected = read_geometry(self.grid), read_geometry(self.reference)
         if spec != expected:
             raise FormatError(
                 self.grid,
                 expected=f"the geometry of {self.reference}: {expected} from {expected.lower}",
                 found=f"{spec} from {spec.lower}",
             )
-        voxels = ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)
-        rows = read_arrays(self.grid, {"occupancy": voxels}, _COPY)[0]
-        cells = rows[:, :3].astype(np.int64)
-        if outside := int((cells >= spec.size).any(axis=1).sum()):
-            raise FormatError(self.grid, expected=f"voxels inside of {spec}", found=f"{outside} voxels outside")
-        semantic = semantic_ids(rows[:, 3])
-        labels = np.zeros(spec.size, np.uint8)
-        known = np.ones(spec.size, np.bool_)
-        labels[tuple(cells.T)] = semantic
-        known[tuple(cells[semantic == 0].T)] = False  # occupied by something without a class
-        return VoxelContent(labels, known)
-
-
-def semantic_ids(codes: NDArray[np.unsignedinteger]) -> NDArray[np.uint8]:
-    """Return the classes of voxel labels, which also hold an instance.
-
-    The documentation says `1000 * class + instance`, the code that made the files `2048 * class + instance`. Most voxels belong to
-    classes whose instance is always 0, and no label above 0 is a multiple of both, so the labels tell which of the two they follow.
-    """
-    decimal, binary = int(np.count_nonzero(codes % 1000 == 0)), int(np.count_nonzero(codes % 2048 == 0))
-    return (codes // (1000 if decimal > binary else 2048)).astype(np.uint8)
+        return VoxelContent(*read_voxels(self.grid, spec))
 
 
 def _numbered(folder: Path, suffix: str) -> dict[int, Path]:
@@ -246,30 +202,6 @@ def _numbered(folder: Path, suffix: str) -> dict[int, Path]:
     paths = folder.iterdir() if folder.is_dir() else ()
     named = [path for path in paths if path.suffix == suffix and path.stem.isascii() and path.stem.isdigit()]
     return {int(path.stem): path for path in sorted(named, key=lambda path: int(path.stem))}
-
-
-def _read_geometry(path: str | Path) -> GridSpec:
-    """Return the geometry of a grid, in the frame of the LiDAR.
-
-    Raises:
-        FormatError: the file does not describe a grid.
-    """
-    few = ArrayFormat(NUMBERS, None, 3)
-    names = ("voxel_size", "voxel_origin", "volume_size")
-    step, origin, size = read_arrays(path, dict.fromkeys(names, few), _COPY)
-    try:
-        lower = np.asarray(origin, np.float64).reshape(3)
-        cells = np.asarray(size, np.int64).reshape(3)
-        x, y, z = cells.tolist()
-        check_size((x, y, z), np.dtype(np.uint8), str(path))
-        # Decimals first, because the origin is float32 and the size of a voxel is not: the bounds are then those of the documentation,
-        # in float32, as `--bounds` gives them.
-        low, up = np.round(lower, 4).tolist(), np.round(lower + cells * float(step), 4).tolist()
-        return GridSpec("cartesian", (x, y, z), (low[0], low[1], low[2]), (up[0], up[1], up[2])).with_bounds(low, up)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise FormatError(
-            path, expected="voxel_size, and 3 values of voxel_origin and volume_size", found=str(error)
-        ) from error
 
 
 def _read_splits(root: Path) -> dict[str, Split]:

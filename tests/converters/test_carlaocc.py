@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from carlasc_converters.carlaocc import CLASSES, CarlaOcc, CarlaOccRecording
+from carlasc_converters.carlaocc import CarlaOcc, CarlaOccRecording
 from converters.formats.carlaocc import (
     FIRST_ACTOR,
     SURROUND,
@@ -16,6 +16,7 @@ from converters.formats.carlaocc import (
 import carlasc
 from carlasc import FromScans
 from carlasc.converting import convert
+from carlasc.core.benchmarks import CARLAOCC
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
@@ -134,12 +135,12 @@ def test_sequences_have_names_and_the_splits_of_their_frames(tmp_path: Path) -> 
 
 
 def test_every_tag_has_the_class_of_carlasc_with_the_same_role() -> None:
-    assert len(CLASSES.names) == 30
+    assert len(CARLAOCC.names) == 30
     remap = CarlaOcc.to_carla
-    assert set(remap.mapping) == set(CLASSES.names)
+    assert set(remap.mapping) == set(CARLAOCC.names)
     for role in ("movable", "ground"):
-        assert {tag for tag in CLASSES.names if remap.mapping[tag] in getattr(CARLA, role)} - {29} == getattr(
-            CLASSES, role
+        assert {tag for tag in CARLAOCC.names if remap.mapping[tag] in getattr(CARLA, role)} - {29} == getattr(
+            CARLAOCC, role
         )
     for kind, name in (("car", "Vehicle"), ("van", "Vehicle"), ("pedestrian", "Pedestrian"), ("road", "Road")):
         assert CARLA.names[remap.mapping[int(TAG_OF_KIND[KINDS.index(kind)])]] == name

@@ -5,77 +5,102 @@ from __future__ import annotations
 import io
 import json
 import time
-import zipfile
-from collections.abc import Sequence
-from contextlib import closing
-from dataclasses import astuple, dataclass, field, replace
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from hashlib import sha256
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.core.frames import Frames
-from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError, CarlascError, MissingDataError
+from carlasc.errors import ArgumentError, CarlascError, reading
 from carlasc.groundtruth import FromScans
-from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.inspection.auditing.counting import Sums
-from carlasc.inspection.auditing.judging import Stretches, judge_geometry
+from carlasc.groundtruth.inputs import RunProgress
+from carlasc.inspection.auditing.counting import OCCUPIED, FrameCounter
+from carlasc.inspection.auditing.geometry import judge_geometry
+from carlasc.inspection.auditing.judging import judge_contents
 from carlasc.inspection.auditing.matching import MatchedGrids, match_grids
-from carlasc.inspection.auditing.shares import judge_shares
-from carlasc.inspection.auditing.tallies import LAGS, FrameCounter, FrameErrors
+from carlasc.inspection.auditing.sums import Stretches, Sums, add
 from carlasc.inspection.auditing.verdicts import AuditFailure, AuditResult, Verdict
 from carlasc.metrics.pairs import Place
-from carlasc.motion.options import MotionOptions, MotionSource
+from carlasc.motion.options import MotionOptions
 from carlasc.motion.tracks import MovingActors
-from carlasc.running.processes import run_all
+from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run
-from carlasc.storage import layout
-from carlasc.storage.files import write_output
+from carlasc.storage import FolderSink, layout
 from carlasc.storage.protocol import Source
+from carlasc.storage.resuming import derived_key, read_derived, scans_digest
+from carlasc.storage.sinks import SequenceWriter
 
-_VERSION = 1  # of what is counted: it changes when the same input gives other sums
-_STRETCH, _STRETCHES = 8, 10  # frames of a stretch at most, and stretches of a sequence at least
-_WORST = 4
+_VERSION = 2  # of what is counted: it changes when the same input gives other sums
+_STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and stretches of a sequence at least
+_DRAWN = 50  # stretches that are drawn at most: neighbours are drawn together where there are more
+_SHOWN = 4  # frames that are drawn
 _REACH = 30  # frames before and after a stretch in which actors matter
+_BLOCK = 400  # frames for which actors are found together
+_SUMS, _WORST, _KEY = "audit", "worst", "key"  # names of the files that keep sums, and of what else is in them
+
+_Row = tuple[str, int, int, int]  # of the worst frames: path, frame of the grid, frame of the scan, wrong voxels
 
 
 @dataclass(frozen=True)
 class _Stretch:
-    """Some frames of a sequence, to be counted in a worker, and the file that keeps their sums."""
+    """Some frames of a sequence, to be counted in a worker, and where their sums are kept."""
 
     counter: FrameCounter
     frames: tuple[tuple[int, int], ...]
-    kept: Path | None
+    writer: SequenceWriter | None
+    scans: str  # digest
+
+    def key(self) -> str:
+        """Return the name of the sums: those of other grids, other scans or another window have another one."""
+        one, content = self.counter.matched, sha256()
+        for number, _ in self.frames:
+            with suppress(CarlascError, OSError):  # which is reported when the frame is counted
+                labels, _, known = one.read(number)
+                content.update(labels.tobytes() + (b"" if known is None else np.packbits(known).tobytes()))
+        about = [_VERSION, one.path, str(one.spec), one.spec.lower, one.spec.upper, self.frames, self.counter.window]
+        return sha256(json.dumps([about, self.scans, content.hexdigest()], default=str).encode()).hexdigest()
+
+    def read(self) -> Sums | None:
+        """Return what another run or part kept."""
+        return None if self.writer is None else read_derived(self.writer, _SUMS, self.key(), _sums_from)
+
+    def count(self) -> tuple[Sums, list[AuditFailure]]:
+        """Count the frames, unless another run did; return which of them cannot be read."""
+        if (kept := self.read()) is not None:
+            return kept, []
+        counter, sums = replace(self.counter), Sums()  # whose caches end with it
+        worst, failures = [], []
+        for number, frame in self.frames:
+            try:
+                kinds = counter.add_frame(sums, number, frame)
+            except (CarlascError, OSError) as error:
+                failures.append(self.failure(number, str(error)))
+            else:
+                worst.append((number, frame, np.count_nonzero(kinds > OCCUPIED)))
+        sums[_WORST] = np.array(worst, np.int64).reshape(-1, 3)
+        if self.writer is not None and not failures:
+            buffer, key = io.BytesIO(), self.key()
+            np.savez_compressed(buffer, **{_KEY: np.array(key)}, **sums)  # type: ignore[arg-type]
+            self.writer.write_document(layout.derived(_SUMS, key), buffer.getvalue())
+        return sums, failures
+
+    def failure(self, number: int, message: str) -> AuditFailure:
+        """Return why a frame could not be counted."""
+        one = self.counter.matched
+        return AuditFailure(one.path, one.grids.name_of(number), message)
 
 
-@dataclass
-class _Counted:
-    """What was counted of a stretch."""
-
-    sums: Sums = field(default_factory=dict)
-    worst: list[tuple[int, int, int]] = field(
-        default_factory=list
-    )  # wrong voxels, frame of the grid, frame of the scan
-    failures: list[AuditFailure] = field(default_factory=list)
-
-    def to_bytes(self) -> bytes:
-        about = {"worst": self.worst, "failures": [astuple(failure) for failure in self.failures]}
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **{"about ": np.frombuffer(json.dumps(about).encode(), np.uint8)}, **self.sums)  # type: ignore[arg-type]
-        return buffer.getvalue()
-
-    @classmethod
-    def read(cls, file: Path) -> _Counted | None:
-        """Return what an earlier run kept; None if it kept nothing that can be read."""
-        try:
-            with np.load(file, allow_pickle=False) as arrays:
-                about = json.loads(arrays["about "].tobytes())
-                sums = {name: arrays[name] for name in arrays.files if name != "about "}
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-            return None
-        return cls(sums, [tuple(row) for row in about["worst"]], [AuditFailure(*row) for row in about["failures"]])
+def _sums_from(data: bytes, where: str) -> tuple[Sums, str]:
+    with reading(where, "sums of an audit"), np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files if name != _KEY}, str(arrays[_KEY])
 
 
 def audit(
@@ -93,7 +118,8 @@ def audit(
     Nothing is written but what `keep` asks for. A frame that cannot be read is listed in `failures`.
 
     Args:
-        grids: anything that `evaluate` reads: a data set, the folder of a grid, or files of SemanticKITTI, SSCBench, Occ3D or OpenOccupancy.
+        grids: anything that `evaluate` reads: a data set, the folder of a grid, or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or
+            CarlaOcc.
         scans: a recording in the layout: scans; poses, labels, and what shows motion are used where they exist.
         grid: name of the grids; None takes `evaluation`, or the only grid of a sequence.
         made_from: first and last scan, relative to its frame, that a grid was made from; None if that is not known.
@@ -114,133 +140,107 @@ def audit(
         raise ArgumentError("made_from", expected="a range that contains 0, such as -30:30", found=str(made_from))
     if run.part.count > 1 and keep is None:
         raise ArgumentError("part", expected="`keep`, the folder in which parts are put together", found="no folder")
-    matched, notes = match_grids(grids, scans, grid, frames), list[str]()
-    stretches: list[_Stretch] = []
-    for one in matched:
-        notes += [f"{one.path}: {note}" for note in one.notes]
-        actors = _actors(one, run, notes)
-        counter = FrameCounter(one, actors, made_from)
-        size = int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))
-        for first in range(0, len(one.frames), size):
-            part = one.frames[first : first + size]
-            near = actors.between(part[0][1] - _REACH, part[-1][1] + _REACH)
-            kept = None if keep is None else Path(keep) / f"{_key(counter, part)}.npz"
-            stretches.append(_Stretch(replace(counter, actors=near), part, kept))
-    own = run.part.take(stretches)
-    counted = _count_all(own, run)
-    if len(own) < len(stretches):
-        read = {id(s): c for s, c in zip(own, counted, strict=True)}
-        every = [read.get(id(s)) or (_Counted.read(s.kept) if s.kept else None) for s in stretches]
-        if any(c is None for c in every):
-            return replace(_result(grids, scans, matched, {}, notes, counted, start), is_whole=False, grid=grid)
-        counted = [c for c in every if c is not None]
-    verdicts, worst = {}, []
-    for one in matched:
-        parts = [c for s, c in zip(stretches, counted, strict=True) if s.counter.matched is one]
-        worst += [(one.path, number, frame, wrong) for c in parts for wrong, number, frame in c.worst]
-        whole = Stretches([c.sums for c in parts if c.sums])
-        if not whole.parts:
-            raise MissingDataError(
-                one.grids.location, expected="a frame that can be read", found=parts[0].failures[0].message
-            )
-        verdicts[one.path] = _judge(whole, one, made_from)
-    worst.sort(key=lambda row: -row[3])
-    return replace(_result(grids, scans, matched, verdicts, notes, counted, start), worst=tuple(worst[:_WORST]))
-
-
-def frame_errors(result: AuditResult, path: str, number: int, frame: int) -> tuple[GridSpec, str, FrameErrors]:
-    """Count a frame of an audit again: return the geometry and the handedness of its grid, and its wrong voxels."""
-    matched = next(one for one in match_grids(result.grids, result.scans, result.grid, None) if one.path == path)
-    counter = FrameCounter(matched, _actors(matched, Run(workers=1), []))
-    return matched.spec, matched.axes, counter.add_frame({}, number, frame)
-
-
-def _judge(whole: Stretches, one: MatchedGrids, window: tuple[int, int] | None) -> tuple[Verdict, ...]:
-    scans = [scan for _, scan in one.frames]
-    period = (one.seconds(scans[-1]) - one.seconds(scans[0])) / max(scans[-1] - scans[0], 1)
-    geometry = list(judge_geometry(whole, one.spec, one.path, period or layout.FRAME_PERIOD_S))
-    wrong = next((verdict for verdict in geometry if verdict.state == "fault"), None)
-    return (*geometry, *judge_shares(whole, one, window, "" if wrong is None else wrong.check))
-
-
-def _result(
-    grids: Place,
-    scans: Place,
-    matched: Sequence[MatchedGrids],
-    verdicts: dict[str, tuple[Verdict, ...]],
-    notes: list[str],
-    counted: Sequence[_Counted],
-    start: float,
-) -> AuditResult:
-    names = [place.location if isinstance(place, Source) else str(place) for place in (grids, scans)]
+    matched = match_grids(grids, scans, grid, frames)
+    notes = [f"{one.path}: {note}" for one in matched for note in one.notes]
+    stretches = list(chain.from_iterable(_stretches_of(one, made_from, keep) for one in matched))
+    with one_pool(run) as spread:
+        sums, worst, failures, is_whole = _count_all(stretches, spread, notes)
+    verdicts = {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in matched} if is_whole else {}
     return AuditResult(
-        names[0],
-        names[1],
+        grids.location if isinstance(grids, Source) else str(grids),
+        scans.location if isinstance(scans, Source) else str(scans),
         verdicts,
         {one.path: len(one.frames) for one in matched},
         {one.path: one.frame_name for one in matched},
-        notes=tuple(notes),
-        failures=tuple(failure for c in counted for failure in c.failures),
-        elapsed_s=time.perf_counter() - start,
+        tuple(sorted(worst, key=lambda row: -row[3])[:_SHOWN]),
+        tuple(dict.fromkeys(notes)),
+        tuple(failures),
+        grid,
+        time.perf_counter() - start,
     )
 
 
-def _count_all(stretches: Sequence[_Stretch], run: Run) -> list[_Counted]:
-    total, done, counted = sum(len(s.frames) for s in stretches), 0, []
-    with closing(run_all(_count_stretch, stretches, run, lost=_fail)) as results:
-        for stretch, result in zip(stretches, results, strict=True):
-            counted.append(result)
-            done += len(stretch.frames)
-            if run.progress is not None:
-                run.progress(done, total)
-    return counted
+def voxels_of(result: AuditResult, path: str, number: int, frame: int) -> tuple[MatchedGrids, NDArray[np.uint8]]:
+    """Count a frame of an audit again: return its grids, and what its voxels are (see `FrameCounter.add_frame`)."""
+    one = next(one for one in match_grids(result.grids, result.scans, result.grid, None) if one.path == path)
+    return one, FrameCounter(one, _actors_of(one, frame, frame, Run(workers=1), [])).add_frame({}, number, frame)
 
 
-def _count_stretch(stretch: _Stretch) -> _Counted:
-    """Count the frames of a stretch, in a worker, or return what an earlier run kept."""
-    if stretch.kept is not None and (kept := _Counted.read(stretch.kept)) is not None:
-        return kept
-    counted, counter = _Counted(), stretch.counter
-    for number, frame in stretch.frames:
-        try:
-            errors = counter.add_frame(counted.sums, number, frame)
-        except (CarlascError, OSError) as error:
-            failure = AuditFailure(counter.matched.path, counter.matched.grids.name_of(number), str(error))
-            counted.failures.append(failure)
-            continue
-        counted.worst.append((errors.count, number, frame))
-    counted.worst = sorted(counted.worst, reverse=True)[:_WORST]
-    if stretch.kept is not None and not counted.failures:
-        write_output(stretch.kept, counted.to_bytes())
-    return counted
+def _judge(sums: Stretches, one: MatchedGrids, window: tuple[int, int] | None) -> tuple[Verdict, ...]:
+    geometry = list(judge_geometry(sums, one))
+    wrong = next((verdict.check for verdict in geometry if verdict.state == "fault"), "")
+    return (*geometry, *judge_contents(sums, one, window, wrong))
 
 
-def _fail(stretch: _Stretch, message: str) -> _Counted:
-    """Return the result of a stretch that no worker could count."""
-    matched = stretch.counter.matched
-    rows = [AuditFailure(matched.path, matched.grids.name_of(number), message) for number, _ in stretch.frames]
-    return _Counted(failures=rows)
+def _stretches_of(one: MatchedGrids, window: tuple[int, int] | None, keep: str | Path | None) -> Iterator[_Stretch]:
+    """Yield the stretches of a sequence, without actors."""
+    writer, digest, scans = None, "", one.scans.frames("points")
+    if keep is not None:
+        writer, digest = FolderSink(keep).sequence(one.path), scans_digest(one.scans, scans)
+        digest = derived_key(one.scans, scans, digest) if layout.POSES in one.scans.documents() else digest
+    size = int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))
+    for first in range(0, len(one.frames), size):
+        yield _Stretch(FrameCounter(one, MovingActors(), window), one.frames[first : first + size], writer, digest)
 
 
-def _actors(one: MatchedGrids, run: Run, notes: list[str]) -> MovingActors:
-    """Return what moves in a recording: by its fields, and if it has none by free space."""
+def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> Iterator[_Stretch]:
+    """Yield stretches with what moves near them, which is found for some hundred frames at a time, so that memory does not grow."""
+    known, actors = ("", -1), MovingActors()
+    for stretch in stretches:
+        if stretch.read() is None:
+            one, (first, last) = stretch.counter.matched, (stretch.frames[0][1], stretch.frames[-1][1])
+            block = first // _BLOCK
+            if known != (one.path, block):
+                known = one.path, block
+                actors = _actors_of(one, block * _BLOCK, (block + 1) * _BLOCK + last - first, run, notes)
+            near = actors.between(first - _REACH, last + _REACH)
+            yield replace(stretch, counter=replace(stretch.counter, actors=near))
+        else:
+            yield stretch
+
+
+def _actors_of(one: MatchedGrids, first: int, last: int, run: Run, notes: list[str]) -> MovingActors:
+    """Return what moves near some frames of a recording: by its fields, and if it has none by free space."""
     if layout.POSES not in one.scans.documents():
-        notes.append(f"{one.path}: the scans have no poses: what moves, and drift, cannot be told")
+        notes.append(f"{one.pair}: the scans have no poses.txt: what moves, and drift, cannot be told")
         return MovingActors()
-    fields = one.scans.fields()
-    names: tuple[MotionSource, ...] = ("boxes", "instances", "flow")
-    usable = [name for name in names if name in fields and (name == "boxes" or "labels" in fields)]
-    motion = MotionOptions(usable[0] if usable else "evidence")
-    feed = ScanFeed(one.scans, FromScans(motion=motion))
+    frames = one.scans.frames("points")
+    far = frames[(frames < first - 2 * _REACH) | (frames > last + 2 * _REACH)].tolist()
+    scans, named = WithoutScans(one.scans, far), [n for n in ScanFeed(one.scans, FromScans()).motion if n != "evidence"]
+    # where fields name actors, evidence would only add doubtful ones
+    observe = FromScans(motion=MotionOptions(named[0] if named else "evidence"))  # type: ignore[arg-type]
     try:
-        return find_actors(feed, replace(run, progress=None))
+        return find_actors(ScanFeed(scans, observe), run)
     except CarlascError as error:
         notes.append(f"{one.path}: what moves cannot be told: {error}")
         return MovingActors()
 
 
-def _key(counter: FrameCounter, frames: Sequence[tuple[int, int]]) -> str:
-    """Return a name for the sums of some frames: that of another audit is different."""
-    one = counter.matched
-    about = [_VERSION, one.grids.location, one.scans.location, one.path, str(one.spec), one.spec.lower, one.spec.upper]
-    return sha256(json.dumps([*about, frames, counter.window, LAGS], default=str).encode()).hexdigest()[:24]
+def _count_all(
+    stretches: list[_Stretch], run: Run, notes: list[str]
+) -> tuple[dict[str, list[Sums]], list[_Row], list[AuditFailure], bool]:
+    """Count the stretches of this part, and read those of others: sums by sequence, frames, failures, and whether all are there."""
+    own = run.part.take(range(len(stretches)))
+    steps = RunProgress(run.progress, 0, sum(len(stretch.frames) for stretch in stretches))
+    lengths = Counter(stretch.counter.matched.path for stretch in stretches)
+    sums = {path: [Sums() for _ in range(min(length, _DRAWN))] for path, length in lengths.items()}
+    worst, failures, is_whole, rows = list[_Row](), list[AuditFailure](), True, Counter[str]()
+    tasks = _with_actors((stretches[index] for index in own), run, notes)
+    with closing(run_all(_Stretch.count, tasks, run, lost=_fail)) as results:
+        for index, stretch in enumerate(stretches):
+            found, failed = next(results) if index in own else (stretch.read(), [])
+            path, is_whole = stretch.counter.matched.path, is_whole and found is not None
+            steps(len(stretch.frames))
+            failures += failed
+            for name, counts in (found or {}).items():
+                if name == _WORST:
+                    worst += [(path, number, frame, wrong) for number, frame, wrong in counts.tolist()]
+                else:
+                    add(sums[path][rows[path] * len(sums[path]) // lengths[path]], name, counts)
+            rows[path] += 1
+    return sums, worst, failures, is_whole
+
+
+def _fail(stretch: _Stretch, message: str) -> tuple[Sums, list[AuditFailure]]:
+    """Return the result of a stretch that no worker could count."""
+    return {}, [stretch.failure(number, message) for number, _ in stretch.frames]

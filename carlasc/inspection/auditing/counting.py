@@ -1,142 +1,357 @@
-"""How the audit counts: compiled loops for points under many corrections and for the voxels that rays cross, and sums that add up."""
+"""What is counted of each frame: sums, which add up over stretches of frames, so that memory does not grow with the number of frames."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import Cells, find_voxel
-from carlasc.core.compiling import cached
-from carlasc.core.grids import GridSpec
+from carlasc.core.cells import first_of_cells
+from carlasc.core.geometry import invert, thin, transform_points
+from carlasc.core.scans import Scan
+from carlasc.errors import CarlascError
+from carlasc.inspection.auditing.hypotheses import Family, families
+from carlasc.inspection.auditing.loops import count_occupied_under, crossings, grown, voxels_at
+from carlasc.inspection.auditing.matching import MatchedGrids
+from carlasc.inspection.auditing.sums import Sums, add
+from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
+from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
 
-_SAMPLES = 4  # on a ray, per edge of the smallest voxel
-_INSIDE = 3  # samples of a ray that a voxel must hold to be crossed: rays that graze a corner do not count
+HEIGHTS = 4  # layers of equal height that shares are told by
+MAX_ID = 511  # larger ids of classes count as this one
+_SPREAD, _RAYS = 20_000, 8000  # points of a frame that are spread over places, and rays that are followed
+_LEAST, _MOST, _IN_ALL = 500, 2500, 250_000  # points that are left of these in a frame, and in all frames
+_TIMES = (*range(-20, -1, 2), *range(2, 21, 2))  # frames before and after, at which actors are looked for
+_APART = 20  # frames to the scans that show a drift
+_CLEAR_RAYS = 3  # so many rays cross a phantom
+_AROUND_M = 0.6  # by which an actor may be larger than its body, which was measured on a few sides
+_INSET_M = 0.2  # by which the path of an actor is narrower than its body, and above the ground
+_MEMBERS = 5  # voxels in which an actor must be seen
+_KEPT = 14  # scans that are kept for the frames that follow
+FREE, OCCUPIED, PHANTOM, TRAIL, FALSE_FREE = range(5)
+"""What a voxel is in what `add_frame` returns."""
 
 
-Sums = dict[str, NDArray[np.int64]]
-"""Counts by name, each an array of its own shape; missing ones are 0."""
+@dataclass
+class _Frame:
+    """A grid and its scan; `voxels` holds -1 for points outside of the grid, and for those that are no returns."""
 
-BANDS_M = (0.0, 10.0, 20.0, 30.0, np.inf)
-HEIGHTS = 4
+    number: int
+    scan: Scan
+    points: NDArray[np.float64]  # (N, 3) in the frame of the grid
+    voxels: NDArray[np.int64]
+    labels: NDArray[np.unsignedinteger]  # (X, Y, Z)
+    occupied: NDArray[np.bool_]
+    known: NDArray[np.bool_] | None
+    crossed: NDArray[np.int64]
+    turns: bool  # whether the grid is cylindrical
+
+    @cached_property
+    def hit(self) -> NDArray[np.bool_]:
+        """(X, Y, Z) which voxels hold a return."""
+        hit = np.zeros(self.occupied.size, np.bool_)
+        hit[self.voxels[self.voxels >= 0]] = True
+        return hit.reshape(self.occupied.shape)
+
+    @cached_property
+    def around(self) -> NDArray[np.bool_]:
+        """(X, Y, Z) these voxels and their neighbours."""
+        return grown(self.hit, self.turns)
 
 
-def count_occupied_under(
-    points: NDArray[np.float64], warps: NDArray[np.float64], spec: GridSpec, occupied: NDArray[np.bool_]
-) -> NDArray[np.int64]:
-    """Return (W,) how many points lie in occupied voxels under each correction.
+@dataclass
+class FrameCounter:
+    """Counts the frames of one sequence. It pickles into workers.
 
-    Args:
-        points: (N, 4) x, y, z in metres in the frame of the grid, and dt in seconds.
-        warps: (W, 3, 5) see `Family`.
-        spec: geometry of the grid.
-        occupied: (X, Y, Z).
+    Attributes:
+        matched: the grids and their scans.
+        actors: what moves in the recording.
+        window: first and last scan that the grids were made from, relative to the frame; None if that is not known.
     """
-    counted = np.zeros(len(warps), np.int64)
-    _count(points, np.ascontiguousarray(warps), Cells.of(spec), np.append(occupied.reshape(-1), False), counted)
-    return counted
+
+    matched: MatchedGrids
+    actors: MovingActors
+    window: tuple[int, int] | None = None
+    _scans: dict[int, Scan] = field(default_factory=dict, init=False, repr=False)
+    _spread: dict[int, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
+
+    def add_frame(self, sums: Sums, number: int, frame: int) -> NDArray[np.uint8]:
+        """Add a frame to sums, and return what its voxels are.
+
+        Args:
+            sums: of the frames before.
+            number: number of the grid.
+            frame: number of the scan.
+
+        Raises:
+            CarlascError: the grid or the scan cannot be read.
+        """
+        seen = self._read(number, frame)
+        add(sums, "frames", [1, seen.known is None])
+        add(sums, "fits", self._fits(seen))
+        self._add_classes(sums, seen)
+        self._add_unknown(sums, seen)
+        self._add_held_out(sums, seen)
+        kinds = np.where(seen.occupied, OCCUPIED, FREE).astype(np.uint8)
+        kinds[self._add_phantoms(sums, seen)] = PHANTOM
+        kinds[self._add_actors(sums, seen)] = TRAIL
+        kinds[self._add_false_free(sums, seen)] = FALSE_FREE
+        return kinds
+
+    def _read(self, number: int, frame: int) -> _Frame:
+        spec, scan = self.matched.spec, self._scan(frame)
+        labels, occupied, known = self.matched.read(number)
+        points, returns = self.matched.place(scan.points), _are_returns(scan)
+        rays = np.flatnonzero(returns)
+        rays = rays[:: max(1, len(rays) // _RAYS)]
+        begun = scan.others.get("origins", np.zeros_like(scan.points))[rays]
+        margin = 1.5 * float(np.linalg.norm(spec.voxel_size[[0, 0, 2]]))
+        crossed = crossings(self.matched.place(begun), points[rays], spec, margin)
+        voxels = np.where(returns, spec.flat_index(points), -1)
+        kinds = labels if labels.dtype == np.uint8 else np.minimum(labels, MAX_ID)
+        turns = spec.coordinates == "cylindrical"
+        return _Frame(frame, scan, points, voxels, kinds, occupied, known, crossed, turns)
+
+    def _scan(self, frame: int) -> Scan:
+        if frame not in self._scans:
+            self._scans[frame] = self.matched.scans.scan(frame, ("labels", "instances", "origins"))
+            while len(self._scans) > _KEPT:
+                self._scans.pop(next(iter(self._scans)))
+        return self._scans[frame]
+
+    # Geometry
+
+    @cached_property
+    def _families(self) -> list[Family]:
+        return families(self.matched.spec)
+
+    def _fits(self, seen: _Frame) -> NDArray[np.int64]:
+        """Return (H, 2) points, and those in occupied voxels, under all corrections of all families."""
+        drift, lag = self._families[-2:]
+        own = self._fit_points(seen.number)
+        counts = [self._fit(seen, family.warps, own) for family in self._families[:-2]]
+        drifts = np.zeros((len(drift.values), 2), np.int64)
+        for other in (seen.number - _APART, seen.number + _APART):
+            if (placed := self._standing(seen.number, other)) is not None:
+                later_s = self._second(other) - self._second(seen.number)
+                drifts += self._fit(seen, drift.warps, thin(placed, self._most), later_s)
+        lags = [self._fit(seen, lag.warps[:1], self._fit_points(seen.number + int(value))) for value in lag.values]
+        return np.concatenate([*counts, drifts, *lags])
+
+    def _fit(
+        self, seen: _Frame, warps: NDArray[np.float64], points: NDArray[np.float64], later_s: float = 0.0
+    ) -> NDArray[np.int64]:
+        timed = np.column_stack([points, np.full(len(points), later_s)])
+        found = count_occupied_under(timed, warps, self.matched.spec, seen.occupied)
+        return np.column_stack([np.full(len(found), len(points)), found])
+
+    @property
+    def _most(self) -> int:
+        return int(np.clip(_IN_ALL // len(self.matched.frames), _LEAST, _MOST))
+
+    def _fit_points(self, frame: int) -> NDArray[np.float64]:
+        """Return (N, 3) points of a scan inside the grid, about as many of each place; none if it cannot be read."""
+        if frame not in self._spread:
+            spec, edge = self.matched.spec, float(self.matched.spec.voxel_size[[0, 2]].min()) / 2
+            scan = self._other(frame)
+            some = np.empty((0, 3), np.float32) if scan is None else thin(scan.points[_are_returns(scan)], _SPREAD)
+            points = self.matched.place(some[first_of_cells(np.floor(some / edge).astype(np.int64))])
+            self._spread[frame] = thin(points[spec.flat_index(points) >= 0], self._most)
+            while len(self._spread) > _KEPT:
+                self._spread.pop(next(iter(self._spread)))
+        return self._spread[frame]
+
+    # Scans at other times
+
+    def _other(self, frame: int) -> Scan | None:
+        """Return the scan of another frame; None without one, or if it cannot be read, which is reported where it is the frame's own."""
+        try:
+            return None if self._row(frame) is None else self._scan(frame)
+        except (CarlascError, OSError):
+            return None
+
+    def _row(self, frame: int) -> int | None:
+        frames = self.matched.trajectory[0]
+        row = int(np.searchsorted(frames, frame))
+        return row if row < len(frames) and int(frames[row]) == frame else None
+
+    def _second(self, frame: int) -> float:
+        return float(self.matched.trajectory[1][self._row(frame)])
+
+    def _grid_T_world(self, frame: int) -> NDArray[np.float64] | None:
+        poses = self.matched.trajectory[2]
+        return None if poses is None else self.matched.grid_T_scan @ invert(poses[self._row(frame)])
+
+    def _standing(self, frame: int, other: int) -> NDArray[np.float64] | None:
+        """Return (N, 3) returns of another scan inside the grid of a frame, of what cannot move as far as labels say; None without it."""
+        grid_T_world, poses = self._grid_T_world(frame), self.matched.trajectory[2]
+        if grid_T_world is None or poses is None or (scan := self._other(other)) is None:
+            return None
+        keep = _are_returns(scan)
+        if scan.labels is not None:
+            keep &= ~np.isin(scan.labels, sorted(self.matched.scans.metadata.classes.movable))
+        placed = transform_points(grid_T_world @ poses[self._row(other)], thin(scan.points[keep], _SPREAD))
+        return placed[self.matched.spec.flat_index(placed) >= 0]
+
+    def _add_held_out(self, sums: Sums, seen: _Frame) -> None:
+        """Count the returns of the nearest scans that did not make the grid, of what stands still."""
+        if self.window is None or seen.known is None:
+            return
+        for other in (seen.number + self.window[0] - 1, seen.number + self.window[1] + 1):
+            if (placed := self._standing(seen.number, other)) is not None:
+                own = self.matched.spec.flat_index(placed)
+                known, occupied = (mask.reshape(-1)[own] for mask in (seen.known, seen.occupied))
+                add(sums, "held out", [known.sum(), (known & ~occupied).sum()])
+
+    # Contents
+
+    @cached_property
+    def ground(self) -> list[int]:
+        """The classes of the grids that are ground, as far as the scans' classes tell."""
+        lookup = self.matched.lookup
+        found = set() if lookup is None else {int(lookup[i]) for i in self.matched.scans.metadata.classes.ground}
+        return sorted(found - {-1, 0})
+
+    def _add_classes(self, sums: Sums, seen: _Frame) -> None:
+        """Count the classes of the grid, those of points by that of their voxels, and columns with ground at one and at two heights."""
+        lookup, labels = self.matched.lookup, seen.scan.labels
+        add(sums, "classes of grids", np.bincount(seen.labels[seen.occupied].astype(np.int64), minlength=MAX_ID + 1))
+        if len(self.ground):
+            ground = seen.occupied & np.isin(seen.labels, self.ground)
+            layers = (ground & ~np.pad(ground, ((0, 0), (0, 0), (1, 0)))[:, :, :-1]).sum(axis=2)
+            add(sums, "ground columns", [(layers > 0).sum(), (layers > 1).sum()])
+        if labels is not None and lookup is not None and self.matched.classes is not None:
+            size = min(self.matched.classes.num_channels, MAX_ID + 1)
+            own = lookup[np.minimum(labels.astype(np.int64), len(lookup) - 1)]
+            both = np.flatnonzero((seen.voxels >= 0) & (own >= 0) & (own < size))
+            both = both[seen.occupied.reshape(-1)[seen.voxels[both]]]
+            met = np.minimum(seen.labels.reshape(-1)[seen.voxels[both]].astype(np.int64), size)  # an id without a name
+            confusion = np.bincount(own[both] * (size + 1) + met, minlength=(size + 1) ** 2)
+            add(sums, "confusion", confusion.reshape(size + 1, size + 1))
+
+    def _add_false_free(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
+        """Count returns in free voxels by class, distance and height, and return these voxels."""
+        wrong = np.zeros(seen.occupied.shape, np.bool_)
+        if seen.known is not None:
+            own = np.flatnonzero(seen.voxels >= 0)
+            own = own[seen.known.reshape(-1)[seen.voxels[own]]]
+            free = ~seen.occupied.reshape(-1)[seen.voxels[own]]
+            wrong.reshape(-1)[seen.voxels[own[free]]] = True
+            kinds = np.zeros(len(own), np.int64) if seen.scan.labels is None else seen.scan.labels[own]
+            self._add_by(sums, "returns", kinds, seen.points[own], free)
+        return wrong
+
+    def _add_phantoms(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
+        """Count occupied voxels that rays cross, of those that rays see, by class, distance and height, and return the wrong ones."""
+        spec, clear = self.matched.spec, seen.crossed >= _CLEAR_RAYS
+        wrong = seen.occupied & clear & ~seen.around
+        # rays run along the ground for metres, and through its voxels
+        wrong &= ~(np.isin(seen.labels, self.ground) if len(self.ground) else lowest_of_columns(seen.occupied))
+        looked = np.nonzero(seen.occupied & (clear | seen.hit))
+        centers = spec.from_axes(np.array(spec.lower) + (np.column_stack(looked) + 0.5) * spec.voxel_size)
+        self._add_by(sums, "seen voxels", seen.labels[looked], centers, wrong[looked])
+        return wrong
+
+    def _add_by(
+        self,
+        sums: Sums,
+        name: str,
+        kinds: NDArray[np.integer],
+        points: NDArray[np.floating],
+        wrong: NDArray[np.bool_],
+    ) -> None:
+        """Add (K, B, H, 2) how many there are by class, band of distances and height, and how many of them are wrong."""
+        low, high = self.matched.spec.lower[2], self.matched.spec.upper[2]
+        heights = np.clip((points[:, 2] - low) / (high - low) * HEIGHTS, 0, HEIGHTS - 1).astype(np.int64)
+        bands = np.searchsorted(BANDS_M, np.linalg.norm(points, axis=1), side="right") - 1
+        shape = (MAX_ID + 1, len(BANDS_M) - 1, HEIGHTS, 2)
+        cells = np.ravel_multi_index(
+            (np.minimum(kinds.astype(np.int64), MAX_ID), bands, heights, wrong.astype(np.int64)), shape
+        )
+        counts = np.bincount(cells, minlength=int(np.prod(shape))).reshape(shape)
+        add(sums, name, np.stack([counts.sum(axis=3), counts[..., 1]], axis=3))
+
+    def _add_unknown(self, sums: Sums, seen: _Frame) -> None:
+        """Count unknown voxels by cause: they hold a return, a ray crosses them, they are outside of the view, or hidden."""
+        if seen.known is None or not seen.hit.any():
+            return
+        points = seen.points[seen.voxels >= 0]
+        angles = np.arctan2(points[:, 2] - self.matched.height_m, np.hypot(points[:, 0], points[:, 1]))
+        rest = ~seen.known & ~seen.hit & (seen.crossed == 0)
+        view = (self._elevations >= angles.min()) & (self._elevations <= angles.max())
+        crossed = ~seen.known & ~seen.hit & (seen.crossed > 0)
+        causes = [~seen.known & seen.hit, crossed, rest & ~view, rest & view]
+        add(sums, "unknown", [seen.known.size, *(cause.sum() for cause in causes)])
+
+    @cached_property
+    def _elevations(self) -> NDArray[np.float32]:
+        x, y, z = np.moveaxis(self.matched.spec.from_axes(self.matched.spec.centers().reshape(-1, 3)), -1, 0)
+        return np.arctan2(z - self.matched.height_m, np.hypot(x, y), dtype=np.float32).reshape(self.matched.spec.size)
+
+    # Actors
+
+    def _add_actors(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
+        """Count the voxels on the path of each actor and on itself, and those of them that are occupied; return occupied paths."""
+        trails, flat = np.zeros(seen.occupied.size, np.bool_), seen.occupied.reshape(-1)
+        for name, members in self._members(seen):
+            own = np.unique(seen.voxels[members])
+            own = own[own >= 0]
+            if len(own) >= _MEMBERS:
+                add(sums, f"actor {name}", [0, 0, len(own), flat[own].sum(), 1])
+        if (grid_T_world := self._grid_T_world(seen.number)) is not None:
+            wide = max(float(self.matched.spec.voxel_size[0]), _AROUND_M)
+            here = seen.around.reshape(-1).copy()  # what the scan meets is there, whoever it is
+            for track in self.actors.tracks.values():
+                here[self._body(track, [seen.number], grid_T_world, wide)] = True
+            for number, track in self.actors.tracks.items():
+                path = self._body(track, [seen.number + k for k in _TIMES], grid_T_world, -_INSET_M)
+                path = path[~here[path]]
+                if len(path):
+                    trails[path[flat[path]]] = True
+                    add(sums, f"actor {_name(number, track)}", [len(path), flat[path].sum(), 0, 0, 0])
+        return trails.reshape(seen.occupied.shape)
+
+    def _members(self, seen: _Frame) -> list[tuple[str, NDArray[np.integer]]]:
+        """Return the points of each actor in a scan: by its instances, or by what moves."""
+        ids, labels = seen.scan.instances, seen.scan.labels
+        if ids is None or not ids.any():
+            tracks = self.actors.tracks.items()
+            return [(_name(n, t), t.members[seen.number]) for n, t in tracks if seen.number in t.members]
+        order = np.argsort(ids, kind="stable")
+        found, starts = np.unique(ids[order], return_index=True)
+        movable = sorted(self.matched.scans.metadata.classes.movable)
+        parts = zip(found.tolist(), np.split(order, starts[1:]), strict=True)
+        return [(str(i), own) for i, own in parts if i and (labels is None or np.isin(labels[own], movable).all())]
+
+    def _body(
+        self, track: Track, frames: Sequence[int], grid_T_world: NDArray[np.float64], margin_m: float
+    ) -> NDArray[np.int64]:
+        """Return the voxels in the body of an actor at some frames, wider by a margin; above the ground where it is narrower."""
+        spec, poses = self.matched.spec, [pose for frame in frames if (pose := track.pose(frame)) is not None]
+        lower, upper = track.lower - margin_m, track.upper + margin_m
+        if margin_m < 0:
+            lower[2] = track.lower[2] + float(spec.voxel_size[2])
+        if not poses or (upper <= lower).any():
+            return np.empty(0, np.int64)
+        edge = float(spec.voxel_size[[0, 2]].min()) / 1.5
+        lines = [np.linspace(a, b, max(2, round((b - a) / edge) + 1)) for a, b in zip(lower, upper, strict=True)]
+        lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+        return voxels_at(lattice, grid_T_world @ np.stack(poses), spec)
 
 
-@cached
-def _count(points, warps, cells, occupied, counted):  # type: ignore[no-untyped-def]
-    for w in range(len(warps)):
-        m = warps[w]
-        for i in range(len(points)):
-            x, y, z, t = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
-            voxel = find_voxel(
-                m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] + m[0, 4] * t,
-                m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] + m[1, 4] * t,
-                m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] + m[2, 4] * t,
-                cells,
-            )
-            counted[w] += occupied[voxel]
-
-
-def crossings(
-    origins: NDArray[np.float64], points: NDArray[np.float64], spec: GridSpec, margin_m: float
-) -> NDArray[np.int64]:
-    """Return (X, Y, Z) how many rays cross each voxel, and not only a corner of it, before they come near their return.
-
-    Args:
-        origins: (N, 3) metres, where each ray begins, in the frame of the grid.
-        points: (N, 3) metres, the returns.
-        spec: geometry of the grid, Cartesian or cylindrical.
-        margin_m: rays end this far before their return.
-    """
-    crossed = np.zeros(spec.num_voxels + 1, np.int64)
-    edges = spec.voxel_size[[0, 2]] if spec.coordinates == "cylindrical" else spec.voxel_size
-    _cross(origins, points, Cells.of(spec), float(min(edges)) / _SAMPLES, margin_m, crossed)
-    return crossed[:-1].reshape(spec.size)
-
-
-@cached
-def _cross(origins, points, cells, step_m, margin_m, crossed):  # type: ignore[no-untyped-def]
-    outside = len(crossed) - 1
-    for i in range(len(points)):
-        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
-        dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-        length = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if not length > margin_m:
-            continue
-        dx, dy, dz = dx / length, dy / length, dz / length
-        last, inside = outside, 0
-        for k in range(int((length - margin_m) / step_m)):
-            t = (k + 0.5) * step_m
-            voxel = find_voxel(x + t * dx, y + t * dy, z + t * dz, cells)
-            inside = inside + 1 if voxel == last else 1
-            last = voxel
-            if inside == _INSIDE:
-                crossed[voxel] += 1
-
-
-def add(sums: Sums, name: str, values: object) -> None:
-    """Add counts to those of a name; the larger of two shapes is kept."""
-    new = np.asarray(values, np.int64)
-    old = sums.get(name)
-    if old is not None and old.shape != new.shape:
-        whole = np.zeros(np.maximum(old.shape, new.shape), np.int64)
-        whole[tuple(slice(n) for n in old.shape)] += old
-        old, new = whole, _padded(new, whole.shape)
-    sums[name] = new if old is None else old + new
-
-
-def _padded(values: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64]:
-    whole = np.zeros(shape, np.int64)
-    whole[tuple(slice(n) for n in values.shape)] = values
-    return whole
-
-
-def add_by(
-    sums: Sums,
-    name: str,
-    kinds: NDArray[np.int64],
-    bands: NDArray[np.int64],
-    heights: NDArray[np.int64],
-    wrong: NDArray[np.bool_],
-    counted: NDArray[np.bool_],
-) -> None:
-    """Add (K, B, H, 2): how many count, and how many of them are wrong."""
-    shape = (min(int(kinds.max(initial=0)), 511) + 1, len(BANDS_M) - 1, HEIGHTS)
-    cells = np.ravel_multi_index((np.minimum(kinds, shape[0] - 1), bands, heights), shape)
-    size = int(np.prod(shape))
-    parts = [np.bincount(cells[chosen], minlength=size).reshape(shape) for chosen in (counted, wrong & counted)]
-    add(sums, name, np.stack(parts, axis=-1))
-
-
-def grown(mask: NDArray[np.bool_], turns: bool) -> NDArray[np.bool_]:
-    """Return a mask grown by one voxel in each direction, around the full turn of a cylindrical grid."""
-    result = mask.copy()
-    for axis in range(3):
-        once = result.copy()
-        ahead, behind = ([slice(None)] * 3 for _ in range(2))
-        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
-        once[tuple(ahead)] |= result[tuple(behind)]
-        once[tuple(behind)] |= result[tuple(ahead)]
-        if turns and axis == 1:
-            once |= np.roll(result, 1, axis=1) | np.roll(result, -1, axis=1)
-        result = once
-    return result
-
-
-def are_returns(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+def _are_returns(scan: Scan) -> NDArray[np.bool_]:
     """Return (N,) which points are returns: some sensors write (0, 0, 0) where there is none."""
-    return (points[:, 0] != 0) | (points[:, 1] != 0) | (points[:, 2] != 0)
+    x, y, z = scan.points.T
+    return np.asarray((x != 0) | (y != 0) | (z != 0))
+
+
+def _name(number: int, track: Track) -> str:
+    is_named = 0 < track.instance < FIRST_MOVER
+    return (
+        str(track.instance)
+        if is_named
+        else f"mover {number}, first seen in scan {min(track.members, default=track.first)}"
+    )

@@ -1,277 +1,247 @@
-"""From the sums of stretches of frames to verdicts: the geometry, lags and drifts. Intervals come from drawing stretches with replacement.
-
-The share of the points of scans that lie in occupied voxels is highest where scans and grids belong together, and falls within a tenth of a
-voxel. Each correction is therefore a hypothesis, and the best one names the fault and its size.
-"""
+"""From the sums of stretches to verdicts: false free space, phantoms, ghost trails, erased actors, labels and gaps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.grids import GridSpec
-from carlasc.inspection.auditing.counting import Sums
-from carlasc.inspection.auditing.hypotheses import AXES, Family, drift_family, families
-from carlasc.inspection.auditing.tallies import LAGS
-from carlasc.inspection.auditing.verdicts import Verdict
+from carlasc.core.classes import ClassTable
+from carlasc.core.wording import count, first_names
+from carlasc.inspection.auditing.counting import HEIGHTS
+from carlasc.inspection.auditing.matching import MatchedGrids
+from carlasc.inspection.auditing.sums import Share, Stretches, share_of
+from carlasc.inspection.auditing.verdicts import State, Verdict
+from carlasc.inspection.heldout_scores import BANDS_M
 
-DRAWS = 300
-_GAIN, _FEWER = (
-    0.01,
-    1.3,
-)  # a correction must raise the share of points in occupied voxels by so much, and lower that of others by this factor
-_ALIKE = 0.02  # axes and lags whose shares differ by less are not told apart
-_SAME = 0.25  # of the gain: corrections whose gains differ by less are not told apart
-_FLAT = 0.006  # values whose shares differ by less are equal
-_BELONGS = 0.75  # share of points below which scans and grids do not belong together
-_LEAST = {
-    "shift": 0.2,
-    "yaw": 0.4,
-    "voxel size": 0.02,
-    "height drift": 0.02,
-}  # smaller faults are none; shifts in voxels
-_WIDEST = {"shift": 1.0, "yaw": 1.5, "voxel size": 0.15, "height drift": 0.06}  # a wider interval determines nothing
-_ADVICE = {
-    "axes": "give grids and scans the same axes",
-    "shift": "move the bounds, or the place of the sensor in the poses that the grids were made with",
-    "yaw": "turn the calibration of the sensor that the grids were made with",
-    "voxel size": "correct the voxel size or the bounds that are declared",
-    "height drift": "refine the poses (`carlasc refine`) and make the grids again",
-    "lag": "give the grids the numbers or times of these scans",
-}
+# A share is a fault from the first value on; that of one class of at least so many counts from the second on.
+_FREE, _FREE_OF_CLASS, _PHANTOM, _PHANTOM_OF_CLASS, _LEAST = 0.06, 0.4, 0.03, 0.2, 1000
+_TRAIL, _TRAIL_VOXELS = 0.1, 30  # of the path of an actor
+_ERASED, _ERASED_VOXELS = 0.2, 40  # of the voxels in which an actor was seen
+_DOUBLED = 0.05  # of the columns with ground
+_EXPLAINED, _OWN = 0.5, 0.3  # shares of a class that another name explains, and that its own name has then at most
+_NONE = 0.002  # the share of its own name where a thin marking is lost in any case
+_SHOWN = 4
 
 
-@dataclass(frozen=True)
-class Stretches:
-    """The sums of a sequence, stretch by stretch.
-
-    Attributes:
-        parts: the sums of each stretch, in order.
-    """
-
-    parts: Sequence[Sums]
-
-    def stacked(self, name: str) -> NDArray[np.int64]:
-        """Return (S, ...) the counts of each stretch, 0 where it has none; (S, 0) if no stretch has any."""
-        found = [part[name] for part in self.parts if name in part]
-        shape = tuple(np.max([f.shape for f in found], axis=0)) if found else (0,)
-        stack = np.zeros((len(self.parts), *shape), np.int64)
-        for row, part in enumerate(self.parts):
-            if name in part:
-                stack[row][tuple(slice(n) for n in part[name].shape)] = part[name]
-        return stack
-
-    @cached_property
-    def _weights(self) -> NDArray[np.float64]:
-        count = len(self.parts)
-        drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), DRAWS)
-        return np.concatenate([np.ones((1, count)), drawn]).astype(np.float64)
-
-    def drawn(self, name: str) -> NDArray[np.float64]:
-        """Return (1 + DRAWS, ...) sums of all stretches, then of stretches drawn with replacement."""
-        return np.einsum("ds,s...->d...", self._weights, self.stacked(name).astype(np.float64))
-
-    def share(self, name: str, part: int, whole: int) -> tuple[float, float, float] | None:
-        """Return a share of two counts of a row of counts, with its interval; None if there is nothing to share."""
-        sums = self.drawn(name)
-        return None if sums.shape[1] <= max(part, whole) else interval(sums[:, part], sums[:, whole])
-
-
-def interval(part: NDArray[np.float64], whole: NDArray[np.float64]) -> tuple[float, float, float] | None:
-    """Return a share and its interval of 95 % from (1 + DRAWS,) counts; None if the whole is 0."""
-    if not whole[0] > 0:
-        return None
-    shares = part / np.where(whole > 0, whole, np.nan)
-    low, high = np.nanquantile(shares[1:], (0.025, 0.975)).tolist()
-    return float(shares[0]), min(low, float(shares[0])), max(high, float(shares[0]))
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """How well the corrections of a family fit."""
-
-    family: Family
-    shares: NDArray[np.float64]  # (1 + DRAWS, V)
-
-    @cached_property
-    def best(self) -> int:
-        return int(self.shares[0].argmax())
-
-    @property
-    def kind(self) -> str:
-        return next((kind for kind in _LEAST if self.family.name.startswith(kind)), self.family.name)
-
-    @property
-    def gain(self) -> float:
-        return float(self.shares[0, self.best] - self.shares[0, self.family.neutral])
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether the gain is more than chance: positive in nearly all draws."""
-        gains = self.shares[1:, self.best] - self.shares[1:, self.family.neutral]
-        own, best = (1 - float(self.shares[0, row]) for row in (self.family.neutral, self.best))
-        return self.gain >= _GAIN and own >= _FEWER * best and float(np.quantile(gains, 0.025)) > 0
-
-    @cached_property
-    def interval(self) -> tuple[float, float]:
-        """The values about the best one that fit as well, and those that are best in nearly all draws."""
-        values, flat = self.family.values, self.shares[0] >= self.shares[0, self.best] - _FLAT
-        low = high = self.best
-        while low > 0 and flat[low - 1]:
-            low -= 1
-        while high + 1 < len(values) and flat[high + 1]:
-            high += 1
-        drawn = np.quantile(values[self.shares[1:].argmax(axis=1)], (0.025, 0.975))
-        return min(float(values[low]), float(drawn[0])), max(float(values[high]), float(drawn[1]))
-
-    def size(self, spec: GridSpec) -> float:
-        """Return one unit of the family's limits: the size of a voxel for shifts."""
-        if self.kind != "shift":
-            return 1.0
-        axis = "xyz".index(self.family.name[-1])
-        return float(spec.voxel_size[0 if spec.coordinates == "cylindrical" and axis < 2 else axis])
-
-
-def judge_geometry(stretches: Stretches, spec: GridSpec, where: str, period_s: float) -> Iterator[Verdict]:
-    """Yield the verdicts on axes, shifts, yaw, voxel size, drift of height, and lag.
+def judge_contents(
+    stretches: Stretches, one: MatchedGrids, window: tuple[int, int] | None, wrong: str = ""
+) -> Iterator[Verdict]:
+    """Yield the verdicts on what is in voxels: free space, phantoms, moving actors, labels, and what is missing.
 
     Args:
         stretches: the sums of a sequence.
-        spec: geometry of its grids.
-        where: name of the sequence in verdicts.
-        period_s: seconds between two scans.
+        one: its grids and scans.
+        window: first and last scan that a grid was made from; None if that is not known.
+        wrong: the fault of geometry that was found, which makes voxels seem wrong that are not; empty for none.
     """
-    sums = stretches.drawn("fits")
-    if not sums[0, 0]:
-        yield Verdict("geometry", "undetermined", None, None, None, "", "no point of a scan is inside a grid", where)
-        return
-    fits, first = [], 1
-    for family in families(spec):
-        rows = slice(first, first + len(family.values))
-        fits.append(_Fit(family, sums[:, rows] / np.maximum(sums[:, :1], 1)))
-        first += len(family.values)
-    lags = _lag_fit(stretches, fits[0])
-    drifted, drift = stretches.drawn("drift"), drift_family()
-    if drifted.shape[1] and drifted[0, 0]:
-        fits.append(_Fit(drift, drifted[:, 1:] / np.maximum(drifted[:, :1], 1)))
-    else:
-        text = "no scans two seconds apart with poses"
-        yield Verdict(drift.name, "undetermined", None, None, None, drift.unit, text, where)
-    found = [fit for fit in [lags, *fits] if fit.is_certain and _counts(fit, spec)]
-    top = max(float(fit.shares[0].max()) for fit in [lags, *fits])
-    certain = stretches.drawn("fits")[:, 1] / np.maximum(sums[:, 0], 1)
-    ends = [float(value) for value in np.quantile(certain[1:], (0.025, 0.975))]
-    text = f"{certain[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} under the best correction"
-    if top < _BELONGS:
-        advice = "these are scans of another sequence, or the grids are in a frame that no correction reaches"
-        yield Verdict("fit", "fault", float(certain[0]), ends[0], ends[1], "share", text, where, advice)
-        return
-    yield Verdict("fit", "sound", float(certain[0]), ends[0], ends[1], "share", text, where)
-    winner = _winner(found)
-    if winner is None:
-        yield from (_sound_or_not(fit, spec, where) for fit in [lags, *fits])
-        return
-    for fit in found:
-        together = fit.kind == winner.kind == "shift" and fit.gain >= _SAME * winner.gain
-        if fit is winner or together:
-            yield _fault(fit, found, spec, where, period_s)
-    text = f"the rest is not told before {winner.family.name} is right"
-    yield Verdict("other geometry", "undetermined", None, None, None, "", text, where)
+    judge = _Judge(stretches, one, window)
+    for verdict in judge.voxels():
+        text = f"not judged before {wrong} is right: {verdict.text}"
+        hidden = wrong and verdict.state == "fault"
+        yield replace(verdict, state="undetermined", text=text, advice="") if hidden else verdict
+    yield from judge.gaps(wrong)
 
 
-def _winner(found: list[_Fit]) -> _Fit | None:
-    """Return the correction that fits best; of several that fit nearly as well, the one of the fewest values."""
-    if not found:
+@dataclass(frozen=True)
+class _Judge:
+    stretches: Stretches
+    one: MatchedGrids
+    window: tuple[int, int] | None
+
+    def _say(
+        self,
+        check: str,
+        state: State | bool,
+        text: str,
+        found: Share | None = None,
+        advice: str = "",
+        unit: str = "share",
+    ) -> Verdict:
+        """Return a verdict; True is a fault, and False is sound. Only a fault has advice."""
+        named: State = state if isinstance(state, str) else "fault" if state else "sound"
+        value, low, high = found or (None, None, None)
+        return Verdict(check, named, value, low, high, unit, text, self.one.path, advice if named == "fault" else "")
+
+    def voxels(self) -> Iterator[Verdict]:
+        """Yield what is wrong in voxels."""
+        if self.stretches.stacked("returns") is None:
+            yield self._say("false free", "undetermined", "the files do not tell free from unknown space")
+        else:
+            by = "scans that may have made the grids" if self.window is None else "the frame's own scan"
+            what, advice = f"returns of {by} are in voxels called free", "the grids call free what scans meet"
+            classes = self.one.scans.metadata.classes
+            yield self._by_class("returns", "false free", what, (_FREE, _FREE_OF_CLASS), classes, advice)
+        if self.window is not None:
+            yield self._held_out()
+        what, advice = "occupied voxels are crossed by rays", "rays pass through what is not there"
+        yield self._by_class("seen voxels", "phantoms", what, (_PHANTOM, _PHANTOM_OF_CLASS), self.one.classes, advice)
+        yield from self._actors()
+        found = self.stretches.share("ground columns")
+        text = "no class of the grids is ground" if found is None else f"{_percent(found)} of the columns with ground have it at two heights"  # fmt: skip
+        state: State | bool = "undetermined" if found is None else found[1] > _DOUBLED
+        yield self._say("doubled ground", state, text, found, "the poses behind the grids drift in height: refine them")
+        yield from self._labels()
+
+    def _by_class(
+        self, name: str, check: str, what: str, limits: tuple[float, float], table: ClassTable | None, advice: str
+    ) -> Verdict:
+        counts = self.stretches.stacked(name)
+        if counts is None or not counts[..., 0].any():
+            return self._say(check, "undetermined", "nothing could be counted")
+        total = counts.sum(axis=0)
+        classes = np.flatnonzero(total[..., 0].sum(axis=(1, 2)) >= _LEAST).tolist()
+        of_class = self.stretches.draw(counts[:, classes].sum(axis=(2, 3)))
+        drawn = self.stretches.draw(counts.sum(axis=(1, 2, 3)))
+        found = share_of(drawn[:, 1], drawn[:, 0]) or (0.0, 0.0, 0.0)
+        shares = {i: share_of(of_class[:, row, 1], of_class[:, row, 0]) for row, i in enumerate(classes)}
+        worst = sorted(((share, _name(table, i)) for i, share in shares.items() if share is not None), reverse=True)
+        wrong = [f"{share[0]:.0%} of {name}" for share, name in worst if share[1] > limits[1]]
+        text = f"{_percent(found)} of the {what}{': ' if wrong else ''}{', '.join(wrong[:_SHOWN])}"
+        if wrong and check == "false free":
+            advice = "these are lost; thin things are outvoted by rays that pass beside them: use more scans or sensors"
+        bands = zip(BANDS_M, total.sum(axis=(0, 2)), strict=False)
+        near = [f"from {low:.0f} m {n[1] / n[0]:.1%}" for low, n in bands if n[0]]
+        levels = [f"layer {k + 1} of {HEIGHTS} {n[1] / n[0]:.1%}" for k, n in enumerate(total.sum(axis=(0, 1))) if n[0]]
+        named = [f"{name} {share[0]:.1%} ({share[1]:.1%} to {share[2]:.1%})" for share, name in worst]
+        said = self._say(check, found[1] > limits[0] or bool(wrong), text, found, advice)
+        return replace(said, details=", ".join([*named, *near, *levels]))
+
+    def _held_out(self) -> Verdict:
+        if (found := self.stretches.share("held out")) is None:
+            text = "no frame has a scan just outside of the window, and poses and a mask"
+            return self._say("false free, held out", "undetermined", text)
+        text = (
+            f"{_percent(found)} of the returns of static things in scans that did not make the grids are in free voxels"
+        )
+        advice = "the grids do not hold what later or earlier scans meet"
+        return self._say("false free, held out", found[1] > _FREE, text, found, advice)
+
+    def _actors(self) -> Iterator[Verdict]:
+        volume, names = float(np.prod(self.one.spec.voxel_size)), {n for p in self.stretches.parts for n in p}
+        sums = {n.removeprefix("actor "): self.stretches.drawn(n) for n in sorted(names) if n.startswith("actor ")}
+        actors = {name: drawn for name, drawn in sums.items() if drawn is not None}
+        moved = {name: n for name, n in actors.items() if n[0, 0] >= _TRAIL_VOXELS}
+        seen = {name: n for name, n in actors.items() if n[0, 2] >= _ERASED_VOXELS}
+        paths = {name: share_of(n[:, 1], n[:, 0]) for name, n in moved.items()}
+        trails = [(moved[name][0, 1], name, path) for name, path in paths.items() if path and path[1] > _TRAIL]
+        listed = [f"actor {name} {_percent(path, 0)}" for _, name, path in sorted(trails, reverse=True)]
+        advice = f"leave out what moves, or move it along: {first_names(listed, _SHOWN)}"
+        if moved:
+            total = np.sum(list(moved.values()), axis=0)
+            found, frames = share_of(total[:, 1], total[:, 0]), self._frames[0]
+            text = f"{found[0] if found else 0:.2%} of the paths of {count(len(moved), 'actor')} are occupied, {total[0, 1] * volume / frames:.2f} m3 in a frame"
+            yield self._say("ghost trails", bool(trails), text, found, advice)
+        else:
+            text = "nothing moves in the recording, as far as its fields and free space show"
+            yield self._say("ghost trails", "undetermined", text)
+        own = {name: share_of(n[:, 3], n[:, 2]) for name, n in seen.items() if n[0, 4] >= 2}
+        erased = [(seen[name][0, 2], name, share[0]) for name, share in own.items() if share and share[2] < _ERASED]
+        listed = [f"actor {name} ({share:.0%} of its voxels in {seen[name][0, 4]:.0f} frames)" for _, name, share in sorted(erased, reverse=True)]  # fmt: skip
+        text = f"{len(erased)} of {count(len(seen), 'actor')} have no voxels"
+        text += f": {first_names(listed, _SHOWN)}" if erased else ""
+        number = float(len(erased))
+        yield self._say(
+            "erased actors",
+            bool(erased) if seen else "undetermined",
+            text if seen else "no actor is named in the recording",
+            (number, number, number) if seen else None,
+            "keep the voxels of these actors",
+            "actors",
+        )
+
+    @cached_property
+    def _frames(self) -> tuple[int, int]:
+        """Number of frames, and of those without a mask."""
+        counts = self.stretches.stacked("frames")
+        made, without = (0, 0) if counts is None else counts.sum(axis=0).tolist()
+        return made, without
+
+    @cached_property
+    def _confusion(self) -> NDArray[np.int64] | None:
+        """(S, K, K) points by their class and that of their voxel, of the classes of the grids; None without any."""
+        counts = self.stretches.stacked("confusion")
+        return None if counts is None or not counts.any() else counts
+
+    def _labels(self) -> Iterator[Verdict]:
+        counts, table = self._confusion, self.one.classes
+        if counts is None or table is None:
+            text = "scans or grids have no labels, or no map of their classes is known"
+            yield self._say("labels", "undetermined", text)
+            return
+        used = np.flatnonzero(counts.any(axis=(0, 1)) | counts.any(axis=(0, 2)))
+        drawn = self.stretches.draw(counts[:, used][:, :, used])
+        names, ground = [_name(table, int(i)) for i in used], np.isin(used, sorted(self._ground))
+        rows, right = drawn.sum(axis=2), np.einsum("dkk->dk", drawn)
+        kinds = [int(i) for i in np.flatnonzero(rows[0] >= _LEAST)]
+        other = {i: j for i in kinds if (j := _explains(drawn, rows, right, i, bool(ground[i]))) is not None}
+        found = share_of(right.sum(axis=1), rows.sum(axis=1))
+        least = sorted(kinds, key=lambda i: right[0, i] / rows[0, i])
+        shares = ", ".join(f"{names[i]} {right[0, i] / rows[0, i]:.0%}" for i in least[:_SHOWN])
+        text = f"{_percent(found)} of the points in occupied voxels have the class of their voxel; least: {shares}"
+        yield self._say("labels", bool(other), text, found, "correct the map of classes")
+        for i, j in other.items():
+            if other.get(j) != i:
+                one = share_of(drawn[:, i, j], rows[:, i])
+                text = f"{_percent(one)} of the points of {names[i]} are in voxels of {names[j]}"
+                yield self._say("class mapped", True, text, one, f"map {names[i]} to id {used[i]}, not {used[j]}")
+            elif i < j:
+                one = share_of(drawn[:, i, j] + drawn[:, j, i], rows[:, i] + rows[:, j])
+                text = f"{names[i]} and {names[j]} are exchanged: {_percent(one)} of their points are in voxels of the other"
+                yield self._say("classes exchanged", True, text, one, f"exchange the ids {used[i]} and {used[j]}")
+
+    @property
+    def _ground(self) -> set[int]:
+        lookup = self.one.lookup
+        return set() if lookup is None else {int(lookup[i]) for i in self.one.scans.metadata.classes.ground}
+
+    def gaps(self, wrong: str) -> Iterator[Verdict]:
+        """Yield what is missing; classes only if the geometry is not `wrong`."""
+        missing, (frames, without) = self.one.absent, self._frames
+        made = len(self.one.frames) + len(missing)
+        share = len(missing) / made
+        text = f"{len(missing)} of {made} frames have no grid ({share:.1%})"
+        text += f": {first_names(map(str, missing))}" if missing else ""
+        advice = "make these frames, or say why they are missing"
+        yield self._say("missing frames", bool(missing), text, (share, share, share), advice)
+        if 0 < without < frames:
+            share, text = without / frames, f"{without} of {frames} frames do not say which voxels are known"
+            yield self._say("missing masks", True, text, (share, share, share), "write the masks of all frames")
+        counts, kinds, table = self._confusion, self.stretches.stacked("classes of grids"), self.one.classes
+        if not wrong and counts is not None and kinds is not None and table is not None:
+            met, made_of = counts.sum(axis=(0, 2)), kinds.sum(axis=0)
+            gone = [_name(table, i) for i in np.flatnonzero(met >= _LEAST).tolist() if not made_of[i]]
+            text = f"classes that scans show and no voxel has: {', '.join(gone)}" if gone else "every class of the scans is in the grids"  # fmt: skip
+            number = float(len(gone))
+            yield self._say("missing classes", bool(gone), text, (number, number, number), "label the voxels of these classes", "classes")  # fmt: skip
+        if (unknown := self.stretches.drawn("unknown")) is not None:
+            whole = share_of(unknown[:, 1:].sum(axis=1), unknown[:, 0])
+            causes = ("hold a return", "are crossed by rays", "are outside the view", "are hidden")
+            parts = [f"{part / unknown[0, 0]:.1%} {cause}" for part, cause in zip(unknown[0, 1:], causes, strict=True)]
+            yield self._say(
+                "unknown space", False, f"{_percent(whole)} of the voxels are unknown: {', '.join(parts)}", whole
+            )
+
+
+def _explains(
+    drawn: NDArray[np.float64], rows: NDArray[np.float64], right: NDArray[np.float64], i: int, thin: bool
+) -> int | None:
+    """Return the class whose voxels hold most points of another one, which has nearly none of its own; None if there is none."""
+    j = int(drawn[0, i].argmax())
+    own, moved = share_of(right[:, i], rows[:, i]), share_of(drawn[:, i, j], rows[:, i])
+    if j == i or own is None or moved is None:
         return None
-    best = max(found, key=lambda fit: fit.gain)
-    near = [fit for fit in found if fit.gain >= (1 - _SAME / 5) * best.gain]
-    shifts = [fit for fit in near if fit.kind == "shift"]
-    return best if best.kind != "voxel size" or not shifts else max(shifts, key=lambda fit: fit.gain)
+    lost = thin and drawn[0, j, i] < _EXPLAINED * rows[0, j]  # a thin marking loses its voxels to the ground around it
+    return j if own[2] < (_NONE if lost else _OWN) and moved[1] > _EXPLAINED else None
 
 
-def _counts(fit: _Fit, spec: GridSpec) -> bool:
-    """Return whether a fault is large enough, and its interval does not hold the value of no fault."""
-    if fit.kind in ("axes", "lag"):
-        return fit.best != fit.family.neutral
-    value, neutral = fit.family.values[fit.best], fit.family.values[fit.family.neutral]
-    low, high = fit.interval
-    return bool(abs(value - neutral) >= 0.99 * _LEAST[fit.kind] * fit.size(spec) and not low <= neutral <= high)
+def _percent(share: Share | None, digits: int = 2) -> str:
+    value, low, high = share or (0.0, 0.0, 0.0)
+    return f"{value:.{digits}%} ({low:.{digits}%} to {high:.{digits}%})"
 
 
-def _lag_fit(stretches: Stretches, axes: _Fit) -> _Fit:
-    sums = stretches.drawn("lags").reshape(DRAWS + 1, -1, 2)
-    values = np.array([*LAGS, 0.0])
-    if not sums.shape[1]:
-        sums = np.zeros((DRAWS + 1, len(LAGS), 2))
-    others = np.where(sums[:, :, 0] > 0, sums[:, :, 1] / np.maximum(sums[:, :, 0], 1), 0.0)
-    shares = np.column_stack([others, axes.shares[:, axes.family.neutral]])
-    order = np.argsort(values)
-    family = Family("lag", "frames", values[order], np.empty((0, 3, 5)), int(np.flatnonzero(values[order] == 0)[0]))
-    return _Fit(family, shares[:, order])
-
-
-def _fault(fit: _Fit, found: list[_Fit], spec: GridSpec, where: str, period_s: float) -> Verdict:
-    name, family = fit.family.name, fit.family
-    value, (low, high) = float(family.values[fit.best]), fit.interval
-    rivals = [o.family.name for o in found if o is not fit and o.gain >= (1 - _SAME / 3) * fit.gain]
-    rivals = [rival for rival in rivals if not rival.startswith("voxel size")]
-    also = f"; {' or '.join(rivals)} explains it nearly as well" if rivals else ""
-    own, share = float(fit.shares[0, family.neutral]), float(fit.shares[0, fit.best])
-    text = f"{_describe(fit, spec, period_s)}: undone, {share:.1%} instead of {own:.1%} of points are in occupied voxels{also}"
-    if fit.kind == "axes":
-        value = low = high = float(fit.best)
-    return Verdict(name, "fault", value, low, high, family.unit, text, where, _ADVICE[fit.kind])
-
-
-def _sound_or_not(fit: _Fit, spec: GridSpec, where: str) -> Verdict:
-    """Return the verdict of a family that explains nothing better: sound, if the right value is told from others."""
-    family, shares = fit.family, fit.shares[0]
-    neutral, (low, high) = float(family.values[family.neutral]), fit.interval
-    value = float(family.values[fit.best])
-    if fit.kind == "axes":
-        others = [i for i in np.flatnonzero(shares >= shares[0] - _ALIKE).tolist() if i]
-        if others:
-            text = f"the scene looks the same with {AXES[others[0]][0]}"
-            return Verdict("axes", "undetermined", None, None, None, "", text, where)
-        return Verdict("axes", "sound", 0.0, 0.0, 0.0, "", "those of the scans", where)
-    if fit.kind == "lag":
-        near = shares[np.abs(family.values) == 1]
-        wide = bool((near >= shares[family.neutral] - _ALIKE).any())
-        text = "the vehicle hardly moves" if wide else "grids fit their own scans best"
-        return Verdict("lag", "undetermined" if wide else "sound", None if wide else 0.0, None if wide else 0.0, None if wide else 0.0, "frames", text, where)  # fmt: skip
-    wide = high - low > _WIDEST[fit.kind] * fit.size(spec)
-    if wide:
-        text = f"the drive does not tell values from {low:.3g} to {high:.3g} {family.unit} apart"
-        return Verdict(family.name, "undetermined", None, low, high, family.unit, text, where)
-    text = f"{value:.3g} {family.unit} (95 %: {low:.3g} to {high:.3g})"
-    if value != neutral:
-        text += ", too little to matter"
-    return Verdict(family.name, "sound", value, low, high, family.unit, text, where)
-
-
-def _describe(fit: _Fit, spec: GridSpec, period_s: float) -> str:
-    value, (low, high), name = float(fit.family.values[fit.best]), fit.interval, fit.family.name
-    ends = f"(95 %: {low:.3g} to {high:.3g})"
-    if fit.kind == "axes":
-        return AXES[fit.best][0]
-    if fit.kind == "lag":
-        late = "late" if value < 0 else "early"
-        frames = f"{abs(value):.0f} frame{'s' if abs(value) > 1 else ''}"
-        return f"grids are {frames} ({abs(value) * period_s:.2f} s) {late}: each shows what an {'earlier' if value < 0 else 'later'} scan saw"
-    if fit.kind == "shift":
-        return f"grids are moved by {value:.3f} m along {name[-1]}, {value / fit.size(spec):.2f} voxels {ends}"
-    if fit.kind == "yaw":
-        return f"grids are turned by {value:.2f} degrees {ends}"
-    if fit.kind == "height drift":
-        return f"places that were seen later are {value:.2f} m/s higher {ends}"
-    axes = [
-        "x, y" in name or name in ("voxel size", "voxel size, lower bound kept"),
-        " z" in name or "x, y" not in name,
-    ]
-    sizes = spec.voxel_size / value
-    true = ", ".join(f"{size:.3g}" for size, used in zip(sizes, (axes[0], axes[0], axes[1]), strict=True) if used)
-    return f"{name}: declared is {value:.3f} times the true one {ends}, which is {true} m"
+def _name(table: ClassTable | None, index: int) -> str:
+    return str(index) if table is None else table.names.get(index, str(index))

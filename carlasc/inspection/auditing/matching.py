@@ -11,13 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.benchmarks import OCC3D_TO_OPENOCCUPANCY, SSCBENCH_TO_RAW, TO_OCC3D, TO_SSCBENCH
+from carlasc.core.benchmarks import (
+    CARLAOCC,
+    CARLAOCC_TO_CARLA,
+    OCC3D_TO_OPENOCCUPANCY,
+    SSCBENCH_TO_RAW,
+    TO_OCC3D,
+    TO_SSCBENCH,
+)
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import remaps_between
+from carlasc.core.wording import count, first_names
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, reading
+from carlasc.metrics.carlaocc import CarlaOccGrids
 from carlasc.metrics.grids import GridFrames, SequenceGrid
 from carlasc.metrics.pairs import Place, TokenFrames, open_grids
 from carlasc.storage import as_source, layout
@@ -28,8 +37,11 @@ from carlasc.storage.protocol import Sequence
 _SAME_TIME_S = 0.06  # a grid belongs to a scan of nearly its time
 _NOISE = 255
 _HEIGHT_M = 1.8  # of the sensor above the ground where the recording does not say it, as in CarlaSC
-TIMES = "tokens.txt"
-"""The table of times beside grids that are named by tokens: lines of a token and seconds."""
+_TIMES = "tokens.txt"  # the table of times beside grids that are named by tokens: lines of a token and seconds
+_FRAMES = {
+    "occ3d-lidar": "the vehicle, with its origin on the ground",
+    "openoccupancy": "the LiDAR, x to the right and y forward",
+}
 
 
 @dataclass(frozen=True)
@@ -58,17 +70,22 @@ class MatchedGrids:
         return self.scans.path or self.scans.name
 
     @property
+    def pair(self) -> str:
+        """The grids and the scans, for messages."""
+        return f"{self.grids.location} with {self.scans.location}"
+
+    @property
     def spec(self) -> GridSpec:
-        """Geometry of the grids."""
-        spec = self.grids.spec
-        if spec is None:
-            raise FormatError(
-                self.grids.location,
-                expected="grids of known geometry",
-                found="a folder without params.json",
-                advice="add params.json: docs/format.md#params-json",
-            )
-        return spec
+        """Geometry of the grids.
+
+        Raises:
+            FormatError: it is not known.
+        """
+        if self.grids.spec is None:
+            expected, advice = "grids of known geometry", "add params.json: docs/format.md#params-json"
+            found = "a folder without params.json"
+            raise FormatError(self.grids.location, expected=expected, found=found, advice=advice)
+        return self.grids.spec
 
     @property
     def axes(self) -> str:
@@ -78,40 +95,40 @@ class MatchedGrids:
     @property
     def frame_name(self) -> str:
         """The frame of the grids in words."""
-        place = {
-            "occ3d-lidar": "the vehicle, with its origin on the ground",
-            "openoccupancy": "the LiDAR, x to the right and y forward",
-        }.get(self.grids.benchmark or "", "the sensor, x forward")
-        return f"{place}; {self.axes}-handed"
+        return f"{_FRAMES.get(self.grids.benchmark or '', 'the sensor, x forward')}; {self.axes}-handed"
 
     @cached_property
     def grid_T_scan(self) -> Transform:
         """(4, 4) from the sensor's frame to that of the grids; it may mirror y."""
-        matrix: Transform = np.eye(4)
-        if self.axes != self.scans.metadata.axes:
-            matrix[1, 1] = -1.0
+        matrix: Transform = np.diag([1.0, 1.0 if self.axes == self.scans.metadata.axes else -1.0, 1.0, 1.0])
         if self.grids.benchmark == "openoccupancy":
             matrix = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ matrix
         matrix[2, 3] = self.height_m
         return matrix
 
+    @property
+    def _many_to_one(self) -> bool:
+        """Whether several classes of the grids are one of the scans, so that the labels of the grids are mapped and not those of the scans."""
+        return isinstance(self.grids, CarlaOccGrids) and self.scans.metadata.classes != CARLAOCC
+
+    @property
+    def classes(self) -> ClassTable | None:
+        """Class table of the labels that `read` returns; that of the scans for a plain folder."""
+        if self._many_to_one:
+            return CARLAOCC_TO_CARLA.target
+        return self.grids.classes or (None if self.grids.benchmark else self.scans.metadata.classes)
+
     @cached_property
     def lookup(self) -> NDArray[np.int64] | None:
         """(K,) class of the grids of each class of the scans, -1 for those that have none; None if no map is known."""
-        source, target = self.scans.metadata.classes, self.grid_classes
-        mapping = None if target is None else _mapping(source, target, self.grids.benchmark)
+        source = self.scans.metadata.classes
+        mapping = None if self.classes is None else _mapping(source, self.classes, self.grids.benchmark)
         if mapping is None:
             return None
         lookup = np.full(source.num_channels, -1, np.int64)
-        for old, new in mapping.items():
-            lookup[old] = new
+        lookup[list(mapping)] = list(mapping.values())
         lookup[0] = -1
         return lookup
-
-    @property
-    def grid_classes(self) -> ClassTable | None:
-        """Class table of the grids; that of the scans for a plain folder."""
-        return self.grids.classes or (None if self.grids.benchmark else self.scans.metadata.classes)
 
     def read(self, frame: int) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_], NDArray[np.bool_] | None]:
         """Return (X, Y, Z) labels of a grid, which voxels are occupied, and which are known; None if the files do not say it.
@@ -120,16 +137,15 @@ class MatchedGrids:
             CarlascError: the grid cannot be read.
         """
         labels, known = self.grids.labels(frame), self.grids.known(frame)
+        where = f"{self.grids.location}: frame {self.grids.name_of(frame)}"
         if labels.size != self.spec.num_voxels:
-            raise FormatError(
-                f"{self.grids.location}: frame {self.grids.name_of(frame)}",
-                expected=f"{self.spec.num_voxels} voxels",
-                found=str(labels.size),
-            )
+            raise FormatError(where, expected=f"{self.spec.num_voxels} voxels", found=str(labels.size))
         labels = labels.reshape(self.spec.size)
         occupied = labels != (17 if self.grids.benchmark == "occ3d-lidar" else 0)
-        if self.grids.benchmark in ("occ3d-lidar", "openoccupancy"):
+        if self.grids.benchmark in _FRAMES:
             occupied &= labels != _NOISE
+        if self._many_to_one:
+            labels = CARLAOCC_TO_CARLA(labels, where)
         if known is not None:
             known = known.reshape(self.spec.size)
             occupied &= known
@@ -139,10 +155,19 @@ class MatchedGrids:
         """Return (N, 3) points of the sensor's frame in the frame of the grids."""
         return transform_points(self.grid_T_scan, points)
 
-    def seconds(self, frame: int) -> float:
-        """Return the time of a scan."""
-        timed = layout.TIMES in self.scans.documents()
-        return self.scans.read_time(frame) if timed else frame * layout.FRAME_PERIOD_S
+    @cached_property
+    def trajectory(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
+        """(F,) frames with scans, their seconds, and their (F, 4, 4) poses, None without poses.txt."""
+        frames, documents = self.scans.frames("points"), self.scans.documents()
+        seconds = [self.scans.read_time(f) for f in frames.tolist()] if layout.TIMES in documents else frames * layout.FRAME_PERIOD_S  # fmt: skip
+        poses = np.stack([self.scans.read_pose(f) for f in frames.tolist()]) if layout.POSES in documents else None
+        return frames, np.asarray(seconds), poses
+
+    @property
+    def period_s(self) -> float:
+        """Seconds between two scans."""
+        frames, seconds, _ = self.trajectory
+        return float(seconds[-1] - seconds[0]) / max(int(frames[-1] - frames[0]), 1) or layout.FRAME_PERIOD_S
 
 
 def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) -> list[MatchedGrids]:
@@ -158,17 +183,15 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
         MissingDataError: there are no grids, no scans, or no pair of them; names the pairs that were tried.
         FormatError: the geometry of the grids is not known.
     """
-    recordings = {s.path: s for s in as_source(scans).sequences().values() if "points" in s.fields()}
+    source = as_source(scans)
+    recordings = {s.path: s for s in source.sequences().values() if "points" in s.fields()}
     found = list(open_grids(grids, grid, "truth"))
     if not recordings:
-        raise MissingDataError(as_source(scans).location, expected="sequences with scans (velodyne/)", found="none")
-    matched = []
-    for one in found:
-        recording = _recording_of(one, recordings, alone=len(found) == 1)
-        if recording is not None:
-            matched.append(_match_frames(one, recording, FrameRange.of(frames)))
+        raise MissingDataError(source.location, expected="sequences with scans (velodyne/)", found="none")
+    pairs = [(one, _recording_of(one, recordings, alone=len(found) == 1)) for one in found]
+    matched = [_match_frames(one, own, FrameRange.of(frames)) for one, own in pairs if own is not None]
     if not matched:
-        tried = ", ".join(f"{one.path or one.location} with {path}" for one in found[:3] for path in [*recordings][:3])
+        tried = first_names([f"{one.path or one.location} with {path}" for one in found for path in recordings], 6)
         raise MissingDataError(
             str(grids),
             expected="grids of a sequence of the scans",
@@ -187,83 +210,80 @@ def _recording_of(grids: GridFrames, recordings: Mapping[str, Sequence], *, alon
 
 
 def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> MatchedGrids:
-    numbers, own, notes = grids.frames(), scans.frames("points"), list[str]()
-    times = _token_times(grids) if isinstance(grids, TokenFrames) else None
-    if isinstance(grids, TokenFrames) and times is None:
-        if len(numbers) != len(own):
-            raise MissingDataError(
-                grids.location,
-                expected=f"a time for each of {len(numbers)} tokens, or as many scans",
-                found=f"{len(own)} scans, and no {TIMES} or annotations.json",
-                advice=f"write lines of a token and seconds to {TIMES} beside the grids",
-            )
+    numbers, own, notes = grids.frames().tolist(), scans.frames("points"), list[str]()
+    height = _height_of(scans) if grids.benchmark == "occ3d-lidar" else 0.0
+    if height is None:
+        height = _HEIGHT_M
+        notes.append(f"the height of the sensor is not known, and taken to be {height:g} m")
+    result = MatchedGrids(grids, scans, (), (), (), height)
+    _ = result.spec  # unknown geometry is an error before work begins
+    if not isinstance(grids, TokenFrames):
+        pairs = [(number, number) for number in numbers if number in set(own.tolist())]
+    elif (times := _token_times(grids)) is not None:
+        seconds = result.trajectory[1]
+        timed = [(number, times[grids.name_of(number)]) for number in numbers if grids.name_of(number) in times]
+        nearest = [(number, int(np.abs(seconds - t).argmin()), t) for number, t in timed]
+        pairs = [(number, int(own[row])) for number, row, t in nearest if abs(seconds[row] - t) <= _SAME_TIME_S]
+    elif len(numbers) == len(own):
         notes.append("tokens without times were taken in the order of the scans")
-        pairs = list(zip(numbers.tolist(), own.tolist(), strict=True))
-    elif isinstance(grids, TokenFrames) and times is not None:
-        timed = layout.TIMES in scans.documents()
-        seconds = np.array([scans.read_time(f) if timed else f * layout.FRAME_PERIOD_S for f in own.tolist()])
-        wanted = [(number, times.get(grids.name_of(number))) for number in numbers.tolist()]
-        nearest = [(n, int(np.abs(seconds - t).argmin()), t) for n, t in wanted if t is not None]
-        pairs = [(n, int(own[row])) for n, row, t in nearest if abs(seconds[row] - t) <= _SAME_TIME_S]
+        pairs = list(zip(numbers, own.tolist(), strict=True))
     else:
-        pairs = [(number, number) for number in numbers.tolist() if number in set(own.tolist())]
+        raise MissingDataError(
+            result.pair,
+            expected=f"a time for each of {len(numbers)} tokens, or as many scans",
+            found=f"{len(own)} scans, and no {_TIMES} or annotations.json",
+            advice=f"write lines of a token and seconds to {_TIMES} beside the grids",
+        )
+    if without := sorted(set(numbers) - {number for number, _ in pairs}):
+        names = first_names([grids.name_of(number) for number in without], 4)
+        notes.append(f"{count(len(without), 'grid')} of {len(numbers)} without a scan of the same number or time were left out: {names}")  # fmt: skip
     pairs = [pair for pair in pairs if pair[0] in chosen]
     if not pairs:
-        where = f"frames {own[0]} to {own[-1]} of {scans.location}" if len(own) else scans.location
-        shown = f"{numbers[0]} to {numbers[-1]}" if len(numbers) else "no frame"
-        raise MissingDataError(
-            grids.location, expected=f"grids of {where}", found=shown, advice="no pair of frames has one number or time"
-        )
-    benchmark, height = grids.benchmark, 0.0
-    if benchmark == "occ3d-lidar":
-        height, assumed = _height(scans)
-        notes += [f"the height of the sensor is not known, and taken to be {height:g} m"] if assumed else []
+        where = f"frames {own[0]} to {own[-1]}" if len(own) else "frames with scans"
+        shown = f"{grids.name_of(numbers[0])} to {grids.name_of(numbers[-1])}" if numbers else "no frame"
+        advice = "no pair of frames has one number or time"
+        raise MissingDataError(result.pair, expected=f"grids of {where}", found=shown, advice=advice)
     made = [scan for _, scan in pairs]
-    steps = np.diff(made)
-    step = int(np.bincount(steps).argmax()) if len(steps) else 1
-    usual = [f for f in own.tolist() if made[0] <= f <= made[-1] and (f - made[0]) % max(step, 1) == 0]
-    result = MatchedGrids(grids, scans, tuple(pairs), tuple(sorted(set(usual) - set(made))), tuple(notes), height)
-    _ = result.spec  # unknown geometry is an error before work begins
-    return result
+    step = max(int(np.bincount(np.diff(made)).argmax()), 1) if len(made) > 1 else 1
+    usual = [f for f in own.tolist() if made[0] <= f <= made[-1] and (f - made[0]) % step == 0]
+    return MatchedGrids(grids, scans, tuple(pairs), tuple(sorted(set(usual) - set(made))), tuple(notes), height)
 
 
 def _token_times(grids: TokenFrames) -> dict[str, float] | None:
     """Return the seconds of tokens, from tokens.txt or Occ3D's annotations.json, in the folder of the scene or one above it."""
     folder = Path(grids.location)
     for place in (folder, folder.parent, folder.parent.parent):
-        if (file := place / TIMES).is_file():
+        if (file := place / _TIMES).is_file():
             with reading(file, "lines of a token and seconds"):
                 rows = [line.split() for line in file.read_text().splitlines() if line.strip()]
                 return {token: float(seconds) for token, seconds in rows}
         if (file := place / "annotations.json").is_file():
-            scenes: Any = parse_json(file.read_bytes(), str(file)).get("scene_infos", {})
             with reading(file, "timestamps of tokens"):
-                scene = scenes.get(folder.name, {})
+                scene: Any = parse_json(file.read_bytes(), str(file)).get("scene_infos", {}).get(folder.name, {})
                 return {token: float(entry["timestamp"]) / 1e6 for token, entry in scene.items()}
     return None
 
 
-def _height(scans: Sequence) -> tuple[float, bool]:
+def _height_of(scans: Sequence) -> float | None:
     sensors = scans.metadata.extra.get("sensors")
     first = sensors[0] if isinstance(sensors, list) and sensors else None
     height = first.get("height_m") if isinstance(first, dict) else None
-    known = isinstance(height, int | float) and not isinstance(height, bool)
-    return (float(height), False) if known and isinstance(height, int | float) else (_HEIGHT_M, True)
+    return float(height) if isinstance(height, int | float) and not isinstance(height, bool) else None
 
 
 def _mapping(source: ClassTable, target: ClassTable, benchmark: str | None) -> Mapping[int, int] | None:
     """Return which class of the grids each class of the scans becomes; None if nothing says so."""
-    if benchmark in ("occ3d-lidar", "openoccupancy"):
+    if benchmark in _FRAMES:
         to_occ3d = TO_OCC3D.get(source.name)
         if to_occ3d is None or benchmark == "occ3d-lidar":
             return to_occ3d
         return {old: OCC3D_TO_OPENOCCUPANCY.get(new, -1) for old, new in to_occ3d.items()}
     if benchmark == "sscbench" and source.name in TO_SSCBENCH:
         return {old: SSCBENCH_TO_RAW.get(new, -1) for old, new in TO_SSCBENCH[source.name].items()}
+    mapping = {index: index for index in source.names}
     if source.names == target.names:
-        return {index: index for index in source.names}
+        return mapping
     try:
-        mapping = {index: index for index in source.names}
         for remap in remaps_between(source, target):
             mapping = {old: remap.mapping.get(new, -1) for old, new in mapping.items()}
         return mapping

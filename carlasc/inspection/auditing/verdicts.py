@@ -22,8 +22,9 @@ class Verdict:
         high: upper end.
         unit: of the three numbers; "share" for shares of 1.
         text: what was found, in words.
-        where: the sequence, and the place or the frames in it.
-        advice: what to fix.
+        where: the sequence.
+        advice: what to fix; empty if nothing is wrong.
+        details: more numbers in words, such as those by distance; shown on the page.
     """
 
     check: str
@@ -35,10 +36,15 @@ class Verdict:
     text: str
     where: str
     advice: str = ""
+    details: str = ""
 
     def __str__(self) -> str:
-        text = f"{self.where}: {self.check}: {self.text}"
-        return f"{text}: {self.advice}" if self.advice else text
+        return f"{self.where}: {self.sentence}"
+
+    @property
+    def sentence(self) -> str:
+        """The check, what was found, and what to fix, in a line."""
+        return f"{self.check}: {self.text}{f': {self.advice}' if self.advice else ''}"
 
 
 @dataclass(frozen=True)
@@ -63,14 +69,13 @@ class AuditResult:
     Attributes:
         grids: where the grids are.
         scans: where the scans are.
-        verdicts: of all checks, by path of the sequence.
+        verdicts: of all checks, by path of the sequence; empty if other parts have still to count their frames.
         frames: number of audited frames, by path of the sequence.
         placed: the frame that the grids are taken to be in, in words, by path of the sequence.
         worst: the frames with most wrong voxels, worst first: path, frame of the grids, frame of the scan, number of wrong voxels.
         notes: what was assumed.
         failures: frames that could not be audited.
         grid: name of the grids that was asked for.
-        is_whole: False if only a part of the frames was counted, and nothing was judged.
         elapsed_s: duration, in seconds.
     """
 
@@ -83,7 +88,6 @@ class AuditResult:
     notes: tuple[str, ...] = ()
     failures: tuple[AuditFailure, ...] = ()
     grid: str | None = None
-    is_whole: bool = True
     elapsed_s: float = field(default=0.0, compare=False)
 
     @property

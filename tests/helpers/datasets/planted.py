@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,13 @@ from pathlib import Path
 import numpy as np
 
 import carlasc
-from carlasc import GridSpec
-from carlasc.core.geometry import invert, transform_points
+from carlasc import Boxes, GridSpec
+from carlasc.core.benchmarks import CARLAOCC_TO_CARLA
+from carlasc.core.geometry import invert, quaternions_of, transform_points
+from carlasc.groundtruth import FromScans
+from carlasc.groundtruth.from_scans.feed import ScanFeed
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
+from carlasc.motion import MotionOptions
 from carlasc.storage import FolderSink, Sequence, layout
 
 GRID = "evaluation"
@@ -131,3 +137,43 @@ def fastest(sequence: Sequence) -> int:
         for instance, count in zip(*np.unique(scan.instances[fast & inside], return_counts=True), strict=True):
             seen[int(instance)] = seen.get(int(instance), 0) + int(count)
     return max(seen, key=seen.get)
+
+
+def without_fields(source: Path, out: Path, *fields: str) -> Path:
+    """Copy the recording of a sequence without some fields, and without its grids."""
+    folders = [layout.field_named(field).file(0).split("/")[0] for field in fields]
+    shutil.copytree(source, out, ignore=shutil.ignore_patterns(*folders, GRID))
+    return out
+
+
+def with_boxes(source: Path, out: Path) -> Path:
+    """Copy the recording of a sequence with boxes around what moves, instead of instances and flow."""
+    sequence = sequence_of(source)
+    feed = ScanFeed(sequence, FromScans(motion=MotionOptions("instances")))
+    tracks = find_actors(feed).tracks.values()
+    writer = FolderSink(without_fields(source, out, "instances", "flow")).sequence("cartesian")
+    for frame in sequence.frames("points").tolist():
+        sensor_T_world = invert(sequence.read_pose(frame))
+        seen = [(track, sensor_T_world @ pose) for track in tracks if (pose := track.pose(frame)) is not None]
+        poses = np.stack([pose for _, pose in seen]) if seen else np.empty((0, 4, 4))
+        numbers = np.array([[t.instance, t.label] for t, _ in seen], np.uint32).reshape(-1, 2)
+        sizes = np.array([t.size for t, _ in seen]).reshape(-1, 3)
+        known = np.ones(len(seen), np.bool_)
+        boxes = Boxes(*numbers.T, poses[:, :3, 3], quaternions_of(poses[:, :3, :3]), sizes, known)
+        writer.write("boxes", frame, boxes.to_table())
+    return out
+
+
+def write_carlaocc(source: Path, out: Path, name: str = "Town01_Opt_Seq07") -> None:
+    """Write left-handed grids of CARLA's classes as a sequence of CarlaOcc, whose axes are right-handed."""
+    sequence = sequence_of(source)
+    spec, folder = sequence.grids[GRID], out / name / "occupancy" / "vs_0_4_surround_view"
+    tag_of = {new: tag for tag, new in reversed(CARLAOCC_TO_CARLA.mapping.items())}
+    tags = np.array([tag_of.get(i, 0) for i in range(max(tag_of) + 1)], np.uint16)
+    folder.mkdir(parents=True)
+    for frame in sequence.frames(f"{GRID}/labels").tolist():
+        labels = tags[sequence.grid(GRID, frame).labels[:, ::-1]]
+        cells = np.argwhere(labels > 0)
+        rows = np.column_stack([cells, 1000 * labels[labels > 0]]).astype(np.uint16)
+        geometry = {"voxel_size": spec.voxel_size[0], "voxel_origin": np.float32(spec.lower), "volume_size": spec.size}
+        np.savez_compressed(folder / f"{frame:04d}.npz", occupancy=rows, **geometry)

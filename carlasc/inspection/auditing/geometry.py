@@ -1,0 +1,166 @@
+"""The verdicts on the geometry, the times and the drift of grids.
+
+The share of the points of scans that lie in occupied voxels is highest where scans and grids belong together, and falls within a tenth of a
+voxel. Each correction is therefore a hypothesis, and the best one names the fault and its size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.wording import count
+from carlasc.inspection.auditing.hypotheses import AXES, Family, families, shift_step
+from carlasc.inspection.auditing.matching import MatchedGrids
+from carlasc.inspection.auditing.sums import Stretches
+from carlasc.inspection.auditing.verdicts import State, Verdict
+
+# A correction must raise the share of points in occupied voxels by so much, and lower that of others by this factor.
+_GAIN, _FEWER = 0.01, 1.3
+_ALIKE = 0.02  # axes and lags whose shares differ by less are not told apart
+_SAME = 0.25  # of the gain: corrections whose gains differ by less are not told apart
+_FLAT = 0.006  # values whose shares differ by less are equal
+_BELONGS = 0.75  # share of points below which scans and grids do not belong together
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How well the corrections of a family fit."""
+
+    family: Family
+    shares: NDArray[np.float64]  # (1 + DRAWS, V), -1 where no point was tried
+
+    @cached_property
+    def best(self) -> int:
+        return int(self.shares[0].argmax())
+
+    @property
+    def value(self) -> float:
+        return float(self.family.values[self.best])
+
+    @property
+    def is_measured(self) -> bool:
+        return float(np.delete(self.shares[0], self.family.neutral).max()) >= 0
+
+    @property
+    def gain(self) -> float:
+        return float(self.shares[0, self.best] - self.shares[0, self.family.neutral])
+
+    @property
+    def is_fault(self) -> bool:
+        """Whether a correction fits better than the data as they are, by more than chance, and the fault is not too small to matter."""
+        family = self.family
+        own, best = (1 - float(self.shares[0, row]) for row in (family.neutral, self.best))
+        gains = self.shares[1:, self.best] - self.shares[1:, family.neutral]
+        if self.gain < _GAIN or own < _FEWER * best or float(np.quantile(gains, 0.025)) <= 0:
+            return False
+        neutral = float(family.values[family.neutral])
+        low, high = self.interval
+        is_large = abs(self.value - neutral) >= 0.99 * family.least and not low <= neutral <= high
+        return is_large or family.kind in ("axes", "lag")
+
+    @cached_property
+    def interval(self) -> tuple[float, float]:
+        """The values about the best one that fit as well, and those that are best in nearly all draws."""
+        values, worse = self.family.values, np.flatnonzero(self.shares[0] < self.shares[0, self.best] - _FLAT)
+        low = int(worse[worse < self.best].max(initial=-1)) + 1
+        high = int(worse[worse > self.best].min(initial=len(values))) - 1
+        drawn = np.quantile(values[self.shares[1:].argmax(axis=1)], (0.025, 0.975))
+        return min(float(values[low]), float(drawn[0])), max(float(values[high]), float(drawn[1]))
+
+
+def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]:
+    """Yield the verdicts on axes, shifts, yaw, voxel size, drift of height, and lag, from the sums of a sequence."""
+    sums = stretches.drawn("fits")
+    if sums is None or not sums[0, 0, 0]:
+        text = "no point of a scan is inside a grid"
+        yield Verdict("geometry", "undetermined", None, None, None, "", text, one.path)
+        return
+    shares = np.where(sums[..., 0] > 0, sums[..., 1] / np.maximum(sums[..., 0], 1), -1.0)
+    kinds = families(one.spec)
+    ends = np.cumsum([len(family.values) for family in kinds])
+    fits = [_Fit(family, part) for family, part in zip(kinds, np.split(shares, ends[:-1], axis=1), strict=True)]
+    top, own = max(float(fit.shares[0].max()) for fit in fits), shares[:, 0]
+    low, high = np.quantile(own[1:], (0.025, 0.975)).tolist()
+    text = f"{own[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} under the best correction"
+    state: State = "sound" if top >= _BELONGS else "fault"
+    advice = f"these are scans of another sequence, or the grids are in a frame that no correction reaches; tried: {one.pair}"
+    yield Verdict("fit", state, float(own[0]), low, high, "share", text, one.path, "" if state == "sound" else advice)
+    if state == "fault":
+        return
+    found = [fit for fit in fits if fit.is_measured and fit.is_fault]
+    if not found:
+        yield from (_sound_or_not(fit, one.path) for fit in fits)
+        return
+    best = max(found, key=lambda fit: fit.gain)
+    # of corrections that fit nearly as well, a shift needs fewer assumptions than another size
+    near = [fit for fit in found if fit.family.kind == "shift" and fit.gain >= (1 - _SAME / 5) * best.gain]
+    winner = max(near, key=lambda fit: fit.gain) if near and best.family.kind == "voxel size" else best
+    for fit in found:
+        together = fit.family.kind == winner.family.kind == "shift" and fit.gain >= _SAME * winner.gain
+        if fit is winner or together:
+            yield _fault(fit, found, one)
+    text = f"the rest is not told before {winner.family.name} is right"
+    yield Verdict("other geometry", "undetermined", None, None, None, "", text, one.path)
+
+
+def _fault(fit: _Fit, found: list[_Fit], one: MatchedGrids) -> Verdict:
+    family, (low, high) = fit.family, fit.interval
+    others = [
+        o for o in found if o is not fit and o.family.kind != "voxel size" and o.gain >= (1 - _SAME / 3) * fit.gain
+    ]
+    also = f"; {' or '.join(o.family.name for o in others)} explains it nearly as well" if others else ""
+    own, best = (float(fit.shares[0, row]) for row in (family.neutral, fit.best))
+    text = f"{_describe(fit, one)}: undone, {best:.1%} instead of {own:.1%} of points are in occupied voxels{also}"
+    if family.kind == "axes":
+        low = high = fit.value
+    return Verdict(family.name, "fault", fit.value, low, high, family.unit, text, one.path, family.advice)
+
+
+def _sound_or_not(fit: _Fit, where: str) -> Verdict:
+    """Return the verdict of a family that explains nothing better: sound, if the right value is told from others."""
+    family, shares, (low, high) = fit.family, fit.shares[0], fit.interval
+    neutral, measured, unclear = float(family.values[family.neutral]), fit.value, ""
+    if family.kind == "axes":
+        others = np.flatnonzero(shares[1:] >= shares[0] - _ALIKE)
+        unclear = f"the scene looks the same with {AXES[others[0] + 1][0]}" if len(others) else ""
+        text, measured, low, high = "those of the scans", neutral, neutral, neutral
+    elif family.kind == "lag":
+        near = shares[np.abs(family.values) == 1]
+        unclear = "the vehicle hardly moves" if (near >= shares[family.neutral] - _ALIKE).any() else ""
+        text, measured, low, high = "grids fit their own scans best", neutral, neutral, neutral
+    else:
+        unclear = f"the drive does not tell values from {low:.3g} to {high:.3g} {family.unit} apart"
+        unclear = unclear if high - low > family.widest else ""
+        small = "" if fit.value == neutral else ", too little to matter"
+        text = f"{fit.value:.3g} {family.unit} (95 %: {low:.3g} to {high:.3g}){small}"
+    if not fit.is_measured:
+        unclear = "no other scans near enough, or no poses"
+    if unclear:
+        return Verdict(family.name, "undetermined", None, None, None, family.unit, unclear, where)
+    return Verdict(family.name, "sound", measured, low, high, family.unit, text, where)
+
+
+def _describe(fit: _Fit, one: MatchedGrids) -> str:
+    value, (low, high), name = fit.value, fit.interval, fit.family.name
+    ends = f"(95 %: {low:.3g} to {high:.3g})"
+    if fit.family.kind == "axes":
+        return AXES[fit.best][0]
+    if fit.family.kind == "lag":
+        late, other = ("late", "before") if value < 0 else ("early", "after")
+        frames = f"{count(round(abs(value)), 'frame')} ({abs(value) * one.period_s:.2f} s)"
+        return f"grids are {frames} {late}: each shows what a scan {other} its own saw"
+    if fit.family.kind == "shift":
+        voxels = value / shift_step(one.spec, name[-1])
+        return f"grids are moved by {value:.3f} m along {name[-1]}, {voxels:.2f} voxels {ends}"
+    if fit.family.kind == "yaw":
+        return f"grids are turned by {value:.2f} degrees {ends}"
+    if fit.family.kind == "height drift":
+        return f"places that were seen later are {value:.2f} m/s higher {ends}"
+    axes = (0, 1) if "x, y" in name else (2,) if " z" in name else (0, 1, 2)
+    true = ", ".join(f"{one.spec.voxel_size[axis] / value:.3g}" for axis in axes)
+    return f"declared is {value:.3f} times the true one {ends}, which is {true} m"
