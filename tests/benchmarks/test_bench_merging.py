@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import time
 import tracemalloc
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from carlasc import FromScans, GridSpec, Voting
+from carlasc import FromScans, GridSpec, Run, Voting
 from carlasc.core.frames import FrameRange
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
+from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.motion import MotionOptions
 from carlasc.motion.tracks import MovingActors
@@ -85,3 +87,12 @@ def test_a_frame_with_a_part_of_the_rays(benchmark: Any, tmp_path: Path, res: fl
     make()  # compiled, and the scans are read
     assert len(feed.read(frame).rays) == places
     assert benchmark.pedantic(make, rounds=3 if benchmark.enabled else 1).grid.known.any()
+
+
+def test_the_pass_that_finds_what_moves(benchmark: Any, tmp_path: Path) -> None:
+    feed = feed_of(tmp_path, benchmark.enabled)
+    feed = ScanFeed(feed.sequence, FromScans(motion=MotionOptions("evidence")))
+    run = partial(find_actors, feed, Run(workers=1))
+    run()  # compiled
+    actors = benchmark.pedantic(run, rounds=3 if benchmark.enabled else 1)
+    assert bool(actors.tracks) == benchmark.enabled  # three scans show nothing that moves

@@ -61,6 +61,18 @@ FILES: dict[str, dict[str, Row]] = {
         )
         for res, name in ((0.4, "coarse"), (0.2, "fine"), (0.1, "finest"))
         for kind in ("grid", "and evidence")
+    }
+    | {
+        f"test_a_frame_with_a_part_of_the_rays[{res}-{rays}-turning]": Row(
+            f"merging.{name}.{rays}", "ms", f"a frame from 31 merged scans at {res} m, rays from 20 places, {rays}"
+        )
+        for res, name in ((0.4, "coarse"), (0.2, "fine"))
+        for rays in ("all", "enough")
+    }
+    | {
+        "test_the_pass_that_finds_what_moves": Row(
+            "merging.pass", "ms", "finding what moves by free space, per scan of 57,600 rays", 31
+        )
     },
     "poses": {
         f"test_poses_of_a_drive[{name}]": Row(
