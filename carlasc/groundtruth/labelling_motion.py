@@ -27,7 +27,7 @@ from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.copying import counter
-from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence, sequences_with_scans
+from carlasc.storage.derived_copies import CopyResult, DerivedCopy, MadeSequence, sequences_with_scans
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
@@ -109,7 +109,7 @@ def label_motion(
     step, moving, notes = counter(progress, scans + files), dict[str, _MovingSequence](), list[str]()
     with one_pool(run) as pool:
         for path, one in inputs.items():
-            _find(one, copy.writer(path), pool, step)
+            find_moving(one, copy.writer(path), pool, step)
             moving[path] = _MovingSequence(given[path], one.feed, one.actors)
             notes += [note for note in one.notes() if "grids" not in note]
         after = replace(pool, progress=lambda done, total: progress(scans + done, scans + total))
@@ -121,7 +121,7 @@ def label_motion(
     )
 
 
-def _find(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]) -> None:
+def find_moving(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]) -> None:
     """Find the actors of a sequence, or read what an interrupted run kept with `writer`."""
     if writer is not None:
         inputs.prepare(writer, run, step)
@@ -130,32 +130,18 @@ def _find(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: C
     inputs.actors = with_numbers(find_actors(inputs.feed, run, step), inputs.feed)
 
 
-class _MovingSequence(DerivedSequence):
+class _MovingSequence(MadeSequence):
     """A sequence with the instances and the flow of what was found to move."""
 
     def __init__(self, whole: Sequence, feed: ScanFeed, actors: MovingActors) -> None:
         extra = {**whole.metadata.extra, "motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}"}
-        super().__init__(whole, {layout.METADATA: replace(whole.metadata, extra=extra).to_json()}, changed=_WRITTEN)
+        super().__init__(whole, replace(whole.metadata, extra=extra), _WRITTEN)
         self._feed, self.actors = feed, actors
-        self._made: dict[int, NDArray[np.float32]] = {}  # flow of the frames whose instances have been read
 
-    def fields(self) -> frozenset[str]:
-        """Return the fields that do not change, and those that were found."""
-        return self.kept | set(_WRITTEN)
-
-    def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames of a field."""
-        return self.whole.frames("points") if field in _WRITTEN else super().frames(field)
-
-    def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one field of one frame."""
-        if field not in _WRITTEN:
-            return self.whole.read(field, frame)
-        if field == "flow" and frame in self._made:
-            return self._made.pop(frame)
+    def make(self, frame: int) -> dict[str, NDArray[Any]]:
+        """Return the instances and the flow of a frame."""
         instances, flow = points_of_actors(self._feed, self.actors.between(frame, frame), frame)
-        self._made = {frame: flow} if field == "instances" else {}
-        return instances if field == "instances" else flow
+        return {"instances": instances, "flow": flow}
 
 
 def points_of_actors(

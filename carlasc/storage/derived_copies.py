@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -95,6 +96,35 @@ class DerivedSequence(SequenceView):
     def read_document(self, name: str) -> bytes:
         """Return the bytes of a text file."""
         return self.texts[name] if name in self.texts else self.whole.read_document(name)
+
+
+class MadeSequence(DerivedSequence):
+    """A sequence with fields of its scans that are made from the whole one, all of those of a frame at once."""
+
+    def __init__(self, whole: Sequence, metadata: Metadata, made: Collection[str], stale: Collection[str] = ()) -> None:
+        super().__init__(whole, {layout.METADATA: metadata.to_json()}, changed=made, stale=stale)
+        self._names = frozenset(made)
+        self._made: dict[tuple[str, int], NDArray[Any]] = {}  # what was made and not yet read
+
+    @abstractmethod
+    def make(self, frame: int) -> Mapping[str, NDArray[Any]]:
+        """Return the fields of a frame that are made."""
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields that do not change, and those that are made."""
+        return self.kept | self._names
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames of a field: all scans have those that are made."""
+        return self.whole.frames("points") if field in self._names else super().frames(field)
+
+    def read(self, field: str, frame: int) -> NDArray[Any]:
+        """Read one field of one frame."""
+        if field not in self._names:
+            return self.whole.read(field, frame)
+        if (field, frame) not in self._made:
+            self._made |= {(name, frame): array for name, array in self.make(frame).items()}
+        return self._made.pop((field, frame))
 
 
 def sequences_with_scans(source: Source) -> dict[str, Sequence]:
