@@ -275,7 +275,9 @@ def test_scores_are_broken_down_by_distance_height_and_visibility(folders, world
     assert sum(m.total for name, m in parts.items() if name.endswith("up")) == result.matrix.total
     assert parts["0-10 m"].total == result.matrix.total
     assert result.tables()[-1].rows[0][0] == "0-10 m"
-    with pytest.raises(ArgumentError, match="by: expected any of distance, height, visibility, motion, seen, found 'colour'"):
+    with pytest.raises(
+        ArgumentError, match="by: expected any of distance, height, visibility, motion, seen, found 'colour'"
+    ):
         evaluate(*folders, scoring=Scoring(by=("colour",)))
 
 
