@@ -159,7 +159,7 @@ class _ShownSequence(MadeSequence):
         return dict(zip(_WRITTEN, self.painter.paint(frame), strict=True))
 
 
-class _Photo(NamedTuple):
+class _ClassImage(NamedTuple):
     """What an image says of points.
 
     Attributes:
@@ -246,7 +246,7 @@ class Painter:
                 _add(sums, rows[kept], weights, photo, np.rint(pixels[kept]).astype(np.int64))
         return sums
 
-    def _photos(self, frame: int) -> Iterator[_Photo]:
+    def _photos(self, frame: int) -> Iterator[_ClassImage]:
         """Yield what the images of a frame say; those of frames that were asked last are kept."""
         key = (self.key, frame)
         if key not in _PHOTOS:
@@ -258,7 +258,7 @@ class Painter:
         _PHOTOS.move_to_end(key)
         yield from _PHOTOS[key]
 
-    def _read_photos(self, frame: int) -> Iterator[_Photo]:
+    def _read_photos(self, frame: int) -> Iterator[_ClassImage]:
         sequence = self.feed.sequence
         if frame not in self.feed.frames:
             return
@@ -286,10 +286,10 @@ class Painter:
             pixels = camera.project(in_camera)
             inside = camera.contains(pixels)
             nearest, cell = _nearest(camera, pixels[inside], in_camera[inside, 2])
-            yield _Photo(camera, pose @ place, late, ids, sure, nearest, cell)
+            yield _ClassImage(camera, pose @ place, late, ids, sure, nearest, cell)
 
 
-_PHOTOS: OrderedDict[tuple[str, int], list[_Photo]] = OrderedDict()  # of this process, those asked last at the end
+_PHOTOS: OrderedDict[tuple[str, int], list[_ClassImage]] = OrderedDict()  # of this process, those asked last at the end
 
 
 def _nearest(
@@ -309,7 +309,7 @@ def _cells(pixels: NDArray[np.float64], cell_px: float) -> NDArray[np.int64]:
     return ((pixels + 0.5) // cell_px).astype(np.int64).T
 
 
-def _hidden(photo: _Photo, pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _hidden(photo: _ClassImage, pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which points have nearer ones around them in an image: in their cell, to the left and the right, or above and below."""
     padded = np.pad(photo.nearest, _REACH_CELLS, constant_values=np.inf)
     columns, rows = _cells(pixels, photo.cell_px) + _REACH_CELLS
@@ -329,7 +329,7 @@ def _add(
     sums: NDArray[np.float32],
     rows: NDArray[np.int64],
     weights: NDArray[np.float32],
-    photo: _Photo,
+    photo: _ClassImage,
     pixels: NDArray[np.int64],
 ) -> None:
     """Add what the pixels at some points say to the weights of classes: the less pixels around them agree, the less it counts."""

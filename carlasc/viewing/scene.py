@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_spec, mirror_voxels
 from carlasc.core.boxes import Boxes
+from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import Transform
@@ -22,6 +23,7 @@ from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
 from carlasc.metrics.grids import check_same_geometry, compare_grids
+from carlasc.storage.camera_files import cameras_of, has_image, image_bytes, scan_T_camera
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ERRORS, PALETTES, ClassColors, PaletteName
 from carlasc.viewing.finding import (
@@ -168,6 +170,26 @@ class GridPanel:
     spec: GridSpec
     colors: ClassColors
     name: str = "grid"
+
+
+@dataclass(frozen=True)
+class Photo:
+    """The image of a camera.
+
+    Attributes:
+        camera: the camera.
+        ego_T_camera: (4, 4) where it was when it took the image, in the frame of the scan.
+        data: the image as the bytes of a JPEG or PNG.
+    """
+
+    camera: CameraModel
+    ego_T_camera: Transform
+    data: bytes
+
+    @property
+    def kind(self) -> str:
+        """The format of the image: "jpeg" or "png"."""
+        return "png" if self.data.startswith(b"\x89PNG") else "jpeg"
 
 
 @dataclass(frozen=True)
@@ -342,6 +364,20 @@ class SceneReader:
         if frame not in self.data.sequence.frames("bev"):
             return None
         return self.data.sequence.read("bev", frame).tobytes()
+
+    def read_photos(self, frame: int) -> tuple[Photo, ...]:
+        """Read the images of a frame; of cameras without one, nothing.
+
+        Raises:
+            FormatError: the calibration is damaged.
+        """
+        sequence, found = self.data.sequence, []
+        mirror = np.diag([1.0, -1.0 if self.mirrored else 1.0, 1.0, 1.0])
+        for camera in cameras_of(sequence).values():
+            place = scan_T_camera(sequence, camera, frame) if has_image(sequence, camera, frame) else None
+            if place is not None:
+                found.append(Photo(camera, mirror @ place, image_bytes(sequence, camera, frame)[0]))
+        return tuple(found)
 
     def _read_grids(self, frame: int) -> tuple[Grid, ...]:
         if not self.data.grid:

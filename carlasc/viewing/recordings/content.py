@@ -18,7 +18,7 @@ from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
 from carlasc.viewing.rendering.drawings import motion_arrows
 from carlasc.viewing.rendering.meshes import SQUARE, split_arcs, surrounded
-from carlasc.viewing.scene import FrameContent, SceneReader
+from carlasc.viewing.scene import FrameContent, Photo, SceneReader
 
 LONGEST = 50
 """Frames that a trail reaches back: five seconds at the rate of the data."""
@@ -177,6 +177,7 @@ class RecordedFrame:
         pose: (4, 4) world_T_sensor, where the world is the frame of the first scan; None if the sequence has no poses.
         trails: the ways of the actors up to this frame, in the world.
         picture: the bird's-eye camera picture as its JPEG bytes, or None.
+        photos: the images of the cameras.
     """
 
     number: int
@@ -189,6 +190,7 @@ class RecordedFrame:
     pose: Transform | None
     trails: tuple[Trail, ...]
     picture: bytes | None
+    photos: tuple[Photo, ...] = ()
 
 
 class RecordingWriter(Protocol):
@@ -231,6 +233,7 @@ def record_frames(reader: SceneReader, max_points: int | None) -> Iterator[Recor
             content.pose,
             trails.follow(content),
             reader.read_picture(number),
+            reader.read_photos(number),
         )
 
 
