@@ -47,7 +47,7 @@ from carlasc.storage.protocol import Sequence, Source
 
 _WRITTEN = ("labels", "probabilities")
 
-# Chosen on one simulated drive: see docs/howto/cameras.md.
+# Chosen on two simulated drives: see docs/howto/cameras.md.
 _ASKED = (0, -3, 3, -6, 6, -10, 10, -15, 15, -20, 20)  # frames whose images a point asks, relative to its own
 _OTHER, _BEHIND_VOXELS = (
     np.float32(0.02),

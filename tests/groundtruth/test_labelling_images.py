@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.scenes.box_street import Street, drive, write_drive
+from helpers.scenes.box_street import Street, cast_image, drive, write_drive
 from typer.testing import CliRunner
 
 import carlasc
@@ -21,7 +21,7 @@ from carlasc.storage.folder import FolderSequence
 
 pytest.importorskip("PIL")
 ONE, SEED, FRAMES = Run(workers=1), 3, 4
-WIDTH, HEIGHT, SKY = 200, 100, 13
+WIDTH, HEIGHT = 200, 100
 
 
 def street_camera(yaw_deg):
@@ -29,16 +29,6 @@ def street_camera(yaw_deg):
     place[:3, 3] = 0.4, 0.0, -0.2
     matrix = np.array([[110.0, 0, (WIDTH - 1) / 2], [0, 110, (HEIGHT - 1) / 2], [0, 0, 1]])
     return CameraModel(name=f"at{yaw_deg}", width=WIDTH, height=HEIGHT, matrix=matrix, sensor_T_camera=place)
-
-
-def cast_image(street, world_T_sensor, one):
-    """Return (H, W) what a camera sees in a street: classes, and distances along its rays."""
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH].reshape(2, -1)
-    world_T_camera = world_T_sensor @ one.sensor_T_camera
-    rays = one.unproject(np.stack([columns, rows], axis=1)) @ world_T_camera[:3, :3].T
-    distances, labels = street._cast(world_T_camera[:3, 3], rays)
-    labels[~(distances < 200)] = SKY
-    return labels.reshape(HEIGHT, WIDTH).astype(np.uint8), distances.reshape(HEIGHT, WIDTH)
 
 
 @pytest.fixture(scope="module")
