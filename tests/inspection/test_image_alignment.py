@@ -38,6 +38,7 @@ def agreement(folder):
     return found
 
 
+@pytest.mark.slow
 def test_images_that_fit_are_said_to_fit(tmp_path):
     found = agreement(write(tmp_path))
     assert found.shift_px == pytest.approx(0, abs=2) and found.late_s == pytest.approx(0, abs=0.02)
@@ -53,11 +54,13 @@ def test_a_shift_of_the_image_is_a_warning_with_its_pixels(tmp_path):
     assert "pixels to the right" in result.sequences[0].images["side"]
 
 
+@pytest.mark.slow
 def test_images_of_the_next_frame_are_late(tmp_path):
     found = agreement(write(tmp_path, late=1))
     assert found.late_s == pytest.approx(0.1, abs=0.02) and found.is_wrong
 
 
+@pytest.mark.slow
 def test_noise_determines_nothing(tmp_path):
     found = agreement(write(tmp_path, noise=True))
     assert (found.shift_px, found.late_s) == (None, None) and str(found) == "undetermined, undetermined"
