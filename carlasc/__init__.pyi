@@ -31,6 +31,7 @@ from .groundtruth import FromCapture as FromCapture
 from .groundtruth import FromGrid as FromGrid
 from .groundtruth import FromScans as FromScans
 from .groundtruth import Voting as Voting
+from .groundtruth import label_images as label_images
 from .groundtruth import label_motion as label_motion
 from .groundtruth import map as map
 from .groundtruth import refine as refine

@@ -27,7 +27,7 @@ def test_the_page_shows_what_its_commands_draw_and_nothing_else(gallery):
     drawn = [shlex.split(line) for section in sections for line in section.commands if " render " in line]
     assert [words[words.index("-o") + 1] for words in drawn] == shown
     assert sorted(shown) == sorted(path.name for path in gallery.IMAGES.iterdir())
-    assert len([name for name in shown if name.endswith(".png")]) == 13
+    assert len([name for name in shown if name.endswith(".png")]) == 15
     assert len([name for name in shown if name.endswith(".webp")]) == 2
 
 

@@ -19,6 +19,20 @@ OutArgument = Annotated[
 ]
 
 
+CamerasOption = Annotated[
+    str,
+    typer.Option(
+        help="Cameras of the vehicle, separated by commas: front, front_left, front_right, left, right, back_left, back_right, back.",
+        metavar="NAMES",
+    ),
+]
+
+
+def camera_names(cameras: str) -> tuple[str, ...]:
+    """Return the names that the option gives."""
+    return tuple(filter(None, map(str.strip, cameras.split(","))))
+
+
 @dataclass(frozen=True)
 class SensorFlags(Flags):
     """What drives and what records it: the same in `simulate` and in `capture`."""
@@ -62,6 +76,7 @@ def capture(
     sensors: SensorFlags,
     out: OutArgument,
     count: Annotated[int, typer.Option(help="Number of frames, 0.1 s apart.", min=1)] = 2000,
+    cameras: CamerasOption = "",
     json: Json = False,
 ) -> None:
     """Record a drive on a running CARLA server as a raw capture.
@@ -73,7 +88,13 @@ def capture(
     with progress_bar("capture") as progress:
         place = carlasc.captures.ServerOptions(server.host, server.port, server.traffic_port, server.timeout_s)
         result = carlasc.record(
-            out, server=place, town=server.town, count=count, **sensors.arguments(), progress=progress
+            out,
+            server=place,
+            town=server.town,
+            count=count,
+            **sensors.arguments(),
+            cameras=camera_names(cameras),
+            progress=progress,
         )
     if json:
         print_json(result)

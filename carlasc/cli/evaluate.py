@@ -69,7 +69,8 @@ class ScoringFlags(Flags):
     by: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="PART", help="Also score by distance, height, visibility or motion; may be given several times."
+            metavar="PART",
+            help="Also score by distance, height, visibility, motion or seen (by a camera); may be given several times.",
         ),
     ] = None
     rays: Annotated[

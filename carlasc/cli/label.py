@@ -22,9 +22,16 @@ def label(
         typer.Option(
             "--from",
             metavar="FILES",
-            help="Folder of the predictions: a file for each frame, by sequence. motion: what carlasc finds to move, as instances and flow.",
+            help="Folder of the predictions: a file for each frame, by sequence. motion: what carlasc finds to move, as instances and flow. images: the classes of the pixels that show the points.",
         ),
     ],
+    pixels: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="With --from images, classes of pixels: SEQUENCE/CAMERA/000000.png or .npy; default: image_labels of SOURCE.",
+        ),
+    ] = None,
     motion: Annotated[
         carlasc.motion.MotionSource | None,
         typer.Option(help="With --from motion, what tells which points move; default: the best field, and free space."),
@@ -40,30 +47,38 @@ def label(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what this command has made.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a copy of SOURCE with the labels that a network predicted, or with what moves in it. SOURCE is not changed.
+    """Write a copy of SOURCE with the labels that a network predicted for its points or images, or with what moves in it. SOURCE is not changed.
 
     Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
     """
+    if pixels is not None and predictions != "images":
+        raise ArgumentError("pixels", expected="--from images", found=f"--from {predictions}")
+    others: dict[str, object] = {"--logits": logits, "--frames": frames}
+    others |= {"--classes": classes, "--by": by} if predictions == "motion" else {}
+    if predictions in ("motion", "images") and (given := [name for name, value in others.items() if value]):
+        raise ArgumentError("predictions", expected=f"no {given[0]} with --from {predictions}", found=given[0])
     if predictions == "motion":
-        others = {"--classes": classes, "--logits": logits, "--by": by, "--frames": frames}
-        if given := [name for name, value in others.items() if value]:
-            raise ArgumentError("predictions", expected=f"no {given[0]} with --from motion", found=given[0])
         _label_motion(source, out, motion or "auto", overwrite, run, json)
         return
     if motion is not None:
         raise ArgumentError("motion", expected="--from motion", found=f"--from {predictions}")
     with run.spread("Labelling", "files") as spread:
-        result = carlasc.label(
-            source,
-            out,
-            predictions,
-            classes=classes,
-            logits=logits,
-            by=by,
-            frames=frames,
-            overwrite=overwrite,
-            run=spread,
-        )
+        if predictions == "images":
+            result = carlasc.label_images(
+                source, out, pixels=pixels, classes=classes, by=by, overwrite=overwrite, run=spread
+            )
+        else:
+            result = carlasc.label(
+                source,
+                out,
+                predictions,
+                classes=classes,
+                logits=logits,
+                by=by,
+                frames=frames,
+                overwrite=overwrite,
+                run=spread,
+            )
     if json:
         print_json(result)
         return

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 import carlasc
-from carlasc.cli.capture import OutArgument, SensorFlags
+from carlasc.cli.capture import CamerasOption, OutArgument, SensorFlags, camera_names
 from carlasc.cli.common import Json, console, print_frames, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import GridFlags
@@ -20,13 +20,7 @@ def simulate(
     out: OutArgument,
     count: Annotated[int, typer.Option(help="Number of frames, 0.1 s apart.", min=1)] = 20,
     first_frame: Annotated[int, typer.Option(help="Number of the first frame. The drive starts at 0.", min=0)] = 0,
-    cameras: Annotated[
-        str,
-        typer.Option(
-            help="Cameras of the vehicle, separated by commas: front, front_left, front_right, left, right, back_left, back_right, back.",
-            metavar="NAMES",
-        ),
-    ] = "",
+    cameras: CamerasOption = "",
     grid: GridFlags,
     json: Json = False,
     sensors: SensorFlags,
@@ -38,7 +32,7 @@ def simulate(
     written, and no raw capture. A second run with the same options writes only the frames that are missing.
     """
     drive = {"count": count, "first_frame": first_frame, **sensors.arguments()}
-    drive["cameras"] = tuple(filter(None, map(str.strip, cameras.split(","))))
+    drive["cameras"] = camera_names(cameras)
     if not grid.is_given and PurePosixPath(out).suffix != ".zarr":
         with run.spread("simulate") as spread:
             written = carlasc.simulate(out, **drive, run=spread)

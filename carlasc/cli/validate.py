@@ -134,6 +134,8 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
         if report.mounting:
             mounting = ", ".join(f"{axis} {value}" for axis, value in report.mounting.items())
             out.print(line(f"  sensor in the frame of the poses: {mounting}"), soft_wrap=True)
+        for camera, agreement in report.images.items():
+            out.print(line(f"  images of {camera} on the scans: {agreement}"), soft_wrap=True)
     counts = ", ".join(f"{result.count(severity)} {severity}s" for severity in SEVERITIES)
     out.print(line(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold"), soft_wrap=True)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -36,6 +35,8 @@ def write_cameras(plan: RecordingPlan, target: AxesAndClasses, images: Images) -
     content = cameras_to_json(written)
     if plan.writer.read_document(layout.CAMERAS) != content:
         plan.writer.write_document(layout.CAMERAS, content)
+    if images == "link" and not any(camera.images for camera in cameras):
+        return ["no image of a camera lies in a file of its own: --images copy writes those that exist"]
     return _copy_images(plan, cameras) if images == "copy" else []
 
 
@@ -55,13 +56,12 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
         found: dict[int, dict[str, np.ndarray]] = {}
         for number in numbers:
             for camera in cameras:
-                path = Path(camera.images[number] if camera.images else "")
-                if path.suffix not in (".jpg", ".png") or not path.is_file():
+                if any(plan.writer.has(f"images.{camera.name}.{suffix}", number) for suffix in layout.IMAGE_SUFFIXES):
+                    continue
+                if (image := plan.recording.image(camera, number)) is None:
                     missing += 1
                     continue
-                field = f"images.{camera.name}{path.suffix}"
-                if not plan.writer.has(field, number):
-                    found.setdefault(number, {})[field] = np.frombuffer(path.read_bytes(), np.uint8)
+                found.setdefault(number, {})[f"images.{camera.name}.{image[0]}"] = np.frombuffer(image[1], np.uint8)
         if found:
             plan.writer.write_frames(found)
     return [f"{missing} images of cameras do not exist, or are neither .jpg nor .png"] if missing else []

@@ -248,6 +248,14 @@ class Recording(ABC):
         """
         return ()
 
+    def image(self, camera: CameraModel, frame: int) -> tuple[str, bytes] | None:
+        """Return the image of one of the cameras: the ending of its file, "jpg" or "png", and its bytes; None if there is none.
+
+        It is the file that `images` of the camera names, unless a recording keeps its images in another way.
+        """
+        path = Path(camera.images[frame] if camera.images else "")
+        return (path.suffix[1:], path.read_bytes()) if path.suffix in (".jpg", ".png") and path.is_file() else None
+
     def problems(self) -> list[tuple[int, str]]:
         """Return (frame number, message in one line) of frames that should exist and do not."""
         return []

@@ -50,5 +50,5 @@ StyleName = Literal["screen", "paper"]
 PaletteName = Literal["class", "colorblind", "height"]
 """The colours of classes, or colours by height."""
 
-GridColor = Literal["class", "confidence", "views", "votes", "inferred", "actor"]
+GridColor = Literal["class", "confidence", "views", "votes", "inferred", "actor", "seen"]
 """What the colours of a grid mean: its classes, one of the kinds of evidence (see `docs/format.md#evidence`), or who is in it."""

@@ -8,6 +8,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cameras import CameraModel
 from carlasc.errors import import_extra
 
 FIELDS = (
@@ -28,9 +29,10 @@ EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
 """Fields of grids that say how certain each voxel is, which published grids do not."""
 ACTOR_FIELDS = ("instances", "voxel_flow")
 """Fields of grids that say who is in each voxel, and how fast it moves."""
-CAMERA_FIELDS = ("camera_visible",)
-"""Fields of grids of data with cameras."""
+CAMERA_FIELDS = ("camera_visible", "images", "cameras")
+"""Fields of data with cameras."""
 ALWAYS = ("valid", "sequence", "frame")
+PLAIN = ("cameras",)  # no arrays
 RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of the scan
 
 
@@ -50,6 +52,8 @@ class Sample(TypedDict, total=False):
     instances: NDArray[np.int64]
     voxel_flow: NDArray[np.float32]
     camera_visible: NDArray[np.uint8]
+    images: Mapping[str, NDArray[np.uint8]]
+    cameras: Mapping[str, CameraModel]
     points: NDArray[np.float32]
     point_labels: NDArray[np.unsignedinteger[Any]]
     flow: NDArray[np.float32]
@@ -67,7 +71,7 @@ Values = dict[str, Any]
 def collate(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
     """Return a batch of samples that may hold fields with one row per point. Give it to a DataLoader as `collate_fn`.
 
-    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, one per sample. All other fields are stacked as torch's
+    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, and `cameras` a list, one per sample. All other fields are stacked as torch's
     default_collate does.
 
     Raises:
@@ -75,7 +79,8 @@ def collate(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
     """
     torch = import_extra("torch", "torch")
     given: list[Values] = [dict(sample) for sample in samples]
-    dense = [{name: value for name, value in sample.items() if name not in RAGGED} for sample in given]
+    dense = [{name: value for name, value in sample.items() if name not in (*RAGGED, *PLAIN)} for sample in given]
     batch: dict[str, Any] = import_extra("torch.utils.data", "torch").default_collate(dense)
     ragged = {name: [torch.from_numpy(sample[name]) for sample in given] for name in given[0] if name in RAGGED}
+    ragged |= {name: [sample[name] for sample in given] for name in given[0] if name in PLAIN}
     return {name: ragged[name] if name in ragged else batch[name] for name in given[0]}

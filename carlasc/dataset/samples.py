@@ -23,6 +23,7 @@ from carlasc.core.notebook import describe
 from carlasc.core.wording import count
 from carlasc.dataset.fields import ACTOR_FIELDS, ALWAYS, CAMERA_FIELDS, EVIDENCE_FIELDS, FIELDS, Sample, Values
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
+from carlasc.dataset.photographs import OF_CAMERAS, frames_with_images, read_cameras, stored_images
 from carlasc.dataset.selection import (
     RecentScans,
     SequenceFrames,
@@ -38,12 +39,8 @@ from carlasc.storage.metadata import Axes
 from carlasc.storage.transport.caching import CachedTree
 
 _STACKS = frozenset({"occupancy", "density", "visibility"})
-_OF_SCAN = {
-    "points": "points",
-    "point_labels": "labels",
-    "flow": "flow",
-    "remission": "points",
-}  # field of a sample -> field of the scan
+# field of a sample -> field of the scan
+_OF_SCAN = {"points": "points", "point_labels": "labels", "flow": "flow", "remission": "points"}
 
 if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; torch is not imported at run time
     from torch.utils.data import Dataset as TorchDataset
@@ -72,6 +69,8 @@ class Dataset(_MapStyle):
         instances     (X, Y, Z) int64, number of the actor that the voxel belongs to, 0 for none; the same in all frames of a sequence
         voxel_flow    (X, Y, Z, 3) float32 m/s, velocity of what is in the voxel, sensor frame; zero where nothing moves
         camera_visible (X, Y, Z) uint8, bit i: the i-th camera of cameras.json sees the voxel; see `carlasc.Voting(keep_seen=True)`
+        images        {camera: (H, W, 3) uint8}, RGB; `carlasc.dataset.ResizeImages` gives them another size
+        cameras       {camera: `carlasc.core.CameraModel`}, where they were when they took these images
         points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan
         point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
         flow          (N, 3) float32 m/s, velocity of each point, sensor frame
@@ -217,6 +216,8 @@ class Dataset(_MapStyle):
             sample |= self._grid_fields.read(part.grids, part.grid, frame, self._label_map)
         if self._asks(_OF_SCAN):
             sample |= self._scan(part, frame)
+        if self._asks(OF_CAMERAS):
+            sample |= read_cameras(part.scans, frame)
         sample["valid"] = np.array([number is not None for number in past])
         sample |= {"sequence": part.scans.name, "frame": frame}
         made = cast(Sample, {name: sample[name] for name in (*self.fields, *ALWAYS)})
@@ -311,7 +312,9 @@ class Dataset(_MapStyle):
         if grids is not None:
             parts = self._grid_fields.parts(grids, grid)
             wanted |= {(grids, f"{grid}/{part}"): None for part in sorted(parts)}
-        part = SequenceFrames(scans, grids, grid, common_frames(wanted), tuple(wanted))
+        wanted |= stored_images(scans) if (shows := self._asks(OF_CAMERAS)) else {}
+        frames = frames_with_images(scans, common_frames(wanted)) if shows else common_frames(wanted)
+        part = SequenceFrames(scans, grids, grid, frames, tuple(wanted))
         if self._needs_poses:
             part.check_poses()
         return part

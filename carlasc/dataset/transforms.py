@@ -99,8 +99,10 @@ def flip(sample: Sample, direction: str, spec: GridSpec | None) -> Sample:
         spec: the sample's grid; None if it holds none.
 
     Raises:
-        ArgumentError: the grid is not symmetric in this direction.
+        ArgumentError: the grid is not symmetric in this direction, or the sample has images.
     """
+    if {"images", "cameras"} & sample.keys():
+        raise ArgumentError("sample", expected="one without images and cameras to flip", found="one with them")
     column, given = _DIRECTIONS.index(direction), cast(Values, sample)
     flipped = dict(given)
     if spec is not None:

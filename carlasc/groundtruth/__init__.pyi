@@ -1,4 +1,5 @@
 from .from_grid import resample as resample
+from .labelling_images import label_images as label_images
 from .labelling_motion import MotionResult as MotionResult
 from .labelling_motion import label_motion as label_motion
 from .maps.mapping import MapResult as MapResult

@@ -109,7 +109,7 @@ def label_motion(
     step, moving, notes = counter(progress, scans + files), dict[str, _MovingSequence](), list[str]()
     with one_pool(run) as pool:
         for path, one in inputs.items():
-            _find(one, copy.writer(path), pool, step)
+            find_moving(one, copy.writer(path), pool, step)
             moving[path] = _MovingSequence(given[path], one.feed, one.actors)
             notes += [note for note in one.notes() if "grids" not in note]
         tables = {one.metadata.classes.name for one in given.values() if not one.metadata.classes.standing}
@@ -125,7 +125,7 @@ def label_motion(
     )
 
 
-def _find(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]) -> None:
+def find_moving(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]) -> None:
     """Find the actors of a sequence, or read what an interrupted run kept with `writer`."""
     if writer is not None:
         inputs.prepare(writer, run, step)

@@ -24,6 +24,7 @@ MOST_CAMERAS = 8
 Views = Sequence[tuple[CameraModel, Transform | None]]
 """Cameras, and (4, 4) scan_T_camera of each when it took its image; None where it took none."""
 
+_BESIDE = 1.5  # voxels along the longest axis, from a point, that do not hide it
 _HALF = 0.499  # of a voxel: from its centre to where it is tried, just inside of its faces and corners
 
 
@@ -104,6 +105,55 @@ def _mark_seen(voxels, blocks, eye, size, bit, seen):  # type: ignore[no-untyped
             k += 1
         if reached:
             seen[flat] |= bit
+
+
+def see_points(
+    points: NDArray[np.floating], occupied: NDArray[np.bool_], spec: GridSpec, eye: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return (N,) which points no voxel of a grid hides from a place. What is outside of the grid hides nothing.
+
+    The voxel that a point is in, and its neighbours, hide it as little as the surface that it lies on does. Ground is reached at so flat an
+    angle that its own voxels would hide it, so a ray from above the point, by the height of a voxel, is tried too.
+
+    Args:
+        points: (N, 3) metres, in the frame of the grid.
+        occupied: (X, Y, Z) voxels that stop rays.
+        spec: the grid, which is Cartesian.
+        eye: (3,) metres, the place.
+    """
+    lower, edge, size = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64), np.array(spec.size)
+    blocks = np.ascontiguousarray(occupied, np.bool_).reshape(-1)
+    reached = np.empty(len(points), np.bool_)
+    _reach_points((np.asarray(points, np.float64) - lower) / edge, blocks, (eye - lower) / edge, size, reached)
+    return reached
+
+
+@cached
+def _reach_points(points, blocks, eye, size, reached):  # type: ignore[no-untyped-def]
+    """Find which points rays from an eye reach. Everything is in units of voxels."""
+    for n in range(len(points)):
+        reached[n] = False
+        for raised in range(2):
+            at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2] + raised
+            way_x, way_y, way_z = eye[0] - at_x, eye[1] - at_y, eye[2] - at_z
+            far = max(abs(way_x), abs(way_y), abs(way_z))
+            first = 1.0 if far <= _BESIDE else _BESIDE / far  # share of the way after which voxels hide the point
+            for at, way, last in ((at_x, way_x, size[0]), (at_y, way_y, size[1]), (at_z, way_z, size[2])):
+                if at < 0 or at >= last:  # where the way comes into the grid
+                    edge = 1e-9 if at < 0 else last - 1e-9
+                    share = (edge - at) / way if way != 0 else 2.0
+                    first = max(first, share if share > 0 else 2.0)
+            if first >= 1.0:
+                reached[n] = True
+                break
+            at_x, at_y, at_z = at_x + first * way_x, at_y + first * way_y, at_z + first * way_z
+            x, y, z = int(np.floor(at_x)), int(np.floor(at_y)), int(np.floor(at_z))
+            if x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]:
+                reached[n] = True
+                break
+            if _reaches(at_x, at_y, at_z, eye, x, y, z, size, blocks):
+                reached[n] = True
+                break
 
 
 @jit

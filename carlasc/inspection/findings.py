@@ -74,6 +74,7 @@ class SequenceReport:
         refined_m: the same under refined poses.
         mounting: x, y, z, roll, pitch and yaw of the sensor in the frame of the poses, and how late these are, each with its standard
             error, or "undetermined"; empty if nothing tells.
+        images: by camera, where its images lie on the scans, in pixels, and how late they are, or "undetermined"; empty without images.
     """
 
     path: str
@@ -84,6 +85,7 @@ class SequenceReport:
     disagreement_m: float | None = None
     refined_m: float | None = None
     mounting: Mapping[str, str] = field(default_factory=dict)
+    images: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelo
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
+from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import PoseQuality, describe_mounting
 from carlasc.inspection.structure import static_structure
 from carlasc.inspection.trajectory import check_poses, check_times
@@ -249,8 +250,11 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
     shares = {name: diagnosis.share for name, diagnosis in diagnoses.items() if not math.isnan(diagnosis.share)}
     pose_share = poses.share if poses is not None and poses.pairs else None
     quality = None if poses is None else poses.quality
+    images = compare_images(sequence) if described else []
+    found.extend(judge_images(sequence, images))
+    about = {agreement.camera: str(agreement) for agreement in images}
     return found, SequenceReport(
-        sequence.path, len(plan.frames), len(plan.read), shares, pose_share, *_figures(quality)
+        sequence.path, len(plan.frames), len(plan.read), shares, pose_share, *_figures(quality), about
     )
 
 

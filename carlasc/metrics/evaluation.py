@@ -118,12 +118,13 @@ class Scorer:
         prediction = given or pair.prediction.classes or self.convention.usual_prediction
         self.convention.check(truth, pair.truth.location)
         self.convention.check(prediction, pair.prediction.location)
-        if self.convention.seen_by == "camera" and pair.truth.known(int(pair.truth.frames()[0]), "camera") is None:
+        needs_seen = self.convention.seen_by == "camera" or "seen" in self.scoring.by
+        if needs_seen and pair.truth.known(int(pair.truth.frames()[0]), "camera") is None:
             raise MissingDataError(
                 pair.truth.location,
                 expected="which voxels a camera observed",
-                found="data without cameras",
-                advice=f"score by another convention than {self.convention.name}",
+                found="data without cameras, or without the field `seen`",
+                advice="make the grids with --keep-seen, or score without what cameras see",
             )
         true_spec, predicted_spec = pair.truth.spec, pair.prediction.spec
         if true_spec and predicted_spec and true_spec != predicted_spec:
@@ -210,6 +211,9 @@ class Scorer:
             yield height_bands(spec, np.linspace(spec.lower[2], spec.upper[2], _HEIGHTS + 1).tolist())
         if "visibility" in self.scoring.by:
             yield visibility(Grid(spec, truth, counts), free=self.convention.free)
+        if "seen" in self.scoring.by and (seen := pair.truth.known(frame, "camera")) is not None:
+            seen = seen.reshape(spec.size)
+            yield {"seen": seen, "not seen": ~seen}
         if "motion" in self.scoring.by and isinstance(pair.truth, SequenceGrid):
             labels = pair.truth.labels(frame).reshape(spec.size)
             yield motion(Grid(spec, labels, counts), pair.truth.sequence.scan(frame, ("flow",)), sorted(table.movable))

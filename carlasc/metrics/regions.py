@@ -1,4 +1,4 @@
-"""Which voxels count: masks, (X, Y, Z) bool, combined with `&`; and separate scores by distance, height, visibility and motion."""
+"""Which voxels count: masks, (X, Y, Z) bool, combined with `&`; and separate scores by distance, height, visibility, motion, and what cameras see."""
 
 from __future__ import annotations
 

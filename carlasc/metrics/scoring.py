@@ -13,7 +13,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
 
 Region = Callable[[GridSpec], NDArray[np.bool_]]
-BREAKDOWNS = ("distance", "height", "visibility", "motion")
+BREAKDOWNS = ("distance", "height", "visibility", "motion", "seen")
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Scoring:
         voxels: "known" scores the voxels that the convention scores; "all" also scores voxels that the truth never evaluated.
         region: function from a GridSpec to a (X, Y, Z) bool mask, such as `lambda spec: distance_band(spec, 0, 10)`; only voxels in
             the mask count. With several processes it must be a function that can be pickled.
-        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant) and "motion".
+        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant), "motion" and "seen" (by any camera).
         rays: also compute RayIoU; this needs poses and a Cartesian grid.
         actors: also score who is in each voxel and how fast: both sides need the field `instance`, and for velocities `velocity`.
 

@@ -143,24 +143,32 @@ def read_image(sequence: Sequence, camera: CameraModel, frame: int, folder: str 
         FormatError: the image is cut short or damaged, or has another size than the camera's calibration.
         DependencyError: Pillow is not installed.
     """
+    data, where = image_bytes(sequence, camera, frame, folder)
+    return decode_image(data, where, camera, color=folder == "images")
+
+
+def image_bytes(sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images") -> tuple[bytes, str]:
+    """Return the file of an image as its bytes, and its name for errors. The arguments are those of `read_image`.
+
+    Raises:
+        MissingDataError: there is no such image.
+    """
     field = image_fields(sequence, folder).get(camera.name)
     if field is not None and frame in sequence.frames(field):
         where = f"{sequence.location}/{layout.field_named(field).file(frame)}"
-        data = sequence.read(field, frame).tobytes()
-    elif folder == "images" and (reference := _reference(sequence, camera, frame)):
+        return sequence.read(field, frame).tobytes(), where
+    if folder == "images" and (reference := _reference(sequence, camera, frame)):
         path = Path(sequence.location) / reference
         where = str(path)
         if not path.is_file():
             raise MissingDataError(where, expected=f"an image of the camera {camera.name}", found="no file")
-        data = path.read_bytes()
-    else:
-        raise MissingDataError(
-            sequence.location,
-            expected=f"{folder}/{camera.name}/{frame:06d}.jpg or .png",
-            found="none",
-            advice="convert with --images copy or link",
-        )
-    return decode_image(data, where, camera, color=folder == "images")
+        return path.read_bytes(), where
+    raise MissingDataError(
+        sequence.location,
+        expected=f"{folder}/{camera.name}/{frame:06d}.jpg or .png",
+        found="none",
+        advice="convert with --images copy or link",
+    )
 
 
 def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -> NDArray[Any]:

@@ -101,7 +101,7 @@ def label(
     scans = sequences_with_scans(source)
     files = find_predictions(root, scans, chosen)
     sequences = {
-        path: _LabelledSequence(one, files[path], _reader(table, one, logits), by) for path, one in scans.items()
+        path: _LabelledSequence(one, files[path], reader_for(table, one, logits), by) for path, one in scans.items()
     }
     settings = {"frames": str(chosen), "logits": logits, "by": by, "predictions": _digest(files.values())}
     settings |= {"classes": None if table is None else table.to_dict()}
@@ -153,7 +153,7 @@ class _LabelledSequence(DerivedSequence):
         return {name: array for name, array in found.items() if array is not None}
 
 
-def _reader(given: ClassTable | None, sequence: Sequence, logits: bool) -> PredictionReader:
+def reader_for(given: ClassTable | None, sequence: Sequence, logits: bool) -> PredictionReader:
     """Return what reads predictions for a sequence: as labels in its own table, if the given one can be converted to it."""
     own = sequence.metadata.classes
     try:

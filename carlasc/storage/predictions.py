@@ -130,21 +130,26 @@ class PredictionReader:
             if rows is not None and len(rows) != count:
                 raise FormatError(path, expected=f"{count} rows, one for each point", found=str(len(rows)))
         if scores is not None:
-            scores = self._probabilities(scores, str(path))
+            scores = self.probabilities(scores, str(path))
             labels = scores.argmax(axis=1) if labels is None else labels
         if labels is None:
             raise FormatError(path, expected="labels or probabilities", found="neither")
-        self._check(np.unique(labels), str(path))
+        self.check(np.unique(labels), str(path))
         converted = to_table(labels.astype(np.uint32), self.classes, self.target, str(path)).astype(np.uint32)
-        return converted, None if scores is None else self._pairs(scores, str(path))
+        return converted, None if scores is None else self.pairs(scores, str(path))
 
-    def _check(self, ids: NDArray[np.integer], where: str) -> None:
+    def check(self, ids: NDArray[np.integer], where: str) -> None:
+        """Check that the class table of the files has some ids.
+
+        Raises:
+            FormatError: it lacks one.
+        """
         if len(unknown := ids[~np.isin(ids, list(self.classes.names))]):
             expected = f"ids of the class table {self.classes.name}, up to {max(self.classes.names)}"
             advice = "give the class table of the predictions as `classes`"
             raise FormatError(where, expected=expected, found=str(unknown[0]), advice=advice)
 
-    def _probabilities(self, scores: NDArray[np.floating], where: str) -> NDArray[np.float32]:
+    def probabilities(self, scores: NDArray[np.floating], where: str) -> NDArray[np.float32]:
         """Return the (N, C) float32 probabilities that scores are, after checking that they are such."""
         shares = scores.astype(np.float32)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -161,10 +166,10 @@ class PredictionReader:
             raise FormatError(where, expected=expected, found=found, advice=advice)
         return shares
 
-    def _pairs(self, shares: NDArray[np.float32], where: str) -> NDArray[np.uint16]:
+    def pairs(self, shares: NDArray[np.float32], where: str) -> NDArray[np.uint16]:
         """Return the likeliest classes of each point of (N, C) probabilities, and their probabilities, added up where classes become one."""
         columns = np.flatnonzero(shares.max(axis=0, initial=0) * layout.CERTAIN >= 1).astype(np.uint32)
-        self._check(columns, where)
+        self.check(columns, where)
         ids, place = np.unique(to_table(columns, self.classes, self.target, where), return_inverse=True)
         rest = np.zeros((len(shares), len(ids)), np.float32)
         for column, target in zip(columns.tolist(), place.reshape(-1).tolist(), strict=True):

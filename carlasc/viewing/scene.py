@@ -38,6 +38,7 @@ from carlasc.viewing.finding import (
     list_fields,
     table_of,
 )
+from carlasc.viewing.photos import Photo, photos_of
 
 CONTENTS = ("grid", "scan", "flow", "truth", "errors")
 """What a picture can show of a frame."""
@@ -358,6 +359,10 @@ class SceneReader:
         if frame not in self.data.frames_with(f"{self.data.grid}/instance"):
             return np.zeros(self.data.spec.size, np.uint32)
         return self.data.read_part("instance", frame)
+
+    def read_photos(self, frame: int) -> tuple[Photo, ...]:
+        """Read the images of a frame; of cameras without one, nothing."""
+        return photos_of(self.data.sequence, frame, self.mirrored)
 
     def _read_grids(self, frame: int) -> tuple[Grid, ...]:
         if not self.data.grid:

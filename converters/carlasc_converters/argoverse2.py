@@ -18,6 +18,7 @@ from carlasc.core.geometry import translation
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.argoverse2_classes import ARGOVERSE2, CATEGORIES, TO_CARLA
 from carlasc_converters.feather import read_columns
+from carlasc_converters.image_files import nearest_images
 from carlasc_converters.rigid import poses_of
 
 _SPLITS: dict[str, Split] = {"train": "Train", "val": "Val", "test": "Test"}
@@ -198,15 +199,8 @@ class Argoverse2Log(Recording):
         paths = {int(path.stem): path for path in folder.glob("*.jpg") if path.stem.isascii() and path.stem.isdigit()}
         if not paths:
             return None, None
-        stamps = np.array(sorted(paths), np.int64)
-        after = np.searchsorted(stamps, self._timeline).clip(1, max(1, len(stamps) - 1))
-        after = np.minimum(after, len(stamps) - 1)
-        before = np.maximum(after - 1, 0)
-        is_after = np.abs(stamps[after] - self._timeline) < np.abs(self._timeline - stamps[before])
-        nearest = np.where(is_after, stamps[after], stamps[before])
-        near = np.abs(nearest - self._timeline) < _NEAR_NS
-        images = [str(paths[at].absolute()) if ok else "" for at, ok in zip(nearest.tolist(), near, strict=True)]
-        return np.where(near, self._seconds(nearest), np.nan), tuple(images)
+        nearest, near, images = nearest_images(paths, self._timeline, _NEAR_NS)
+        return np.where(near, self._seconds(nearest), np.nan), images
 
     def boxes(self) -> Mapping[int, Boxes] | None:
         """Return the boxes of the annotated sweeps. Tracks are numbered by the order of their UUIDs."""

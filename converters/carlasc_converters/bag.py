@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Sensor, Trajectory
+from carlasc.core import CameraModel
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
+from carlasc_converters.bag_cameras import BagCamera, find_cameras
 from carlasc_converters.bag_frames import BagFrame, CloudPlace, LidarTopic
 from carlasc_converters.bag_messages import PATH, TRANSFORMS, read_placed
 from carlasc_converters.bag_topics import BagFiles, Topic, find_bags
@@ -150,6 +152,34 @@ class BagRecording(Recording):
             raise FormatError(where, expected=expected, found=f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s")
         self._pose_note = f"{where}: the poses are those of {self._unplaced or self._vehicle}"
         return Trajectory(poses, self._seconds(stamps), where)
+
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the cameras that transforms place on the vehicle, with the image nearest to each frame."""
+        found, stamps = list[CameraModel](), self._lidars[0].stamps
+        for camera in self._cameras.values():
+            if not self._tree.connected(camera.frame, self._vehicle):
+                note = f"{self.location}: no transforms lead from {camera.frame} to {self._vehicle}: {camera.name} is left out"
+                self._notes.append(note)
+                continue
+            rows = self._images[camera.name]
+            taken = [np.nan if row is None else float(camera.images[0][row] - stamps[0]) * 1e-9 for row in rows]
+            place = self._tree.lookup(self._vehicle, camera.frame, stamps[:1])[0]
+            found.append(camera.model(place, np.array(taken) if len(camera.images[0]) else None))
+        return found
+
+    def image(self, camera: CameraModel, frame: int) -> tuple[str, bytes] | None:
+        """Return the image of a frame, which lies in the bag."""
+        row = self._images[camera.name][frame]
+        return None if row is None else self._cameras[camera.name].read(row)
+
+    @cached_property
+    def _cameras(self) -> dict[str, BagCamera]:
+        return {camera.name: camera for camera in find_cameras(self._files)}
+
+    @cached_property
+    def _images(self) -> dict[str, list[int | None]]:
+        """The row of the image of each frame, by camera."""
+        return {name: camera.nearest(self._lidars[0].stamps) for name, camera in self._cameras.items()}
 
     def notes(self) -> list[str]:
         """Say what is not whole, and what was assumed."""

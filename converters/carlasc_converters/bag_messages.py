@@ -33,6 +33,9 @@ POSES = (
     PATH,
     "foxglove.PoseInFrame",
 )
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+IMAGES = ("sensor_msgs/msg/Image", COMPRESSED_IMAGE)
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
 
 _TRANSFORM_TEXT = "geometry_msgs/TransformStamped[] transforms\n"
@@ -69,7 +72,7 @@ class CloudMessage:
 
 
 def is_readable(channel: Channel) -> bool:
-    """Return whether messages of a type in CLOUDS, POSES or TRANSFORMS have an encoding in which it exists."""
+    """Return whether messages of a type in CLOUDS, POSES, TRANSFORMS or IMAGES have an encoding in which it exists."""
     return _ENCODINGS.get(channel.encoding) == ("foxglove" if channel.type.startswith("foxglove.") else "ros")
 
 
@@ -79,7 +82,7 @@ def read_cloud(data: bytes, channel: Channel, where: str) -> CloudMessage:
     Raises:
         FormatError: it is none.
     """
-    message = _decode(data, channel, where)
+    message = decode(data, channel, where)
     with reading(where, f"a message of type {channel.type}"):
         if channel.type.startswith("foxglove."):
             return _foxglove_cloud(message, where)
@@ -92,7 +95,7 @@ def read_cloud(data: bytes, channel: Channel, where: str) -> CloudMessage:
 
 
 def read_stamp(data: bytes, channel: Channel, where: str) -> int:
-    """Return the time of a message of points in nanoseconds, without its points.
+    """Return the time of a message that begins with a header, in nanoseconds, without its content.
 
     Raises:
         FormatError: it is cut short.
@@ -103,7 +106,7 @@ def read_stamp(data: bytes, channel: Channel, where: str) -> int:
         elif channel.encoding == "cdr":
             seconds, rest = unpack_from("<iI" if data[1] else ">iI", data, 4)
         else:
-            return _stamp(_decode(data, channel, where).timestamp)
+            return _stamp(decode(data, channel, where).timestamp)
         return seconds * 10**9 + rest
 
 
@@ -113,7 +116,7 @@ def read_placed(data: bytes, channel: Channel, where: str) -> list[PlacedFrame]:
     Raises:
         FormatError: it is none.
     """
-    message = _decode(data, channel, where)
+    message = decode(data, channel, where)
     with reading(where, f"a message of type {channel.type}"):
         if channel.type == "foxglove.PoseInFrame":
             numbers = _numbers(message.pose.position, message.pose.orientation)
@@ -142,8 +145,12 @@ def read_placed(data: bytes, channel: Channel, where: str) -> list[PlacedFrame]:
         return placed
 
 
-def _decode(data: bytes, channel: Channel, where: str) -> Any:
-    """Return a message with its fields as attributes."""
+def decode(data: bytes, channel: Channel, where: str) -> Any:
+    """Return a message with its fields as attributes.
+
+    Raises:
+        FormatError: it is none.
+    """
     with reading(where, f"a message of type {channel.type}"):
         if _ENCODINGS.get(channel.encoding) == "foxglove":
             return foxglove_messages.read_message(data, channel.type, channel.encoding)

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.core import CameraModel
 from carlasc.core.geometry import Transform, check_rigid, invert
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.files import Version, read_text, version_of
 from carlasc_converters.kitti360_classes import KITTI360, KITTI360_TO_CARLA
 from carlasc_converters.kitti360_labels import MAX_DISTANCE_M, label_points, window_at, windows_of
+from carlasc_converters.kitti_cameras import rectified_cameras
 from carlasc_converters.kitti_files import (
     Calibration,
     FrameTimes,
@@ -28,6 +30,7 @@ from carlasc_converters.kitti_files import (
 
 _TEST = ("2013_05_28_drive_0008_sync", "2013_05_28_drive_0018_sync")  # drives whose labels are held back
 _SCANS = "velodyne_points"
+_IMAGE_SIZE = (1408, 376)  # of the rectified images
 _TICK_S = 1e-4  # points of so short a time have the same pose
 
 
@@ -132,6 +135,28 @@ class Kitti360Drive(Recording):
     def times(self) -> NDArray[np.float64] | None:
         """Return the times at which the scanner looked forward, seconds after the first."""
         return self._times.seconds
+
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the two rectified cameras that look ahead; none without their calibration. The model of the fisheyes is not ours."""
+        folder = self.files.calibration
+        if not (folder / "perspective.txt").is_file() or not (folder / "calib_cam_to_velo.txt").is_file():
+            return ()
+        calibration = Calibration.read(folder / "perspective.txt", "the cameras")
+        lidar_T_camera = Calibration.read(folder / "calib_cam_to_velo.txt", "the place of the LiDAR").transform("")
+        rectify = calibration.values.get("R_rect_00", ())
+        if len(rectify) != 9:
+            raise FormatError(calibration.path, expected="9 numbers after R_rect_00", found=str(len(rectify)))
+        rectified_T_camera = np.eye(4)
+        rectified_T_camera[:3, :3] = np.reshape(rectify, (3, 3))
+        images = Path(self.files.root, "data_2d_raw", self.files.drive)
+        return rectified_cameras(
+            calibration,
+            rectified_T_camera @ invert(lidar_T_camera),
+            {"image_00": "P_rect_00", "image_01": "P_rect_01"},
+            lambda name, frame: images / name / "data_rect" / f"{frame:010d}.png",
+            self._numbers,
+            _IMAGE_SIZE,
+        )
 
     def notes(self) -> list[str]:
         """Return which labels are missing, and how they were found."""

@@ -22,6 +22,7 @@ def rectified_cameras(
     projections: Mapping[str, str],
     image_of: Callable[[str, int], Path],
     frames: Sequence[int],
+    size: tuple[int, int] = SIZE,
 ) -> list[CameraModel]:
     """Return the cameras whose projections a calibration has, in the frame of the LiDAR.
 
@@ -33,6 +34,7 @@ def rectified_cameras(
         projections: name of each camera -> name of its projection.
         image_of: returns the path of a camera's image of a frame.
         frames: numbers of the frames.
+        size: columns and rows of the images, where none exists.
 
     Raises:
         FormatError: a projection is none.
@@ -51,7 +53,7 @@ def rectified_cameras(
         rectified_T_camera = translation(-np.linalg.solve(rows[:, :3], rows[:, 3]))
         paths = {frame: image_of(name, frame) for frame in frames}
         existing = [path for path in paths.values() if path.is_file()]
-        width, height = _size_of(existing[0]) if existing else SIZE
+        width, height = _size_of(existing[0]) if existing else size
         last = max(frames)
         there = {frame: str(path.absolute()) for frame, path in paths.items() if path.is_file()}
         found.append(

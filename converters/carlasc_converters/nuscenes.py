@@ -12,13 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.core import CameraModel
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc_converters.image_files import nearest_images
 from carlasc_converters.nuscenes_classes import MINI_VALIDATION, NUSCENES, TO_CARLA, VALIDATION
 from carlasc_converters.nuscenes_frames import NuScenesFrame
 from carlasc_converters.nuscenes_tables import CHANNEL, Annotations, SceneRow, Tables
 from carlasc_converters.rigid import poses_of
+
+_NEAR_US = 50_000  # between an image and the scan that it belongs to
 
 
 class NuScenes(Converter):
@@ -176,6 +180,30 @@ class NuScenesScene(Recording):
 
     def _seconds(self, microseconds: NDArray[np.int64]) -> NDArray[np.float64]:
         return np.asarray(microseconds - self._scans[0].timestamp, np.float64) * 1e-6
+
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the cameras of the scene, with the images nearest in time to each frame."""
+        root, found = self.tables.folder.parent, []
+        frames = np.array([scan.timestamp for scan in self._scans], np.int64)
+        for token in sorted(
+            {image.mount for image in self.scene.images}, key=lambda one: self.tables.cameras[one].channel
+        ):
+            row, own = self.tables.cameras[token], [image for image in self.scene.images if image.mount == token]
+            nearest, near, images = nearest_images(
+                {image.timestamp: root / image.file for image in own}, frames, _NEAR_US
+            )
+            width, height = own[0].size
+            camera = CameraModel(
+                name=row.channel,
+                width=width,
+                height=height,
+                matrix=row.matrix,
+                sensor_T_camera=row.vehicle_T_camera,
+                times=np.where(near, self._seconds(nearest), np.nan),
+                images=images,
+            )
+            found.append(camera)
+        return found
 
     def boxes(self) -> Mapping[int, Boxes] | None:
         """Return the boxes of the key frames. Tracks are numbered as the data set's panoptic labels are: by first appearance."""

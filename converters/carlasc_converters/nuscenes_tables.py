@@ -28,6 +28,9 @@ _KINDS: dict[str, type | int] = {
     "timestamp": int,
     "index": int,
     "is_key_frame": bool,
+    "width": int,
+    "height": int,
+    "camera_intrinsic": list,
 }
 read_rows = partial(json_rows.read_rows, kinds=_KINDS)
 
@@ -55,6 +58,38 @@ class LidarScan:
     instances: str | None
 
 
+@dataclass(frozen=True, slots=True)
+class CameraRow:
+    """A calibrated camera.
+
+    Attributes:
+        channel: such as "CAM_FRONT".
+        vehicle_T_camera: (4, 4).
+        matrix: (3, 3) intrinsic matrix, pixels.
+    """
+
+    channel: str
+    vehicle_T_camera: Transform
+    matrix: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageRow:
+    """An image of a scene: a row of sample_data.
+
+    Attributes:
+        file: relative to the root of the data set.
+        timestamp: microseconds.
+        mount: token of the calibrated camera.
+        size: columns and rows.
+    """
+
+    file: str
+    timestamp: int
+    mount: str
+    size: tuple[int, int]
+
+
 @dataclass(frozen=True)
 class SceneRow:
     """A scene: about 20 s of driving.
@@ -62,10 +97,12 @@ class SceneRow:
     Attributes:
         name: such as "scene-0103".
         scans: its LiDAR scans by increasing time.
+        images: the images of its cameras.
     """
 
     name: str
     scans: tuple[LidarScan, ...]
+    images: tuple[ImageRow, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -144,11 +181,29 @@ class Tables:
         return {row[0]: pose for row, pose in zip(rows, poses, strict=True)}
 
     @cached_property
+    def cameras(self) -> dict[str, CameraRow]:
+        """The calibrated cameras, by token."""
+        channels = dict(read_rows(self.path("sensor"), ("token", "channel")))
+        path = self.path("calibrated_sensor")
+        keys = ("token", "sensor_token", *_POSE, "camera_intrinsic")
+        rows = [row for row in read_rows(path, keys) if row[4]]
+        poses = poses_of(_columns(rows, 3, 4), _columns(rows, 2, 3), str(path))
+        found = {}
+        for (token, sensor, _, _, intrinsic), pose in zip(rows, poses, strict=True):
+            try:
+                matrix = np.array(intrinsic, np.float64).reshape(3, 3)
+            except ValueError as error:
+                raise FormatError(path, expected="3 x 3 numbers in camera_intrinsic", found=str(intrinsic)) from error
+            found[token] = CameraRow(str(channels.get(sensor)), pose, matrix)
+        return found
+
+    @cached_property
     def scenes(self) -> list[SceneRow]:
         """The scenes, by name."""
         scans: dict[str, list[LidarScan]] = {}
+        images: dict[str, list[ImageRow]] = {}
         labels, instances = self._label_files("lidarseg"), self._label_files("panoptic")
-        samples, mounts = self._samples, self.mounts
+        samples, mounts, cameras = self._samples, self.mounts, self.cameras
         keys = (
             "token",
             "sample_token",
@@ -157,8 +212,14 @@ class Tables:
             "filename",
             "timestamp",
             "is_key_frame",
+            "width",
+            "height",
         )
-        for token, sample, pose, mount, file, timestamp, key in read_rows(self.path("sample_data"), keys):
+        for token, sample, pose, mount, file, timestamp, key, *size in read_rows(self.path("sample_data"), keys):
+            if mount in cameras and sample in samples and all(size):
+                self._check_inside("sample_data", file)
+                width, height = size
+                images.setdefault(samples[sample][1], []).append(ImageRow(file, timestamp, mount, (width, height)))
             if mount not in mounts:
                 continue  # of a camera or a radar
             if sample not in samples:
@@ -174,7 +235,12 @@ class Tables:
         for _, name in rows:
             self._check_inside("scene", name)
         found = [
-            SceneRow(name, tuple(sorted(scans.get(token, ()), key=attrgetter("timestamp")))) for token, name in rows
+            SceneRow(
+                name,
+                tuple(sorted(scans.get(token, ()), key=attrgetter("timestamp"))),
+                tuple(images.get(token, ())),
+            )
+            for token, name in rows
         ]
         return sorted(found, key=attrgetter("name"))
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from carlasc_converters.kitti import KittiRecording
+from carlasc_converters.kitti360 import Kitti360Drive, Kitti360Files
 from carlasc_converters.kitti_raw import RawDrive
 from carlasc_converters.kitti_tracking import TrackingSequence
 
@@ -48,11 +49,27 @@ def tracking(root):
     return TrackingSequence(root, "0000", "KITTI_tracking_0000", "Train"), "image_03"
 
 
-@pytest.mark.parametrize("layout", [odometry, raw, tracking])
+def kitti360(root):
+    scan(root / "data_3d_raw/drive/velodyne_points/data", "0000000004.bin")
+    (root / "calibration").mkdir()
+    camera_T_lidar = np.vstack([TO_CAMERA, [0, 0, 0, 1]])
+    (root / "calibration/perspective.txt").write_text(
+        "calib_time: 09-Jan-2012\n" + line("R_rect_00", RECTIFY) + line("P_rect_01", ROWS)
+    )
+    places = line("x", np.linalg.inv(camera_T_lidar)[:3]).removeprefix("x: ")
+    (root / "calibration/calib_cam_to_velo.txt").write_text(places)
+    return Kitti360Drive(Kitti360Files(str(root), "drive")), "image_01"
+
+
+@pytest.mark.parametrize("layout", [odometry, raw, tracking, kitti360])
 def test_points_have_the_pixels_of_the_projection(layout, tmp_path):
     recording, name = layout(tmp_path)
     (camera,) = recording.cameras()
-    assert (camera.name, camera.width, camera.height, camera.images) == (name, 1242, 375, None)
+    assert (camera.name, camera.width, camera.height, camera.images) == (
+        name,
+        *((1408, 376) if layout is kitti360 else (1242, 375)),
+        None,
+    )
     points = np.random.default_rng(0).uniform((3, -20, -2), (60, 20, 3), (200, 3))
     in_rectified = RECTIFY @ (TO_CAMERA @ np.vstack([points.T, np.ones(200)]))
     u, v, depth = ROWS @ np.vstack([in_rectified, np.ones(200)])
@@ -60,11 +77,11 @@ def test_points_have_the_pixels_of_the_projection(layout, tmp_path):
     assert np.abs(found - np.stack([u / depth, v / depth], axis=1)).max() < 1e-6
 
 
-@pytest.mark.parametrize("layout", [odometry, raw, tracking])
+@pytest.mark.parametrize("layout", [odometry, raw, tracking, kitti360])
 def test_without_a_calibration_there_are_no_cameras(layout, tmp_path):
     recording, _ = layout(tmp_path)
     for path in tmp_path.rglob("*cal*.txt"):
         path.unlink()
-    for path in tmp_path.rglob("calib/0000.txt"):
+    for path in (*tmp_path.rglob("calib/0000.txt"), *tmp_path.rglob("perspective.txt")):
         path.unlink()
     assert not recording.cameras()

@@ -176,6 +176,16 @@ def test_boxes_are_in_the_frame_of_the_vehicle_at_their_scan(root):
         ]
 
 
+def test_cameras_have_the_image_nearest_to_each_scan(root):
+    recording = next(one for one in NuScenes(root).sequences() if len(one.frames) > 1)
+    (camera,) = recording.cameras()
+    assert (camera.name, camera.width, camera.height, camera.model) == ("CAM_FRONT", 1600, 900, "pinhole")
+    assert np.allclose(camera.matrix, nusc.MATRIX) and np.allclose(camera.sensor_T_camera, nusc.VEHICLE_T_CAMERA)
+    later = camera.times - recording.times()
+    assert later == pytest.approx(np.full(len(later), nusc.IMAGE_LATER_US * 1e-6))
+    assert all(name.endswith(".jpg") and f"{root}/samples/CAM_FRONT/" in name for name in camera.images)
+
+
 def test_poses_and_times_are_those_of_the_simulation(root):
     found = recording(root)
     trajectory, times = found.poses(), found.times()

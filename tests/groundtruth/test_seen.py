@@ -80,10 +80,12 @@ def test_what_is_behind_a_wall_is_hidden_and_the_wall_is_seen():
 def town(tmp_path_factory):
     pytest.importorskip("embreex")
     out = tmp_path_factory.mktemp("town")
-    carlasc.simulate(
-        out, count=1, sensors=3, bev=False, cameras=("front", "back"), run=carlasc.Run(workers=1),
-        lidar=carlasc.captures.Lidar(16, 16_000),
-    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:  # a quarter of the pixels says the same
+        patch.setattr("carlasc.captures.town.photographs.IMAGE_SIZE", (400, 225))
+        carlasc.simulate(
+            out, count=1, sensors=2, bev=False, cameras=("front", "back"), run=carlasc.Run(workers=1),
+            lidar=carlasc.captures.Lidar(16, 16_000),
+        )  # fmt: skip
     voting = carlasc.Voting(keep_seen=True)
     carlasc.regrid(out, GridSpec.published(), voting=voting, run=carlasc.Run(workers=1))
     return out
@@ -145,11 +147,11 @@ def test_images_that_do_not_fit_are_refused_in_one_line(town):
     (sequence,) = carlasc.open(town).values()
     one = cameras_of(sequence)["front"]
     data = sequence.read("images.front.jpg", 0).tobytes()
-    assert decode_image(data, "a.jpg", one, color=True).shape == (450, 800, 3)
+    assert decode_image(data, "a.jpg", one, color=True).shape == (225, 400, 3)
     other = encode_image(np.zeros((10, 20), np.uint8), "PNG").tobytes()
     for bad, expected in (
         (data[: len(data) // 2], "a whole JPEG or PNG"),
-        (other, "800 x 450 pixels.*, found 20 x 10"),
+        (other, "400 x 225 pixels.*, found 20 x 10"),
     ):
         with pytest.raises(FormatError, match=expected) as error:
             decode_image(bad, "a.jpg", one, color=True)

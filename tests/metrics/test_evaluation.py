@@ -230,6 +230,10 @@ def test_voxels_that_no_camera_sees_do_not_count_for_cameras(folders):
     by_lidar = evaluate(folders[0], truth, convention="occ3d-lidar")
     assert 0 < by_camera.matrix.total <= seen
     assert by_camera.matrix.total < 0.8 * by_lidar.matrix.total
+    parts = evaluate(folders[0], truth, convention="occ3d-lidar", scoring=Scoring(by=["seen"])).breakdown
+    assert parts["seen"] == by_camera.matrix and parts["seen"] + parts["not seen"] == by_lidar.matrix
+    with pytest.raises(MissingDataError, match="without the field `seen`"):
+        evaluate(folders[0], folders[0], convention="own", scoring=Scoring(by=["seen"]))
 
 
 def test_a_sequence_without_prediction_is_named_in_a_note(folders):
@@ -271,7 +275,9 @@ def test_scores_are_broken_down_by_distance_height_and_visibility(folders, world
     assert sum(m.total for name, m in parts.items() if name.endswith("up")) == result.matrix.total
     assert parts["0-10 m"].total == result.matrix.total
     assert result.tables()[-1].rows[0][0] == "0-10 m"
-    with pytest.raises(ArgumentError, match="by: expected any of distance, height, visibility, motion, found 'colour'"):
+    with pytest.raises(
+        ArgumentError, match="by: expected any of distance, height, visibility, motion, seen, found 'colour'"
+    ):
         evaluate(*folders, scoring=Scoring(by=("colour",)))
 
 

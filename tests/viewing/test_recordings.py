@@ -1,6 +1,7 @@
 """Recordings for Rerun and Foxglove, read back with the readers of their makers: what is where, and in which colours."""
 
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ from helpers.readers.recorded import POINT, read_mcap, read_metadata, read_rrd, 
 from helpers.scenes.road_blocks import ROAD, add_actors, add_poses, write_blocks
 
 from carlasc.core.boxes import Boxes
+from carlasc.core.cameras import CameraModel, optical_axes
 from carlasc.core.geometry import rotation_z, rotations_of, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import Scan
@@ -20,6 +22,7 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, ConflictError, DependencyError, StorageError
 from carlasc.metrics import VoxelOutcome
 from carlasc.storage import FolderSink, layout
+from carlasc.storage.camera_files import cameras_to_json, encode_image
 from carlasc.viewing import Scene, ViewResult, view
 from carlasc.viewing.colors import ACTORS, ERRORS, PATH, UNLABELLED, actor_ids
 from carlasc.viewing.recordings.content import class_surfaces, record_frames, thin_scan
@@ -565,3 +568,44 @@ def test_only_the_scene_reads_sequences():
         path.name for path in viewing.rglob("*.py") if path.name not in allowed and reading.search(path.read_text())
     ]
     assert found == []
+
+
+@pytest.fixture(scope="module")
+def photographed(drive, tmp_path_factory):
+    """The drive with a camera that looks to the right."""
+    folder = tmp_path_factory.mktemp("photographed") / "Town01_Light" / "cartesian"
+    shutil.copytree(drive, folder)
+    matrix = np.array([[100.0, 0, 39.5], [0, 100, 29.5], [0, 0, 1]])
+    place = optical_axes((0.0, 1.0), "left")
+    place[:3, 3] = 1.0, 0.5, -0.2
+    camera = CameraModel(name="right", width=80, height=60, matrix=matrix, sensor_T_camera=place)
+    writer = FolderSink(folder.parent).sequence(folder.name)
+    writer.write_document(layout.CAMERAS, cameras_to_json([camera]))
+    image = encode_image(np.full((60, 80, 3), 90, np.uint8), "PNG")
+    for frame in range(2):
+        writer.write("images.right.png", frame, image)
+    return folder, image.tobytes()
+
+
+def test_recordings_hold_the_images_of_cameras_where_they_were_taken(photographed, tmp_path):
+    folder, image = photographed
+    view(folder, tmp_path / "scene.rrd")
+    entities, _ = read_rrd(tmp_path / "scene.rrd")
+    shown = entities["/world/ego/cameras/right"]
+    assert sorted(shown) == [0, 1] and bytes(shown[1]["EncodedImage:blob"][0]) == image
+    np.testing.assert_allclose(
+        shown[1]["Transform3D:translation"], [(1, -0.5, -0.2)], atol=1e-6
+    )  # y points to the left
+    np.testing.assert_allclose(np.reshape(shown[1]["Pinhole:image_from_camera"], (3, 3)).T[0], (100, 0, 39.5))
+
+    view(folder, tmp_path / "scene.mcap")
+    topics = read_mcap(tmp_path / "scene.mcap")
+    assert len(topics["/cameras/right/image"]) == len(topics["/cameras/right/calibration"]) == 2
+    assert topics["/cameras/right/image"][0].message.data == image
+    lens = topics["/cameras/right/calibration"][0].message
+    assert (lens.width, lens.height, lens.frame_id) == (80, 60, "right") and lens.K[2] == 39.5
+    placed = topics["/tf"][0].message.transforms[1]
+    assert (placed.parent_frame_id, placed.child_frame_id) == ("ego", "right")
+    turn, q = placed.rotation, np.zeros((1, 4))
+    q[0] = turn.w, turn.x, turn.y, turn.z
+    np.testing.assert_allclose(rotations_of(q)[0][:, 2], (0, -1, 0), atol=1e-6)  # it looks to the right

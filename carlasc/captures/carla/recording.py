@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from carlasc.captures.carla.sensors import ActorNumbers, SensorRig
+from carlasc.captures.carla.sensors import ActorNumbers, SensorRig, photo_fields
 from carlasc.captures.carla.server import Server, ServerOptions
 from carlasc.captures.raw import Capture, SensorRecording
 from carlasc.captures.settings import TRAFFIC, Lidar, TrafficLevel, check_at_least, sensor_offsets
+from carlasc.captures.town.photographs import town_cameras
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.errors import ConflictError, MissingDataError, check_choice, import_extra
+from carlasc.storage.camera_files import cameras_to_json
+from carlasc.storage.layout import CAMERAS
 
 SETTINGS_FILE = "recording.json"
 _REPLAY_TOLERANCE_M = 0.02  # greatest distance of the ego sensor in a replay from where it was recorded
@@ -68,6 +71,7 @@ def record(
     traffic: TrafficLevel = "medium",
     lidar: Lidar | None = None,
     bev: bool = True,
+    cameras: Sequence[str] = (),
     carla: Any = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> RecordResult:
@@ -88,6 +92,7 @@ def record(
         traffic: "light", "medium" or "heavy": 25, 50 or 100 vehicles, and as many pedestrians.
         lidar: model of the LiDARs. None: the data set's.
         bev: whether to write bird's-eye pictures.
+        cameras: names of cameras on the vehicle, as in `carlasc.simulate`. Each has images of colour, class and depth.
         carla: module of the client. None: the package `carla`.
         progress: called with (frames done, number of frames).
 
@@ -105,13 +110,16 @@ def record(
     check_at_least(1, count=count, sensors=sensors)
     check_at_least(0, seed=seed)
     check_choice("traffic", traffic, TrafficLevel)
-    if bev:
+    models = town_cameras(cameras)
+    images = photo_fields(models)
+    if bev or cameras:
         import_extra("PIL.Image", "carla")
     writer, written = CaptureWriter(out), 0
     with Server(server, carla) as connection:
         settings = _ServerSettings(town, traffic, sensors, seed, bev, connection.version, lidar or Lidar())
-        writer.check_settings(SETTINGS_FILE, dataclasses.asdict(settings), "carlasc capture")
-        complete = {frame for frame in range(count) if writer.has_frame(frame, sensors, bev)}
+        written_settings = dataclasses.asdict(settings) | ({"cameras": list(cameras)} if cameras else {})
+        writer.check_settings(SETTINGS_FILE, written_settings, "carlasc capture")
+        complete = {frame for frame in range(count) if writer.has_frame(frame, sensors, bev, images)}
         missing = set(range(count)) - (complete & writer.timed_frames(sensors))
         if not missing:
             return RecordResult(writer.out, count, 0, sensors, 0, 0, connection.version)
@@ -121,15 +129,18 @@ def record(
         connection.load_town(town)
         connection.set_up_traffic(server.traffic_port, seed)
         actors = spawn_actors(connection, TRAFFIC[traffic], server.traffic_port, rng)
-        rig = SensorRig(connection, actors.ego, offsets, settings.lidar, bev, seed)
+        rig = SensorRig(connection, actors.ego, offsets, settings.lidar, bev, seed, models)
         spawned = (int(actor.id) for actor in (actors.ego, *actors.vehicles, *actors.walkers))
         numbers = ActorNumbers([*connection.initial_actors, *spawned])
-        writer.write_settings(SETTINGS_FILE, dataclasses.asdict(settings))  # the town is known to exist now
+        writer.write_settings(SETTINGS_FILE, written_settings)  # the town is known to exist now
+        if models:
+            writer.target.put(CAMERAS, cameras_to_json(models))
         with TimesLog(writer) as log:
             for frame in range(max(missing) + 1):
-                recordings, times_s, picture = rig.measure(connection.tick(), frame, numbers)
+                recordings, times_s, picture, photos = rig.measure(connection.tick(), frame, numbers)
                 if frame in missing:
                     _write_frame(writer, frame, recordings, picture)
+                    writer.write_images(frame, photos)
                     log.add(frame, times_s)  # last: a frame without times is not complete
                     written += 1
                 else:

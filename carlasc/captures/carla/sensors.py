@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import io
+import math
 import queue
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,20 @@ from numpy.typing import NDArray
 from carlasc.captures.carla.server import SemanticSweep, Server, decode_sweep
 from carlasc.captures.raw import SensorRecording
 from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE, Lidar
+from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import invert, rotate_vectors
 from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA, REMAPS
-from carlasc.errors import MissingDataError, import_extra
+from carlasc.errors import MissingDataError
+from carlasc.storage.camera_files import encode_image
 from carlasc.storage.layout import FRAME_PERIOD_S
+
+_KINDS = {
+    "images": ("rgb", "jpg"),
+    "image_labels": ("semantic_segmentation", "png"),
+    "image_depths": ("depth", "png"),
+}  # CARLA's cameras that stand in each place, and the ending of what they become, by folder
+_FARTHEST_M, _DEPTH_STEP = 1000.0, 256.0
 
 RENUMBERED_FROM = (0, 9, 14)
 """First version of CARLA whose class ids differ from the data set's."""
@@ -28,7 +38,14 @@ class SensorRig:
     """The semantic LiDARs on the ego vehicle, with the vehicle's orientation, and the camera above it."""
 
     def __init__(
-        self, server: Server, ego: Any, offsets: NDArray[np.float64], lidar: Lidar, bev: bool, seed: int
+        self,
+        server: Server,
+        ego: Any,
+        offsets: NDArray[np.float64],
+        lidar: Lidar,
+        bev: bool,
+        seed: int,
+        cameras: Sequence[CameraModel] = (),
     ) -> None:
         """Spawn the sensors. They measure from the next tick on.
 
@@ -37,8 +54,9 @@ class SensorRig:
             ego: CARLA's actor of the ego vehicle.
             offsets: (S, 3) offsets of the LiDARs in the vehicle's frame, metres.
             lidar: model of the LiDARs. CARLA's semantic LiDAR has no noise, so it is added here.
-            bev: whether to spawn the camera.
+            bev: whether to spawn the camera above the vehicle.
             seed: seed of the noise.
+            cameras: cameras on the vehicle, without distortion and level; their places are relative to the first LiDAR.
 
         Raises:
             MissingDataError: the server has no such sensor, or no room for it.
@@ -65,10 +83,15 @@ class SensorRig:
             above = server.transform((0.0, 0.0, BEV_HEIGHT_M), pitch_deg=-90.0)
             size = {"image_size_x": BEV_SIZE[0], "image_size_y": BEV_SIZE[1]}
             self._camera = self._mount(ego, "sensor.camera.rgb", size, above)
+        self._photos = {
+            field: self._mount_camera(ego, camera, offsets[0], kind)
+            for camera in cameras
+            for field, kind in zip(photo_fields([camera]), _KINDS.values(), strict=True)
+        }
 
     def measure(
         self, tick: int, frame: int, numbers: ActorNumbers
-    ) -> tuple[list[SensorRecording], list[float], bytes | None]:
+    ) -> tuple[list[SensorRecording], list[float], bytes | None, dict[str, NDArray[np.uint8]]]:
         """Collect the measurements of a tick.
 
         Args:
@@ -77,7 +100,8 @@ class SensorRig:
             numbers: the actors' numbers in the capture.
 
         Returns:
-            The recording of each LiDAR, the simulation's time of each in seconds, and the camera's picture as JPEG bytes, or None.
+            The recording of each LiDAR, the simulation's time of each in seconds, the picture from above as JPEG bytes, or None, and the
+            images of the cameras on the vehicle as bytes of files, by field.
 
         Raises:
             ServerError: a measurement does not arrive.
@@ -92,7 +116,39 @@ class SensorRig:
             self._to_recording(sweep, numbers, np.random.default_rng((self._seed, frame, sensor)))
             for sensor, sweep in enumerate(sweeps)
         ]
-        return recordings, [sweep.elapsed_s for sweep in sweeps], None if image is None else encode_image(image)
+        photos = {
+            field: self._to_file(field, self._server.measurement(arrived, tick, f"the camera of {field}"))
+            for field, arrived in self._photos.items()
+        }
+        picture = None if image is None else encode_bev(image)
+        return recordings, [sweep.elapsed_s for sweep in sweeps], picture, photos
+
+    def _mount_camera(
+        self, ego: Any, camera: CameraModel, ego_lidar: NDArray[np.float64], kind: tuple[str, str]
+    ) -> queue.Queue[Any]:
+        """Spawn one of CARLA's cameras where a camera is."""
+        place = camera.sensor_T_camera
+        x, y, z = (place[:3, 3] + ego_lidar).tolist()
+        yaw_deg = math.degrees(math.atan2(place[1, 2], place[0, 2]))
+        width_deg = math.degrees(2 * math.atan(camera.width / 2 / camera.matrix[0, 0]))
+        attributes = {"image_size_x": camera.width, "image_size_y": camera.height, "fov": width_deg}
+        where = self._server.transform((x, y, z), yaw_deg=yaw_deg)
+        return self._mount(ego, f"sensor.camera.{kind[0]}", attributes, where)
+
+    def _to_file(self, field: str, image: Any) -> NDArray[np.uint8]:
+        """Return an image as the bytes of a file: colours, ids of classes, or depths, which CARLA spreads over three channels."""
+        pixels = _rgb(image)
+        folder = field.partition(".")[0]
+        if folder == "images":
+            return encode_image(pixels, "JPEG")
+        if folder == "image_labels":
+            where = f"CARLA {self._server.version}, semantic camera"
+            if self._remap is None:
+                CARLA.check(pixels[..., 0], where)
+                return encode_image(pixels[..., 0], "PNG")
+            return encode_image(self._remap(pixels[..., 0], where).astype(np.uint8), "PNG")
+        shares = (pixels @ np.array([1.0, 256.0, 65536.0])) / (256**3 - 1)
+        return encode_image(np.rint(shares * _FARTHEST_M * _DEPTH_STEP).clip(1, 65535).astype(np.uint16), "PNG")
 
     def _mount(self, ego: Any, name: str, attributes: dict[str, Any], transform: Any) -> queue.Queue[Any]:
         """Spawn a sensor on the ego vehicle. Return the queue of its measurements."""
@@ -147,10 +203,17 @@ class ActorNumbers:
         return np.array(numbers, np.uint32)[position.reshape(-1)] if len(ids) else np.empty(0, np.uint32)
 
 
-def encode_image(image: Any) -> bytes:
-    """Return a `carla.Image`, whose pixels are BGRA, as JPEG bytes."""
+def photo_fields(cameras: Sequence[CameraModel]) -> tuple[str, ...]:
+    """Return the fields of the layout that the images of cameras are."""
+    return tuple(f"{folder}.{camera.name}.{suffix}" for camera in cameras for folder, (_, suffix) in _KINDS.items())
+
+
+def encode_bev(image: Any) -> bytes:
+    """Return a `carla.Image` as JPEG bytes."""
+    return encode_image(_rgb(image), "JPEG", BEV_QUALITY).tobytes()
+
+
+def _rgb(image: Any) -> NDArray[np.uint8]:
+    """Return the (H, W, 3) pixels of a `carla.Image`, which are BGRA."""
     pixels = np.frombuffer(bytes(image.raw_data), np.uint8).reshape(int(image.height), int(image.width), 4)
-    rgb = np.ascontiguousarray(pixels[..., 2::-1])
-    buffer = io.BytesIO()
-    import_extra("PIL.Image", "carla").fromarray(rgb).save(buffer, "JPEG", quality=BEV_QUALITY)
-    return buffer.getvalue()
+    return np.ascontiguousarray(pixels[..., 2::-1])

@@ -150,10 +150,12 @@ class Server:
         """Return a random location for a pedestrian, or None where the server found none."""
         return self._world.get_random_location_from_navigation()
 
-    def transform(self, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0), pitch_deg: float = 0.0) -> Any:
-        """Return CARLA's transform of a position in metres, with a pitch only."""
+    def transform(
+        self, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0), pitch_deg: float = 0.0, yaw_deg: float = 0.0
+    ) -> Any:
+        """Return CARLA's transform of a position in metres, without a roll."""
         carla = self.carla
-        return carla.Transform(carla.Location(*xyz), carla.Rotation(pitch=pitch_deg, yaw=0.0, roll=0.0))
+        return carla.Transform(carla.Location(*xyz), carla.Rotation(pitch=pitch_deg, yaw=yaw_deg, roll=0.0))
 
     def transform_at(self, location: Any) -> Any:
         """Return CARLA's transform of a location, without rotation."""

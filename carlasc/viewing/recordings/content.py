@@ -15,6 +15,7 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
+from carlasc.viewing.photos import Photo
 from carlasc.viewing.rendering.drawings import motion_arrows
 from carlasc.viewing.rendering.meshes import SQUARE, split_arcs, surrounded
 from carlasc.viewing.scene import SceneReader
@@ -111,6 +112,7 @@ class RecordedFrame:
         pose: (4, 4) world_T_sensor, where the world is the frame of the first scan; None if the sequence has no poses.
         trails: the ways of the actors up to this frame, in the world.
         picture: the bird's-eye camera picture as its JPEG bytes, or None.
+        photos: the images of the cameras.
     """
 
     number: int
@@ -123,6 +125,7 @@ class RecordedFrame:
     pose: Transform | None
     trails: tuple[Trail, ...]
     picture: bytes | None
+    photos: tuple[Photo, ...] = ()
 
 
 class RecordingWriter(Protocol):
@@ -166,6 +169,7 @@ def record_frames(reader: SceneReader, max_points: int | None) -> Iterator[Recor
             content.pose,
             trails.follow(position, content, moving),
             reader.read_picture(number),
+            reader.read_photos(number),
         )
 
 

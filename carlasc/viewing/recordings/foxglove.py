@@ -9,6 +9,8 @@ Topics, all in right-handed axes with z up; times are seconds since the first fr
     /flow, /boxes, /tracks   SceneUpdate: arrows, boxes, the ways of the actors
     /path                    SceneUpdate: the way of the vehicle through the whole recording
     /picture                 CompressedImage: the bird's-eye camera picture
+    /cameras/NAME/image, /cameras/NAME/calibration
+                             CompressedImage and CameraCalibration of each camera, whose frame is NAME
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
+from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, quaternions_of
 from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
@@ -78,14 +81,18 @@ class FoxgloveWriter:
             return m.SceneEntity(timestamp=stamp, frame_id=frame_id, id=name, **content)
 
         pose = np.eye(4) if frame.pose is None else frame.pose
-        transform = m.FrameTransform(
-            timestamp=stamp,
-            parent_frame_id=WORLD,
-            child_frame_id=EGO,
-            translation=self._vector(pose[:3, 3]),
-            rotation=self._quaternion(pose),
-        )
-        log("/tf", "FrameTransforms", transforms=[transform])
+        places = {(WORLD, EGO): pose} | {(EGO, photo.camera.name): photo.ego_T_camera for photo in frame.photos}
+        transforms = [
+            m.FrameTransform(
+                timestamp=stamp,
+                parent_frame_id=parent,
+                child_frame_id=child,
+                translation=self._vector(place[:3, 3]),
+                rotation=self._quaternion(place),
+            )
+            for (parent, child), place in places.items()
+        ]
+        log("/tf", "FrameTransforms", transforms=transforms)
         for panel, grid in zip(self._reader.panels, frame.grids, strict=True):
             if grid.spec.coordinates == "cylindrical":
                 log_scene(f"/{panel.name}", [entity(n, EGO, triangles=[t]) for n, t in self._wedges(panel, grid)])
@@ -107,6 +114,10 @@ class FoxgloveWriter:
         self._path = None  # once
         if frame.picture is not None:
             log("/picture", "CompressedImage", timestamp=stamp, frame_id=EGO, data=frame.picture, format="jpeg")
+        for photo in frame.photos:
+            topic, own = f"/cameras/{photo.camera.name}", {"timestamp": stamp, "frame_id": photo.camera.name}
+            log(f"{topic}/image", "CompressedImage", data=photo.data, format=photo.kind, **own)
+            log(f"{topic}/calibration", "CameraCalibration", **own, **_calibration(photo.camera))
         self._output.check()
 
     def close(self) -> None:
@@ -241,6 +252,24 @@ class FoxgloveWriter:
     def _uint(self, size: int) -> Any:
         types = self._messages.PackedElementFieldNumericType
         return {1: types.Uint8, 2: types.Uint16, 4: types.Uint32}[size]
+
+
+def _calibration(camera: CameraModel) -> dict[str, Any]:
+    """Return a camera as the content of a CameraCalibration."""
+    models = {"pinhole": "", "fisheye": "kannala_brandt"}
+    distorted = "rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob"
+    given = (
+        (*camera.distortion, 0.0) if len(camera.distortion) == 4 and camera.model != "fisheye" else camera.distortion
+    )
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "distortion_model": models.get(camera.model, distorted),
+        "D": list(given),
+        "K": camera.matrix.reshape(-1).tolist(),
+        "R": np.eye(3).reshape(-1).tolist(),
+        "P": np.column_stack([camera.matrix, np.zeros(3)]).reshape(-1).tolist(),
+    }
 
 
 class _Output:

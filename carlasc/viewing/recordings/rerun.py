@@ -9,6 +9,7 @@ Entities, all in right-handed axes with z up:
     world/ego/vehicle            a plain car
     world/ego/points, flow, boxes
     world/ego/instances          the points of actors, in a colour for each actor
+    world/ego/cameras/NAME       the image of a camera, in its frustum
     world/ego/PANEL/CLASS        the voxels of each class: `grid`, or `prediction`, `truth` and `errors`; `actors`: by actor
     picture                      the bird's-eye camera picture
 """
@@ -35,6 +36,7 @@ from carlasc.errors import import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import ClassColors
+from carlasc.viewing.photos import Photo
 from carlasc.viewing.recordings.content import RecordedFrame, Triangles, class_cells, class_surfaces
 from carlasc.viewing.rendering.drawings import ego_vehicle
 from carlasc.viewing.scene import GridPanel, SceneReader
@@ -43,6 +45,8 @@ _BLOCK = 1 << 16  # bytes
 _POINT_RADIUS_M = 0.1
 _BATCH = 20  # frames that are written together: each batch costs a kilobyte for each entity
 _TRAIL_RADIUS_M = 0.08
+_IMAGES = 2  # cameras whose images have views of their own
+_FRUSTUM_M = 2.0  # from a camera to where its image is drawn
 _BACKGROUND = (246, 247, 249)
 _EYE, _TARGET = (-49.0, 0.0, 35.0), (-3.0, 0.0, -3.0)  # behind and above: a published grid fits in a square view
 
@@ -160,6 +164,8 @@ class RerunWriter:
             log("world/tracks", rr.LineStrips3D(ways, class_ids=classes, radii=[_TRAIL_RADIUS_M], show_labels=False))
         if frame.picture is not None:
             log("picture", rr.EncodedImage(contents=frame.picture, media_type="image/jpeg"))
+        for photo in frame.photos:
+            self._write_photo(photo)
         self._waiting += 1
         if self._waiting == _BATCH:
             self._flush()
@@ -230,6 +236,19 @@ class RerunWriter:
         )
         self._recording.log("world/ego/boxes", content)
 
+    def _write_photo(self, photo: Photo) -> None:
+        """Write the image of a camera, and where the camera was; distortion is left out, as Rerun has no model of it."""
+        rr, camera, place = self._rr, photo.camera, photo.ego_T_camera
+        name = f"world/ego/cameras/{rr.escape_entity_path_part(camera.name)}"
+        lens = rr.Pinhole(
+            image_from_camera=camera.matrix,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=_FRUSTUM_M,
+        )
+        image = rr.EncodedImage(contents=photo.data, media_type=f"image/{photo.kind}")
+        self._recording.log(name, rr.Transform3D(translation=place[:3, 3], mat3x3=place[:3, :3]), lens, image)
+
     def _mesh(self, surface: Triangles, **colors: Any) -> Any:
         return self._rr.Mesh3D(
             vertex_positions=surface.corners, vertex_normals=surface.normals, triangle_indices=surface.indices, **colors
@@ -252,6 +271,9 @@ class RerunWriter:
         others = [self._view(name, [*(f"{n}/**" for n in names), *(n for n in clouds if n != name)]) for name in clouds]
         if reader.has("bev"):
             others.append(blueprint.Spatial2DView(origin="/picture", name="picture"))
+        for photo in reader.read_photos(reader.frames[0])[:_IMAGES]:
+            origin = f"/world/ego/cameras/{self._rr.escape_entity_path_part(photo.camera.name)}"
+            others.append(blueprint.Spatial2DView(origin=origin, name=photo.camera.name))
         if len(grids) == 1 and others:
             layout = blueprint.Horizontal(*grids, blueprint.Vertical(*others), column_shares=[3, 2])
         elif grids and others:

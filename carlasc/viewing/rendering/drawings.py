@@ -30,7 +30,9 @@ _FLOOR = (240, 240, 243)
 _MOVING_M_S = 0.2  # slower points count as static
 _ARROW_CELL_M = 3.0
 GRID_COLORS: tuple[str, ...] = get_args(GridColor)
-_PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags", "actor": "instance"}
+_PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags"}
+_PARTS |= {"actor": "instance", "seen": "seen"}
+_KEPT_BY = {"actor": "actors", "seen": "seen"}  # options of regrid
 _SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # upper bounds of the classes of probabilities, except for the last one
 _POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
 VELOCITY = Entry("velocity (way of 1 s)", palette.ARROW, AFTER_CLASSES)
@@ -39,6 +41,11 @@ _ORIGINS = (
     Entry("seen in other frames", (190, 196, 204), 1),
     Entry("contested: traffic passes here at other times", (204, 121, 167), 2),
     Entry("inferred: no scan saw it", (230, 110, 0), 3),
+)
+_SEEN = (
+    Entry("no camera sees it", (190, 196, 204)),
+    Entry("one camera", (0, 114, 178), 1),
+    Entry("several cameras", (230, 110, 0), 2),
 )
 
 
@@ -293,7 +300,7 @@ def check_color(color: GridColor, reader: SceneReader) -> None:
             found=f"none in {len(missing)} of {len(frames)} frames, such as frame {missing[0]}",
             advice=""
             if color == "votes"
-            else f"make the grid again with `carlasc regrid --keep-{'actors' if color == 'actor' else 'evidence'}`",
+            else f"make the grid again with `carlasc regrid --keep-{_KEPT_BY.get(color, 'evidence')}`",
         )
 
 
@@ -323,6 +330,8 @@ def evidence_legend(color: GridColor) -> list[Entry]:
     """Return the legend of `evidence_drawing`."""
     if color == "inferred":
         return list(_ORIGINS)
+    if color == "seen":
+        return list(_SEEN)
     if color == "actor":
         first = palette.ACTORS.colors[2]
         return [Entry("no actor", palette.STATIC), Entry("an actor, each in a colour of its own", first, 1)]
@@ -346,6 +355,8 @@ def _classify(values: NDArray[Any], color: GridColor) -> tuple[NDArray[np.int64]
     if color == "inferred":
         seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)
         return np.where(values & VoxelFlag.INFERRED, 3, np.where(values & VoxelFlag.CONTESTED, 2, seen)), legend
+    if color == "seen":
+        return np.minimum(np.bitwise_count(values), 2).astype(np.int64), legend
     if color == "actor":
         return palette.actor_ids(values).astype(np.int64), legend
     if color == "confidence":

@@ -96,7 +96,8 @@ def render(
         what: grid, scan, flow, truth, errors: several names, separated by commas, are drawn side by side. None draws the grid,
             with a ground truth also the truth and the errors; or the scan if there is no grid.
         color: what the colours of the grid mean: "class"; or "confidence" (the probability that a voxel is occupied), "views" (the
-            scans that saw it), "votes", "inferred" (where the knowledge comes from): see `docs/format.md#evidence`; or "actor" (who is in it).
+            scans that saw it), "votes", "inferred" (where the knowledge comes from): see `docs/format.md#evidence`; "actor" (who is in it) or "seen" (by how
+            many cameras).
         boxes: whether boxes around actors are drawn: those of the field `boxes`, or else the tightest ones around the points of each
             actor of `instances`.
         camera: from where the scene is seen. By default the camera follows the ego vehicle, behind and above it, because grids and

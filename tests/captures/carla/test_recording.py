@@ -22,6 +22,7 @@ from carlasc.cli import app
 from carlasc.core.geometry import transform_points
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, DependencyError
+from carlasc.storage.camera_files import decode_image
 
 ROAD, VEHICLE, WALKER = (CARLA.id_of(name) for name in ("Road", "Vehicle", "Pedestrian"))
 
@@ -284,6 +285,35 @@ def test_the_camera_looks_down_from_50_metres(tmp_path):
     (camera,) = [a for a in server.worlds[-1].actors if a.type_id == "sensor.camera.rgb"]
     place, turn = camera.offset.location, camera.offset.rotation
     assert (place.x, place.y, place.z, turn.pitch, turn.yaw, turn.roll) == (0, 0, 50, -90, 0, 0)
+
+
+def test_cameras_have_colour_class_and_depth_where_the_town_has_them(server, tmp_path):
+    call(tmp_path, server, count=2, cameras=("front", "left"))
+    capture = Capture(tmp_path)
+    assert list(capture.cameras) == ["front", "left"]
+    mounted = [actor for actor in server.worlds[-1].actors if actor.type_id == "sensor.camera.rgb"]
+    turns = [one.offset.rotation.yaw for one in mounted]
+    assert turns == pytest.approx([0, -90]) and float(mounted[0].attributes["fov"]) == pytest.approx(70)
+    place = capture.cameras["left"].sensor_T_camera[:3, 3] + sensor_offsets(1, np.random.default_rng(0))[0]
+    at = mounted[1].offset.location
+    assert [at.x, at.y, at.z] == pytest.approx(place.tolist(), abs=1e-5)
+    images = capture.read_images(1)
+    assert set(images) == {
+        f"{name}.{camera}.{end}" for camera in ("front", "left") for name, end in
+        (("images", "jpg"), ("image_labels", "png"), ("image_depths", "png"))
+    }  # fmt: skip
+    one = capture.cameras["front"]
+    kinds = {
+        name: decode_image(images[f"{name}.front.png"].tobytes(), "a", one, color=False)
+        for name in ("image_labels", "image_depths")
+    }
+    old = server.version == "0.9.13"
+    assert set(np.unique(kinds["image_labels"])) == {10 if old else CARLA.id_of("Terrain")}  # tag 10
+    assert set(np.unique(kinds["image_depths"])) == {round((64 + 128 * 256) / (2**24 - 1) * 1000 * 256)}
+    color = decode_image(images["images.front.jpg"].tobytes(), "a", one, color=True)
+    assert np.abs(color.astype(int) - (10, 120, 250)).max() < 8
+    with pytest.raises(ConflictError):
+        call(tmp_path, server, count=2)
 
 
 def test_each_frame_and_sensor_has_its_own_noise(tmp_path):

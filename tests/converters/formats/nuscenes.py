@@ -17,6 +17,9 @@ from carlasc.testing.drives import KINDS, DriveScan, SimulatedDrive
 
 START_US = 1532402927647951
 MOUNT = translation((0.94, 0.0, 1.84)) @ rotation_z(-np.pi / 2)  # x of the LiDAR points to the right, y forward
+MATRIX = [[1266.4, 0.0, 816.3], [0.0, 1266.4, 491.5], [0.0, 0.0, 1.0]]
+VEHICLE_T_CAMERA = translation((1.7, 0.0, 1.5)) @ np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+IMAGE_LATER_US = 10_000
 GLOBAL_T_WORLD = translation((411.3, 1180.9, 0.0)) @ rotation_z(-1.1)
 CATEGORIES = {
     "none": "noise", "road": "flat.driveable_surface", "building": "static.manmade", "vegetation": "static.vegetation",
@@ -96,10 +99,11 @@ def _write_scene(
     """Write the files of one scene, and add its rows to the tables."""
     lidarseg, panoptic, annotated = written
     tables["scene"].append({"token": scene, "name": scene, "log_token": "log"})
-    mounts = {"lidar": drive.sensors[0].vehicle_T_sensor, "camera": translation((1.7, 0.0, 1.5))}
+    mounts = {"lidar": drive.sensors[0].vehicle_T_sensor, "camera": VEHICLE_T_CAMERA}
     for name, mount in mounts.items():
         token = f"{scene}-mount-{name}"
-        tables["calibrated_sensor"].append({"token": token, "sensor_token": f"sensor-{name}", **pose_keys(mount)})
+        row = {"token": token, "sensor_token": f"sensor-{name}", "camera_intrinsic": MATRIX if name == "camera" else []}
+        tables["calibrated_sensor"].append(row | pose_keys(mount))
     for frame in reversed(range(drive.frames)):  # rows of tables have no order
         key, at = frame % every == 0, microseconds(drive, frame)
         sample, token = f"{scene}-sample-{-(-frame // every)}", f"{scene}-scan-{frame}"
@@ -110,12 +114,17 @@ def _write_scene(
             "ego_pose_token": f"{token}-pose",
             "timestamp": at,
             "is_key_frame": key,
+            "width": 0,
+            "height": 0,
         }
         row |= {"calibrated_sensor_token": f"{scene}-mount-lidar", "filename": str(folder / f"{scene}__{at}.pcd.bin")}
         camera = {
             "token": f"{token}-picture",
             "calibrated_sensor_token": f"{scene}-mount-camera",
-            "filename": f"{at}.jpg",
+            "filename": f"samples/CAM_FRONT/{scene}__{at}.jpg",
+            "timestamp": at + IMAGE_LATER_US,
+            "width": 1600,
+            "height": 900,
         }
         tables["sample_data"] += [row | camera | {"ego_pose_token": f"{token}-other"}, row]
         pose = GLOBAL_T_WORLD @ drive.world_T_vehicle(drive.times[frame])

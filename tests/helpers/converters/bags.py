@@ -95,6 +95,29 @@ class Messages:
         kind = "tf2_msgs/msg/TFMessage"
         return topic, kind, stamp_ns, self.make(kind, [stamped])
 
+    def camera_info(self, topic, stamp_ns, frame, size, matrix, model="plumb_bob", distortion=()):
+        kind = "sensor_msgs/msg/CameraInfo"
+        projection = np.column_stack([matrix, np.zeros(3)])
+        numbers = [np.array(distortion, np.float64), np.ravel(matrix), np.eye(3).ravel(), projection.ravel()]
+        region = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+        values = (size[1], size[0], model, *numbers, 0, 0, region)
+        return topic, kind, stamp_ns, self.make(kind, self.header(stamp_ns, frame), *values)
+
+    def image(self, topic, stamp_ns, frame, pixels, encoding="bgr8"):
+        kind, (height, width) = "sensor_msgs/msg/Image", pixels.shape[:2]
+        rows = np.pad(pixels.reshape(height, -1), ((0, 0), (0, 3)))  # rows may be padded
+        values = (height, width, encoding, 0, rows.shape[1], rows.reshape(-1))
+        return topic, kind, stamp_ns, self.make(kind, self.header(stamp_ns, frame), *values)
+
+    def compressed(self, topic, stamp_ns, frame, data):
+        kind = "sensor_msgs/msg/CompressedImage"
+        return (
+            topic,
+            kind,
+            stamp_ns,
+            self.make(kind, self.header(stamp_ns, frame), "jpeg", np.frombuffer(data, np.uint8)),
+        )
+
     def imu(self, topic, stamp_ns):
         """A message of a type that is of no use."""
         kind = "std_msgs/msg/String"

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import invert, relative_to, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
@@ -17,7 +18,7 @@ from carlasc.storage.metadata import Metadata
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SENSOR_HEIGHT_M = 1.8
-BUILDING, FENCE, POLE, ROAD, SIDEWALK, VEHICLE, TERRAIN = 1, 2, 5, 7, 8, 10, 22
+BUILDING, FENCE, POLE, ROAD, SIDEWALK, VEHICLE, SKY, TERRAIN = 1, 2, 5, 7, 8, 10, 13, 22
 
 
 @dataclass(frozen=True)
@@ -187,6 +188,19 @@ def vote(
         table.argmax(axis=1).astype(np.uint32).reshape(spec.size),
         table.sum(axis=1).astype(np.float32).reshape(spec.size),
     )
+
+
+def cast_image(
+    street: Street, world_T_sensor: NDArray[np.float64], camera: CameraModel
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Return (H, W) what a camera on the sensor sees of a street: classes, 13 for the sky, and distances along its rays, metres."""
+    rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
+    world_T_camera = world_T_sensor @ camera.sensor_T_camera
+    rays = camera.unproject(np.stack([columns, rows], axis=1)) @ world_T_camera[:3, :3].T
+    distances, labels = street._cast(world_T_camera[:3, 3], rays)
+    labels[~(distances < 200)] = SKY
+    shape = camera.height, camera.width
+    return labels.reshape(shape).astype(np.uint8), distances.reshape(shape)
 
 
 def camera_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:

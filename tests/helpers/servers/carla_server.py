@@ -52,7 +52,7 @@ def blueprint_library():
         Blueprint("walker.pedestrian.0001", ()),
         Blueprint("controller.ai.walker", ()),
         Blueprint("sensor.lidar.ray_cast_semantic", LIDAR),
-        Blueprint("sensor.camera.rgb", CAMERA),
+        *(Blueprint(f"sensor.camera.{kind}", CAMERA) for kind in ("rgb", "semantic_segmentation", "depth")),
     ]
 
 
@@ -276,6 +276,8 @@ class FakeServer:
             width, height = int(sensor.attributes["image_size_x"]), int(sensor.attributes["image_size_y"])
             pixels = np.zeros((height, width, 4), np.uint8)
             pixels[..., :] = (250, 120, 10, 255)  # BGRA: a blue
+            if sensor.type_id.endswith("depth"):
+                pixels[..., :3] = (0, 128, 64)  # 64 + 128 * 256 of 2**24 - 1, a kilometre
             return SimpleNamespace(raw_data=memoryview(pixels.tobytes()), width=width, height=height, **common)
         return SimpleNamespace(raw_data=memoryview(self.sweep(sensor).tobytes()), **common)
 

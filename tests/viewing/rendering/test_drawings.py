@@ -23,8 +23,9 @@ VALUES = {
         [VoxelFlag.SEEN_NOW, VoxelFlag.CONTESTED | VoxelFlag.SEEN_NOW, VoxelFlag.INFERRED | VoxelFlag.IN_ACTOR],
         np.uint8,
     ),
+    "seen": ([0, 4, 0b101], np.uint8),
 }
-SHOWN = {"confidence": (0, 3, 6), "views": (0, 2, 6), "votes": (0, 3, 6), "inferred": (0, 2, 3)}
+SHOWN = {"confidence": (0, 3, 6), "views": (0, 2, 6), "votes": (0, 3, 6), "inferred": (0, 2, 3), "seen": (0, 1, 2)}
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,122 @@
+"""The class of each pixel of a camera's images, in the layout or in a folder of what a network wrote. See `docs/howto/cameras.md`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from carlasc.core.cameras import CameraModel
+from carlasc.errors import FormatError, MissingDataError
+from carlasc.storage import layout
+from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
+from carlasc.storage.camera_files import cameras_of, decode_image, image_fields, read_image
+from carlasc.storage.protocol import Sequence
+
+_SUFFIXES = (".png", ".npy")
+_LAYOUT = "image_labels"
+
+
+@dataclass(frozen=True)
+class PixelClasses:
+    """What says the class of each pixel of the images of one sequence.
+
+    Attributes:
+        sequence: the sequence.
+        files: the files by camera and frame; None: those of the layout.
+    """
+
+    sequence: Sequence
+    files: Mapping[str, Mapping[int, Path]] | None
+
+    @classmethod
+    def find(cls, sequence: Sequence, root: Path | None) -> PixelClasses:
+        """Find the classes of pixels of a sequence.
+
+        Args:
+            sequence: a sequence with cameras.
+            root: a folder with `<sequence>/<camera>/000000.png` or `.npy`, or `<camera>/000000.png` for a single sequence; None: the
+                `image_labels` of the sequence itself.
+
+        Raises:
+            MissingDataError: the sequence has no cameras, or there are no classes of its pixels.
+            FormatError: two folders have those of one camera, or there are those of a camera without calibration.
+        """
+        cameras = cameras_of(sequence)
+        if not cameras:
+            raise MissingDataError(sequence.location, expected=f"cameras in {layout.CAMERAS}", found="none")
+        if root is None:
+            found = cls(sequence, None)
+            known = set(image_fields(sequence, _LAYOUT))
+        else:
+            found = cls(sequence, _files(sequence, root))
+            known = set(found.files or ())
+        if lost := sorted(known - set(cameras)):
+            expected = f"cameras of {layout.CAMERAS}: {', '.join(cameras)}"
+            raise FormatError(
+                root or sequence.location, expected=expected, found=f"{lost[0]}, which has no calibration"
+            )
+        if not known:
+            expected = f"classes of pixels, such as {sequence.name}/{next(iter(cameras))}/000000.png"
+            advice = "give the folder of those that a network wrote as `pixels`" if root is None else ""
+            raise MissingDataError(
+                root or f"{sequence.location}/{_LAYOUT}", expected=expected, found="none", advice=advice
+            )
+        return found
+
+    def has(self, camera: str, frame: int) -> bool:
+        """Whether there are classes of the pixels of a camera in a frame."""
+        if self.files is not None:
+            return frame in self.files.get(camera, {})
+        field = image_fields(self.sequence, _LAYOUT).get(camera)
+        return field is not None and frame in self.sequence.frames(field)
+
+    def read(self, camera: CameraModel, frame: int) -> NDArray[Any]:
+        """Return (H, W) whole numbers, ids of classes; or (H, W, C) floats, the probability of each id.
+
+        Raises:
+            FormatError: the file is damaged, or has another size than the camera's images.
+        """
+        if self.files is None:
+            return read_image(self.sequence, camera, frame, _LAYOUT)
+        path = self.files[camera.name][frame]
+        if path.suffix == ".png":
+            return decode_image(path.read_bytes(), str(path), camera, color=False)
+        array = read_npy(path, ArrayFormat(NUMBERS, None))
+        size, is_float = (camera.height, camera.width), array.dtype.kind == "f"
+        if array.ndim != 2 + is_float or array.shape[:2] != size:
+            expected = f"{size} whole numbers, or {size} and a column for each class of floats, as camera {camera.name} is calibrated"
+            raise FormatError(path, expected=expected, found=f"{array.dtype.name} of shape {array.shape}")
+        return array
+
+    def stamps(self) -> list[tuple[str, int, int]]:
+        """Return names, sizes and times of the files; nothing of those of the layout, which belong to the source."""
+        paths = [path for files in (self.files or {}).values() for path in files.values()]
+        return [(str(path), found.st_size, found.st_mtime_ns) for path in sorted(paths) for found in (path.stat(),)]
+
+
+def _files(sequence: Sequence, root: Path) -> dict[str, dict[int, Path]]:
+    named: dict[bool, dict[str, dict[int, Path]]] = {
+        True: {},
+        False: {},
+    }  # by whether the path has the name of the sequence
+    for folder, _, names in os.walk(root):
+        paths = {
+            frame: Path(folder, name)
+            for name in names
+            for suffix in _SUFFIXES
+            if (frame := layout.frame_of(name, suffix)) is not None
+        }
+        parts = Path(folder).relative_to(root).parts
+        if not paths or not parts:
+            continue
+        mine = named[sequence.name in parts[:-1]]
+        if parts[-1] in mine and (sequence.name in parts[:-1] or len(parts) == 1):
+            raise FormatError(folder, expected=f"one folder of camera {parts[-1]}", found="two")
+        if sequence.name in parts[:-1] or len(parts) == 1:
+            mine[parts[-1]] = paths
+    return named[True] or named[False]

@@ -1,0 +1,38 @@
+"""Which image of a camera belongs to each frame: the nearest in time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def nearest_rows(stamps: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (F,) the row of the stamp nearest to each frame.
+
+    Args:
+        stamps: (N,) increasing; one at least.
+        frames: (F,) stamps of the frames, in the same unit.
+    """
+    after = np.minimum(np.searchsorted(stamps, frames).clip(1), len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(stamps[after] - frames) < np.abs(frames - stamps[before]), after, before)
+
+
+def nearest_images(
+    paths: Mapping[int, Path], frames: NDArray[np.int64], within: int
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], tuple[str, ...]]:
+    """Return the stamp of the image nearest to each frame, whether it is near enough, and its absolute path, "" where it is not.
+
+    Args:
+        paths: the images by stamp; one at least.
+        frames: (F,) stamps of the frames, in the same unit.
+        within: images that are farther away belong to no frame.
+    """
+    stamps = np.array(sorted(paths), np.int64)
+    nearest = stamps[nearest_rows(stamps, frames)]
+    near = np.abs(nearest - frames) < within
+    found = (str(paths[at].absolute()) if ok else "" for at, ok in zip(nearest.tolist(), near, strict=True))
+    return nearest, near, tuple(found)
