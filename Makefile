@@ -65,7 +65,7 @@ notebooks: $(VENV)/ready ## run the notebooks and keep what they show in them
 	$(RUN)/python examples/notebooks/run.py
 
 page: ## build the bundle of the shareable page again from npm
-	carlasc/viewing/page/build.sh
+	carlasc/viewing/page/assets/build.sh
 
 docs: $(VENV)/ready ## the documentation, built strictly into site/
 	NO_MKDOCS_2_WARNING=1 $(RUN)/mkdocs build --strict --quiet

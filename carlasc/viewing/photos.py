@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.core.cameras import CameraModel
-from carlasc.core.geometry import Transform
+from carlasc.core.geometry import Transform, transform_points
+from carlasc.errors import FormatError, import_extra
 from carlasc.storage.camera_files import cameras_of, has_image, image_bytes, scan_T_camera
 from carlasc.storage.protocol import Sequence
+
+_PHOTO_PX, _FRUSTUM_M = 400, 1.0  # the width of an image, and the length of the lines that show where its camera looks
+_QUALITY = 70  # of a JPEG: a third of the bytes of 90, and enough for an image of a few hundred pixels
 
 
 @dataclass(frozen=True)
@@ -31,6 +38,33 @@ class Photo:
         """The format of the image: "jpeg" or "png"."""
         return "png" if self.data.startswith(b"\x89PNG") else "jpeg"
 
+    def frustum(self, depth_m: float) -> NDArray[np.float64]:
+        """Return (8, 2, 3) lines of what the camera sees up to a depth, in the frame of the scan: from its place to four corners, and between these."""
+        width, height = self.camera.width, self.camera.height
+        looks = self.camera.unproject([(0, 0), (width, 0), (width, height), (0, height)])
+        corners = transform_points(self.ego_T_camera, depth_m * looks / np.linalg.norm(looks, axis=1, keepdims=True))
+        places = np.broadcast_to(self.ego_T_camera[:3, 3], (4, 3))
+        return np.concatenate([np.stack([places, corners], 1), np.stack([corners, np.roll(corners, -1, 0)], 1)])
+
+    def smaller(self, width: int) -> bytes:
+        """Return the image as a JPEG that is not wider than so many pixels.
+
+        Raises:
+            FormatError: the image is damaged.
+            DependencyError: Pillow is not installed.
+        """
+        pillow = import_extra("PIL.Image", "render")
+        out = io.BytesIO()
+        try:
+            with pillow.open(io.BytesIO(self.data)) as image:
+                image.thumbnail((width, self.camera.height))
+                image.convert("RGB").save(out, "JPEG", quality=_QUALITY)
+        except OSError as error:
+            raise FormatError(
+                f"image of {self.camera.name}", expected="a whole JPEG or PNG", found=str(error)
+            ) from error
+        return out.getvalue()
+
 
 def photos_of(sequence: Sequence, frame: int, mirrored: bool) -> tuple[Photo, ...]:
     """Read the images of a frame; of cameras without one, nothing.
@@ -49,3 +83,14 @@ def photos_of(sequence: Sequence, frame: int, mirrored: bool) -> tuple[Photo, ..
         if place is not None:
             found.append(Photo(camera, mirror @ place, image_bytes(sequence, camera, frame)[0]))
     return tuple(found)
+
+
+def encode_photos(photos: tuple[Photo, ...]) -> dict[str, NDArray[Any]]:
+    """Encode the images of a frame for a page: `photos/NAME`, the bytes of a small JPEG, and `actors/cameras`, both ends of the lines of their frustums."""
+    arrays: dict[str, NDArray[Any]] = {
+        f"photos/{photo.camera.name}": np.frombuffer(photo.smaller(_PHOTO_PX), np.uint8) for photo in photos
+    }
+    if photos:
+        lines = np.concatenate([photo.frustum(_FRUSTUM_M) for photo in photos])
+        arrays["actors/cameras"] = lines.astype(np.float32).reshape(-1)
+    return arrays

@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import PurePath
 from typing import Any
 
@@ -24,8 +25,10 @@ from carlasc.core.scans import Scan
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.grids import check_same_geometry, compare_grids
+from carlasc.storage.camera_files import cameras_of, has_image
 from carlasc.viewing.colors import ClassColors
 from carlasc.viewing.finding import SceneSource, find_truth
+from carlasc.viewing.photos import encode_photos
 from carlasc.viewing.rendering.actor_boxes import box_lines
 from carlasc.viewing.rendering.drawings import motion_arrows
 from carlasc.viewing.scene import FrameContent, Scene, SceneReader
@@ -235,6 +238,15 @@ class PageContent:
                 return first, second
         return "left", "right"
 
+    @cached_property
+    def cameras(self) -> tuple[str, ...]:
+        """The names of the cameras with images of these frames; none without Pillow, which makes them small."""
+        sequence = self.reader.data.sequence
+        if find_spec("PIL") is None:
+            return ()
+        own = cameras_of(sequence).values()
+        return tuple(camera.name for camera in own if any(has_image(sequence, camera, frame) for frame in self.frames))
+
     def read(self, frame: int, trails: Trails | None = None) -> tuple[Arrays, FrameScores | None]:
         """Return the arrays of a frame, named `panel0/index`, `scan/index`, `actors/boxes`, ..., and its scores if there is a truth.
 
@@ -263,6 +275,8 @@ class PageContent:
             arrays |= {f"scan/{name}": array for name, array in encode_scan(content.scan, self.thin_m).items()}
         ways = trails.follow(self.frames.index(frame), content, moving) if trails is not None else ()
         arrays |= {f"actors/{name}": array for name, array in encode_actors(content, moving, ways).items()}
+        if self.cameras:
+            arrays |= encode_photos(self.reader.read_photos(frame))
         return arrays, self._score(grids)
 
     def describe(self) -> dict[str, Any]:
@@ -285,6 +299,7 @@ class PageContent:
             "hasFlow": reader.has_motion,
             "hasBoxes": reader.has("boxes"),
             "hasTracks": bool(poses) and any(map(reader.has, ("boxes", "instances", f"{reader.data.grid}/instance"))),
+            "cameras": list(self.cameras),
             "pointCell": self.thin_m,
             "offsetSteps": OFFSET_STEPS,
         }

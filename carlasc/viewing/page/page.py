@@ -31,6 +31,7 @@ SCRIPTS = (
     "voxels.js",
     "points.js",
     "path.js",
+    "photos.js",
     "panels.js",
     "divider.js",
     "plot.js",

@@ -15,6 +15,7 @@ function pageKeys(viewer) {
     p: () => viewer.layerButtons.points?.click(),
     f: () => viewer.layerButtons.flow?.click(),
     t: () => viewer.layerButtons.path?.click(),
+    c: () => viewer.layerButtons.cameras?.click(),
     1: () => viewer.setView('behind'),
     2: () => viewer.setView('top'),
     3: () => press('follow'),

@@ -22,6 +22,7 @@ class Panels {
     this.path = new PathLayer();
     this.actorBoxes = new LineLayer(this.side, '#15171b');
     this.tracks = new LineLayer(this.side, '#c2410c');
+    this.frustums = new LineLayer(this.side, '#2563eb');
     this.scan = new ScanLayer(this.side, this.palettes[scene.pointTable], heights, first);
     this.panels = (scene.panels.length ? scene.panels : [null]).map((panel) => this.makePanel(panel));
     for (const panel of this.panels) {
@@ -50,7 +51,7 @@ class Panels {
     const vehicle = egoVehicle();
     if (layer) scene.add(layer.mesh, outline(panel, this.side));
     const path = this.path.object();
-    scene.add(vehicle, path, this.actorBoxes.object(), this.tracks.object(), ...this.scan.objects());
+    scene.add(vehicle, path, this.actorBoxes.object(), this.tracks.object(), this.frustums.object(), ...this.scan.objects());
     return { panel, scene, layer, vehicle, path, shown: true };
   }
 
@@ -59,12 +60,13 @@ class Panels {
     return this.panels.filter((panel) => panel.shown && !panel.isRight);
   }
 
-  setFrame({ grids, scan, arrows, boxes, tracks }) {
+  setFrame({ grids, scan, arrows, boxes, tracks, cameras }) {
     this.most = Math.max(0, ...grids.map((grid) => this.mode.most(grid)));
     this.panels.forEach(({ layer }, number) => layer && layer.set(grids[number], this.most));
     this.scan.set(scan, arrows);
     this.actorBoxes.set(boxes);
     this.tracks.set(tracks);
+    this.frustums.set(cameras);
     this.invalidate();
   }
 
@@ -79,7 +81,7 @@ class Panels {
       if (what === 'path') path.visible = visible;
       if (what === 'vehicle') vehicle.visible = visible;
     }
-    const objects = { points: this.scan.points, flow: this.scan.arrows, boxes: this.actorBoxes.lines, tracks: this.tracks.lines }[what] ?? [];
+    const objects = { points: this.scan.points, flow: this.scan.arrows, boxes: this.actorBoxes.lines, tracks: this.tracks.lines, cameras: this.frustums.lines }[what] ?? [];
     for (const object of objects) object.visible = visible;
     this.scan.thinArrows();
     this.invalidate();

@@ -36,8 +36,9 @@ class FrameStore {
     const bytes = this.scene.embedded ? this.unwrap(position) : await this.fetch(position, signal);
     const arrays = unpackArrays(await inflate(bytes));
     const grids = this.scene.panels.map((panel, number) => decodeGrid(arrays, `panel${number}`, panel));
-    const [arrows, boxes, tracks] = ['arrows', 'boxes', 'tracks'].map((name) => arrays[`actors/${name}`] ?? new Float32Array(0));
-    return { grids, scan: decodeScan(arrays, this.scene), arrows, boxes, tracks };
+    const [arrows, boxes, tracks, cameras] = ['arrows', 'boxes', 'tracks', 'cameras'].map((name) => arrays[`actors/${name}`] ?? new Float32Array(0));
+    const photos = Object.fromEntries(this.scene.cameras.map((name) => [name, arrays[`photos/${name}`]]));
+    return { grids, scan: decodeScan(arrays, this.scene), arrows, boxes, tracks, cameras, photos };
   }
 
   /** Returns the bytes of a frame that is part of the page. */

@@ -16,7 +16,8 @@ class Viewer {
     this.picked = null;
     this.playing = false;
     this.follows = false;
-    this.layers = { grid: scene.panels.length > 0, points: scene.panels.length === 0, flow: true, boxes: true, tracks: true, path: true, vehicle: true };
+    this.layers = { grid: scene.panels.length > 0, points: scene.panels.length === 0, flow: true, boxes: true, tracks: true, cameras: true, path: true, vehicle: true };
+    this.photos = new PhotoStrip(byId('photos'), scene.cameras);
     this.makeHeader();
     this.makeLayers();
     this.makeLegends();
@@ -74,16 +75,16 @@ class Viewer {
   }
 
   makeLayers() {
-    const { panels, hasPoints, hasFlow, hasBoxes, hasTracks, frames, poses } = this.scene;
-    const names = { grid: 'Grid', points: 'Points', flow: 'Flow', boxes: 'Boxes', tracks: 'Tracks', path: 'Path', vehicle: 'Car' };
-    const available = { grid: panels.length > 0, points: hasPoints, flow: hasFlow, boxes: hasBoxes, tracks: hasTracks, path: Boolean(poses) && frames.length > 1, vehicle: true };
+    const { panels, hasPoints, hasFlow, hasBoxes, hasTracks, cameras, frames, poses } = this.scene;
+    const names = { grid: 'Grid', points: 'Points', flow: 'Flow', boxes: 'Boxes', tracks: 'Tracks', cameras: 'Cameras', path: 'Path', vehicle: 'Car' };
+    const available = { grid: panels.length > 0, points: hasPoints, flow: hasFlow, boxes: hasBoxes, tracks: hasTracks, cameras: cameras.length > 0, path: Boolean(poses) && frames.length > 1, vehicle: true };
     this.layerButtons = {};
     for (const [layer, label] of Object.entries(names)) {
       if (!available[layer]) continue;
       const button = toggleButton(label, this.layers[layer], (on) => this.setLayer(layer, on), { 'data-layer': layer });
       this.layerButtons[layer] = button;
       byId('layer-buttons').append(button);
-      this.panels.setVisible(layer, this.layers[layer]);
+      this.setLayer(layer, this.layers[layer]);
     }
     const select = byId('color-by');
     for (const mode of modesOf(this.scene)) select.append(make('option', { value: mode }, MODES[mode].label));
@@ -149,6 +150,7 @@ class Viewer {
     this.position = position;
     this.contents = contents;
     this.panels.setFrame(contents);
+    this.photos.show(contents.photos);
     this.drive(before, position);
     for (const { legend, counted, panels } of this.legends) {
       const columns = panels.map((number) => countBy(contents.grids[number].label, legend.classes.length));
@@ -220,6 +222,7 @@ class Viewer {
   setLayer(layer, on) {
     this.layers[layer] = on;
     this.panels.setVisible(layer, on);
+    if (layer === 'cameras') this.photos.setVisible(on);
     if (layer === 'grid') this.unpick();
   }
 
