@@ -14,17 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Trajectory
+from carlasc.core import CameraModel
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, check_rigid, invert, multiply, quaternions_of
 from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.files import opening, sequence_name
 from carlasc_converters.kitti_boxes import BoxRows
+from carlasc_converters.ncore_cameras import NcoreCamera
 from carlasc_converters.ncore_classes import NCORE, NCORE_TO_CARLA, OTHER_OBJECT, class_of_name
 from carlasc_converters.ncore_store import SUFFIXES, NcoreStore, open_store
 from carlasc_converters.transforms import FrameTree, PlacedFrame
 
 _VERSION = "v4"
 _COMPONENT = "v1"
+_KINDS = ("lidars", "poses", "cuboids", "cameras", "intrinsics")
 _RIG, _WORLD = "rig", "world"
 _NS = 1000  # nanoseconds in a microsecond
 _ALONE_US = 50_000.0  # how far from a single frame what belongs to it may be
@@ -81,7 +84,7 @@ class NcoreRecording(Recording):
     @cached_property
     def _components(self) -> dict[str, dict[str, tuple[NcoreStore, str]]]:
         """Store and group of each component that is read, by its kind and its name."""
-        found: dict[str, dict[str, tuple[NcoreStore, str]]] = {kind: {} for kind in ("lidars", "poses", "cuboids")}
+        found: dict[str, dict[str, tuple[NcoreStore, str]]] = {kind: {} for kind in _KINDS}
         for store in self._stores:
             for kind, components in found.items():
                 for name in store.groups(kind):
@@ -194,7 +197,7 @@ class NcoreRecording(Recording):
         """Return seconds after the first frame."""
         return self._seconds(self._first[:, 1])
 
-    def _seconds(self, stamps_us: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _seconds(self, stamps_us: NDArray[Any]) -> NDArray[np.float64]:
         return (stamps_us - self._first[0, 1]) / 1e6
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
@@ -239,10 +242,47 @@ class NcoreRecording(Recording):
                 rows.add(frame, track, OTHER_OBJECT if label is None else label, pose, size)
         return rows.boxes()
 
+    @cached_property
+    def _cameras(self) -> list[NcoreCamera]:
+        """The cameras with a calibration, by name."""
+        if (component := self._component("intrinsics")) is None:
+            return []
+        store, group = component
+        images, found = self._components["cameras"], []
+        for name in store.groups(f"{group}/cameras"):
+            own, place = images.get(name, (store, f"cameras/{name}"))
+            found.append(NcoreCamera(name, own, place, store.attributes(f"{group}/cameras/{name}")))
+        return found
+
+    @cached_property
+    def _images(self) -> dict[str, list[int | None]]:
+        """The row of the image of each frame, by camera."""
+        return {camera.name: camera.nearest(self._first[:, 1], self._slack_us) for camera in self._cameras}
+
+    def cameras(self) -> Sequence[CameraModel]:
+        """Return the cameras whose model is one of the layout's, and that the poses place on the vehicle."""
+        found, at = [], self._first[:1, 1] * _NS
+        for camera in self._cameras:
+            if camera.unknown is None and self._tree.connected(camera.name, self._vehicle):
+                middles = self._seconds(camera.spans.mean(axis=1))
+                taken = [np.nan if row is None else float(middles[row]) for row in self._images[camera.name]]
+                place = self._tree.lookup(self._vehicle, camera.name, at)[0]
+                found.append(camera.model(place, np.array(taken) if len(middles) else None))
+        return found
+
+    def image(self, camera: CameraModel, frame: int) -> tuple[str, bytes] | None:
+        """Return the image of a camera that is nearest to a frame."""
+        row = self._images[camera.name][frame]
+        return None if row is None else next(own for own in self._cameras if own.name == camera.name).read(row)
+
     def notes(self) -> list[str]:
         """Return what of the recording was left out, and which classes of objects are not known."""
-        notes = list[str]()
-        for kind in ("poses", "cuboids"):
+        notes = [
+            f"the camera {camera.name} was left out: {camera.unknown or f'no poses lead to {self._vehicle}'}"
+            for camera in self._cameras
+            if camera.unknown or not self._tree.connected(camera.name, self._vehicle)
+        ]
+        for kind in ("poses", "cuboids", "intrinsics"):
             chosen, found = self._component(kind), self._components[kind]
             if others := [name for name, component in found.items() if component != chosen]:
                 notes.append(f"of several {kind}, others than the one that was read: {', '.join(others)}")

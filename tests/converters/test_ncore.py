@@ -16,6 +16,7 @@ from helpers.converters.ncore_files import NAMES, START_US, contents, for_librar
 from carlasc.converting import Sensor
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.errors import FormatError, MissingDataError
+from carlasc.storage.camera_files import encode_image
 from carlasc.testing import ConverterContract, SimulatedDrive
 
 pytestmark = pytest.mark.needs("cbor2", "numcodecs")
@@ -190,3 +191,82 @@ def test_what_the_library_writes_is_read_as_the_library_reads_it(tmp_path, libra
     (recording,) = Ncore(tmp_path).sequences()
     with np.load(tmp_path / "library.npz") as found:
         check_against(recording, found)
+
+
+CAMERA = {
+    "resolution": [64, 48],
+    "shutter_type": "GLOBAL",
+    "principal_point": [32.5, 24.5],
+    "focal_length": [60.0, 61.0],
+    "radial_coeffs": [0.1, 0.02, 0.003, 0.0, 0.0, 0.0],
+    "tangential_coeffs": [0.001, -0.002],
+    "thin_prism_coeffs": [0.0] * 4,
+}
+FISHEYE = {**CAMERA, "radial_coeffs": [0.01, 0.0, 0.0, 0.0], "max_angle": 1.5}
+
+
+def photographed(drive):
+    """Return what adds cameras to a store: two that can be projected, and three that cannot."""
+    image = encode_image(np.full((48, 64, 3), 80, np.uint8), "PNG").tobytes()
+    spans = [(START_US + round(1e6 * t), START_US + round(1e6 * t) + 2000) for t in drive.times]
+    images = dict.fromkeys(spans[:-1], (image + b"\x00\x00", "png"))  # what follows the image is not lost
+    ahead = np.eye(4)
+    ahead[:3, :3], ahead[:3, 3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], (1.5, 0, 1.4)
+    prism = {**CAMERA, "thin_prism_coeffs": [0.1, 0, 0, 0]}
+    kinds = {
+        "front": ("opencv-pinhole", CAMERA),
+        "round": ("opencv-fisheye", FISHEYE),
+        "theta": ("ftheta", CAMERA),
+        "prism": ("opencv-pinhole", prism),
+    }
+    found = {
+        name: {
+            "lens": {"camera_model_type": kind, "camera_model_parameters": given},
+            "rig_T_camera": ahead,
+            "images": images if name == "front" else {},
+        }
+        for name, (kind, given) in kinds.items()
+    }
+    found["nowhere"] = {key: value for key, value in found["front"].items() if key != "rig_T_camera"}
+    return lambda content: content.update(cameras=found)
+
+
+def test_cameras_are_where_the_rig_has_them_with_the_image_nearest_to_each_frame(tmp_path):
+    write_store(tmp_path, DRIVE, edit=photographed(DRIVE))
+    (recording,) = Ncore(tmp_path).sequences()
+    front, wide = recording.cameras()
+    assert (front.name, front.width, front.height, front.model) == ("front", 64, 48, "radial-tangential")
+    assert front.distortion == (0.1, 0.02, 0.001, -0.002, 0.003, 0, 0, 0)
+    np.testing.assert_allclose(
+        front.matrix, [[60, 0, 32], [0, 61, 24], [0, 0, 1]]
+    )  # centres of pixels are whole numbers
+    np.testing.assert_allclose(front.sensor_T_camera[:3, 3], (1.5, 0, 1.4))
+    np.testing.assert_allclose(front.sensor_T_camera[:3, 2], (1, 0, 0), atol=1e-9)  # it looks ahead
+    assert (wide.model, len(wide.distortion), wide.times) == ("fisheye", 4, None)
+    ends = recording.times()
+    assert np.isnan(front.times[-1]) and np.abs(front.times[:-1] - ends[:-1]).max() < 0.06
+    ending, data = recording.image(front, 0)
+    assert ending == "png" and data.startswith(b"\x89PNG") and data.endswith(b"\0\0")
+    assert recording.image(front, len(ends) - 1) is None and recording.image(wide, 0) is None
+
+
+def test_cameras_of_other_models_are_left_out_and_named(tmp_path):
+    write_store(tmp_path, DRIVE, edit=photographed(DRIVE))
+    (recording,) = Ncore(tmp_path).sequences()
+    notes = "\n".join(recording.notes())
+    for name, why in (("theta", "the model ftheta"), ("prism", "thin prisms"), ("nowhere", "no poses lead to rig")):
+        assert f"the camera {name} was left out: {why}" in notes
+
+
+def test_a_camera_without_numbers_is_one_line(tmp_path):
+    def damage(content):
+        photographed(DRIVE)(content)
+        content["cameras"]["front"]["lens"] = {
+            "camera_model_type": "opencv-pinhole",
+            "camera_model_parameters": {"resolution": [64, 48]},
+        }
+
+    write_store(tmp_path, DRIVE, edit=damage)
+    (recording,) = Ncore(tmp_path).sequences()
+    with pytest.raises(FormatError, match="intrinsics of front: .*camera of NCore"):
+        recording.cameras()

@@ -94,7 +94,11 @@ def for_library(folder: Path, content: dict) -> None:
 def write_store(
     folder: Path, drive: SimulatedDrive, *, version: str = "v4", edit: Callable[[dict], object] = bool
 ) -> Path:
-    """Write a store, and return its file; `edit` may change what it holds, as `contents` returns it."""
+    """Write a store, and return its file; `edit` may change what it holds, as `contents` returns it.
+
+    `edit` may add "cameras": for each name `lens`, its attributes in the component "intrinsics", `rig_T_camera`, and `images`: file and format by
+    (start, end) in microseconds.
+    """
     content = contents(drive)
     edit(content)
     members: dict[str, bytes] = {}
@@ -139,6 +143,21 @@ def write_store(
         for key in ("distance_m", "intensity"):
             array(f"{returns}/{key}", frame[key], (1, frame[key].shape[1]))
     group("poses/default", component_version="v1")
+    cameras = content.get("cameras", {})
+    for name, camera in cameras.items():
+        group(f"intrinsics/default/cameras/{name}", **camera["lens"])
+        group(f"cameras/{name}", component_version="v1")
+        group(f"cameras/{name}/frames", frames_timestamps_us=[list(span) for span in camera["images"]])
+        for (_, end), (data, kind) in camera["images"].items():
+            place = f"cameras/{name}/frames/{end}/image"
+            metadata[f"{place}/.zarray"] = {
+                "zarr_format": 2, "shape": [], "chunks": [], "dtype": f"|S{len(data)}", "compressor": None, "fill_value": "", "filters": None, "order": "C",
+            }  # fmt: skip
+            metadata[f"{place}/.zattrs"] = {"format": kind}
+            members[f"{place}/0"] = data
+    if cameras:
+        metadata["intrinsics/default/.zattrs"] = {"component_version": "v1"}
+    content["mounts"] |= {name: camera["rig_T_camera"] for name, camera in cameras.items() if "rig_T_camera" in camera}
     static = {
         str((name, "rig")): {"pose": pose.tolist(), "dtype": "float64"} for name, pose in content["mounts"].items()
     }
