@@ -74,5 +74,6 @@ def test_a_result_as_a_dictionary_holds_all_of_it():
             "disagreement_m": None,
             "refined_m": None,
             "mounting": {},
+            "images": {},
         }
     ]

@@ -277,7 +277,7 @@ def _place_of(error: BaseException) -> str:
         last = f"[{Path(step.filename).name}:{step.lineno}]"
         for package in ("carlasc", "carlasc_converters", "completion"):
             parts = Path(step.filename).parts
-            if package in parts[:-1] and "site-packages" not in parts:
+            if package in parts[:-1] and not {"site-packages", "tests"} & {*parts}:  # a checkout may be named after it
                 own = f"[{'/'.join(parts[len(parts) - 1 - parts[::-1].index(package) :])}:{step.lineno}]"
     return own or last
 
