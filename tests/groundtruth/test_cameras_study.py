@@ -1,0 +1,24 @@
+"""The study of cameras, on two frames of one town."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+STUDY = Path(__file__).parents[2] / "docs/studies/cameras.py"
+
+
+@pytest.mark.slow
+@pytest.mark.needs("embreex")
+def test_the_study_prints_the_rows_of_its_page(tmp_path):
+    call = [sys.executable, STUDY, tmp_path / "work", "--seeds", "23", "--size", "tiny"]
+    done = subprocess.run([*map(str, call)], capture_output=True, text=True, check=True)
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in done.stdout.splitlines()]
+    first, second = rows[:2], rows[2:]
+    labelled, right, of_all, voxels = (float(cell.removesuffix(" %")) for cell in first[1][1:])
+    assert min(labelled, right, of_all, voxels) > 90
+    assert [row[1] for row in second[1:]] == ["coarse, one LiDAR", "coarse, twelve LiDARs", "0.2 m, twelve LiDARs"]
+    for row in second[1:]:
+        uncut, share, by_centre = (float(cell.removesuffix(" %")) for cell in row[2:])
+        assert uncut > by_centre > 70 and 40 < share < 80
