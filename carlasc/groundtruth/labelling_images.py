@@ -24,7 +24,6 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
-from carlasc.errors import ArgumentError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
@@ -38,8 +37,8 @@ from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.camera_files import cameras_of, scan_T_camera
-from carlasc.storage.derived_copies import DerivedCopy, DerivedSequence, sequences_with_scans
-from carlasc.storage.labelling import LabelResult, reader_for
+from carlasc.storage.derived_copies import DerivedSequence, sequences_with_scans
+from carlasc.storage.labelling import LabelResult, begin_labelled, checked_name, reader_for
 from carlasc.storage.metadata import PREDICTED
 from carlasc.storage.pixel_classes import PixelClasses
 from carlasc.storage.predictions import PredictionReader, read_table
@@ -106,9 +105,7 @@ def label_images(
         StorageError: the files cannot be written.
     """
     began = time.perf_counter()
-    by = ("images" if pixels is None else Path(pixels).resolve().name) if by is None else by
-    if not by.strip() or not by.isprintable():
-        raise ArgumentError("by", expected="a name of one line", found=repr(by))
+    by = checked_name(("images" if pixels is None else Path(pixels).resolve().name) if by is None else by)
     table = None if classes is None else read_table(classes)
     source = as_source(source)
     given = sequences_with_scans(source)
@@ -119,16 +116,9 @@ def label_images(
     for one in inputs.values():
         _ = one.feed.motion  # raises what is wrong before anything is written
     digest = blake2b(repr([one.stamps() for one in found.values()]).encode(errors="surrogateescape"), digest_size=16)
-    settings = {"observe": repr(observe), "by": by, "pixels": digest.hexdigest()}
-    copy = DerivedCopy.begin(
-        source,
-        out,
-        settings | {"classes": None if table is None else table.to_dict()},
-        kind="predicted labels",
-        is_kind=lambda metadata: metadata.predicted is not None,
-        overwrite=overwrite,
-        run=run,
-    )
+    settings: dict[str, Any] = {"observe": repr(observe), "by": by, "pixels": digest.hexdigest()}
+    settings |= {"classes": None if table is None else table.to_dict()}
+    copy = begin_labelled(source, out, settings, overwrite, run)
     labelled = dict[str, _ShownSequence]()
     with one_pool(run) as pool:
         for path, one in inputs.items():

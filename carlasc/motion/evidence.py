@@ -161,7 +161,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     candidates = np.flatnonzero(asked & finite(scan.points))
     before, after = _others(window, current)
     world = transform_points(scan.world_T_sensor, scan.points[candidates].astype(np.float64))
-    asked_first, same = _thin(world)
+    asked_first, same = numbered(np.floor(world / _JUDGED_CELL_M).astype(np.int64))
     verdict = _judge(scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after])
     moved, left, static = (answers[same] for answers in verdict)
     kind = np.zeros(len(candidates), np.int64)
@@ -231,11 +231,6 @@ def _judge(
     moved = (seen_through >= _AGREEING) & (seen_through > occupied)
     left = ~moved & (in_a_row >= _IN_A_ROW)
     return moved, left, ~(moved | left) & (occupied > seen_through)
-
-
-def _thin(world: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first point of each small cell, and the position of each point's cell among them."""
-    return numbered(np.floor(world / _JUDGED_CELL_M).astype(np.int64))
 
 
 def _clusters(

@@ -53,9 +53,9 @@ class Planes:
         self._sorted = joined[self._order]
 
     @property
-    def in_order(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], int]:
-        """(M, 3) points, sorted along the axis on which they are spread most, their (M, 3) normals, the (M,) index of each before, and the axis."""
-        return self._sorted, self.normals[self._order], self._order, self._widest
+    def in_order(self) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
+        """(M, 3) points, sorted along the axis on which they are spread most, the (M,) index of each in `points`, and this axis."""
+        return self._sorted, self._order, self._widest
 
 
 def covariances(sums: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -47,27 +47,27 @@ def register(
         previous: (3,) position at the sighting before, metres, world.
         shifts: (K, 4) directions in which the ends of what is seen moved since then, and how far, in metres.
     """
-    state: NDArray[np.float64] = _register(points, *model.in_order, predicted, error, previous, shifts)
+    state: NDArray[np.float64] = _register(
+        points, *model.in_order, model.points, model.normals, predicted, error, previous, shifts
+    )
     return state
 
 
 @cached(error_model="python")
 def _register(
     points: NDArray[np.float64],
-    model: NDArray[np.float64],
-    normals: NDArray[np.float64],
+    ordered: NDArray[np.float64],
     order: NDArray[np.int64],
     axis: int,
+    model: NDArray[np.float64],
+    normals: NDArray[np.float64],
     predicted: NDArray[np.float64],
     error: NDArray[np.float64],
     previous: NDArray[np.float64],
     shifts: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """As `register`, with the model's (M, 3) points, sorted along an axis, their normals, and their order before they were sorted."""
+    """As `register`, with the model's (M, 3) points and normals, and what `Planes.in_order` gives."""
     state, prior = predicted.copy(), 1 / (error * error)
-    place = np.empty(len(order), np.int64)  # where each point of the model is among the sorted ones
-    for k in range(len(order)):
-        place[order[k]] = k
     first_reach = max(_FIRST_REACH_M, _DEVIATIONS * max(error[0], error[1]))
     pose, slope = np.eye(4), np.empty(4)
     for iteration in range(_ITERATIONS):
@@ -84,10 +84,10 @@ def _register(
                 pull[a] += way[a] * left / _ENDS_M**2
                 for b in range(3):
                     information[a, b] += way[a] * way[b] / _ENDS_M**2
-        rows, nearest = nearest_within(points, pose, model, order, axis, reach * reach)
+        rows, nearest = nearest_within(points, pose, ordered, order, axis, reach * reach)
         scale, share = max(2 * _POINT_M, _ROBUST * reach), min(1.0, _INDEPENDENT / max(len(rows), 1))
         for p in range(len(rows) if len(rows) >= _FEWEST else 0):
-            k, point = place[nearest[p]], points[rows[p]]
+            k, point = nearest[p], points[rows[p]]
             arm_x, arm_y = model[k, 0] * cos - model[k, 1] * sin, model[k, 0] * sin + model[k, 1] * cos
             slope[0], slope[1] = normals[k, 0] * cos - normals[k, 1] * sin, normals[k, 0] * sin + normals[k, 1] * cos
             slope[2], slope[3] = normals[k, 2], arm_x * slope[1] - arm_y * slope[0]

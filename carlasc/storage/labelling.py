@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -93,9 +93,7 @@ def label(
     """
     began = time.perf_counter()
     source, root = as_source(source), Path(predictions)
-    by = root.resolve().name if by is None else by
-    if not by.strip() or not by.isprintable():
-        raise ArgumentError("by", expected="a name of one line", found=repr(by))
+    by = checked_name(root.resolve().name if by is None else by)
     table = None if classes is None else read_table(classes)
     chosen = FrameRange.of(frames)
     scans = sequences_with_scans(source)
@@ -105,7 +103,32 @@ def label(
     }
     settings = {"frames": str(chosen), "logits": logits, "by": by, "predictions": _digest(files.values())}
     settings |= {"classes": None if table is None else table.to_dict()}
-    copy = DerivedCopy.begin(
+    copy = begin_labelled(source, out, settings, overwrite, run)
+    copied = copy.write(sequences, run)
+    return LabelResult(
+        **vars(copied) | {"elapsed_s": time.perf_counter() - began},
+        by=by,
+        classes=", ".join(sorted({one.reader.target.name for one in sequences.values()})),
+        frames=sum(len(one.frames) for one in files.values()),
+    )
+
+
+def checked_name(by: str) -> str:
+    """Return the name of what made labels.
+
+    Raises:
+        ArgumentError: it is empty, or has several lines.
+    """
+    if not by.strip() or not by.isprintable():
+        raise ArgumentError("by", expected="a name of one line", found=repr(by))
+    return by
+
+
+def begin_labelled(
+    source: Source, out: str | os.PathLike[str], settings: Mapping[str, Any], overwrite: bool, run: Run
+) -> DerivedCopy:
+    """Begin a copy with predicted labels; see `DerivedCopy.begin`."""
+    return DerivedCopy.begin(
         source,
         out,
         settings,
@@ -113,13 +136,6 @@ def label(
         is_kind=lambda metadata: metadata.predicted is not None,
         overwrite=overwrite,
         run=run,
-    )
-    copied = copy.write(sequences, run)
-    return LabelResult(
-        **vars(copied) | {"elapsed_s": time.perf_counter() - began},
-        by=by,
-        classes=", ".join(sorted({one.reader.target.name for one in sequences.values()})),
-        frames=sum(len(one.frames) for one in files.values()),
     )
 
 

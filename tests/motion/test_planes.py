@@ -17,7 +17,7 @@ def planes_of(points):
 
 
 def pairs(points, pose, model, squared):
-    ordered, _, order, axis = model.in_order
+    ordered, order, axis = model.in_order
     return nearest_within(points, pose, ordered, order, axis, squared)
 
 
