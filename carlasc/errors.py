@@ -10,9 +10,10 @@ import importlib
 import os
 import re
 import signal
+import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from types import FrameType, ModuleType
 from typing import Any, Self, get_args
 
@@ -174,7 +175,7 @@ def import_extra(module: str, extra: str) -> ModuleType:
         DependencyError: the module is not installed or fails to load.
     """
     try:
-        with postponed_interrupts():
+        with nullcontext() if module in sys.modules else postponed_interrupts():
             return importlib.import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]

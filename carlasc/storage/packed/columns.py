@@ -130,8 +130,8 @@ class PointsPacking(Packing):
         """Return (N, 4) float32 rows, as the published file has them."""
         xyz, fourth = columns["xyz"], columns["fourth"]
         points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
-        points[:, :3] = self.to_metres(xyz).T
-        points[:, 3] = fourth if fourth.size else 0
+        for place, column in enumerate((*self.to_metres(xyz), fourth if fourth.size else 0)):  # NumPy moves all three at once slowly
+            points[:, place] = column
         return points
 
     def to_metres(self, xyz: NDArray[Any]) -> NDArray[np.float32]:
