@@ -315,5 +315,5 @@ class RemappedSequence:
 
 def without_invalid_points(scan: Scan) -> Scan:
     """Return a scan without the points that have a coordinate that is NaN or infinite."""
-    finite = np.asarray(np.isfinite(scan.points).all(axis=1))
-    return scan if finite.all() else scan.select(finite)
+    finite = np.isfinite(scan.points)
+    return scan if finite.all() else scan.select(np.asarray(finite.all(axis=1)))
