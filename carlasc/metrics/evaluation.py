@@ -92,7 +92,7 @@ class Scorer:
         try:
             if isinstance(content, CarlascError):
                 raise content
-            matrix = self._score(pair, frame, *content)
+            matrix = self._score(pair, frame, content)
         except ArgumentError:
             raise  # the error is the same in every frame
         except CarlascError as error:
@@ -154,15 +154,8 @@ class Scorer:
             )
         return prediction, truth
 
-    def _score(
-        self,
-        pair: Pair,
-        frame: int,
-        prediction: NDArray[np.unsignedinteger],
-        truth: NDArray[np.unsignedinteger],
-        known_by: _Known,
-    ) -> ConfusionMatrix:
-        tables = self.tables[pair.truth.path]
+    def _score(self, pair: Pair, frame: int, content: LabelPair) -> ConfusionMatrix:
+        (prediction, truth, known_by), tables = content, self.tables[pair.truth.path]
         known, spec = self._known(pair, frame, known_by, truth.shape), pair.spec
         region = None
         if self.scoring.region is not None and spec is not None:

