@@ -16,6 +16,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import study
+
 PASS_WORKERS = 8
 WORKERS = (2, 16, 100, 1000)
 
@@ -146,5 +148,11 @@ def table() -> str:
     return "\n".join(rows)
 
 
+def main() -> None:
+    """Print the table."""
+    with study.begin(study.options(__doc__)):
+        print(table())
+
+
 if __name__ == "__main__":
-    print(table())
+    main()

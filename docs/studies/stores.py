@@ -1,4 +1,4 @@
-"""How small packed stores are: `python docs/studies/stores.py [--size tiny]` prints the table of docs/storage.md.
+"""How small packed stores are: `python docs/studies/stores.py` prints the table of docs/storage.md.
 
 A simulated drive of full scans (64 channels, ground truth from 20 sensors, medium traffic, seed 0) is packed into each store. Shares are of the
 fields that the published download has: `instances` is not among them, and the bird's-eye pictures are.
@@ -6,9 +6,9 @@ fields that the published download has: `instances` is not among them, and the b
 
 from __future__ import annotations
 
-import argparse
-import tempfile
 from pathlib import Path
+
+import study
 
 import carlasc
 from carlasc import GridSpec
@@ -32,7 +32,7 @@ FIELDS = {  # of the store's fields, the row of the table
     "index": "text files, index",
 }
 ALL_FRAMES = 43_200
-SIZES = {"tiny": (2, 2, Lidar(channels=8, points=2_000)), "full": (24, 20, Lidar())}
+SIZES = {"tiny": (2, 2, Lidar(channels=8, points=2_000)), "whole": (24, 20, Lidar())}
 
 
 def measure(folder: Path, size: str) -> tuple[int, dict[str, dict[str, int]]]:
@@ -72,10 +72,8 @@ def rows(frames: int, found: dict[str, dict[str, int]]) -> list[str]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", choices=SIZES, default="full")
-    with tempfile.TemporaryDirectory() as folder:
-        print("\n".join(rows(*measure(Path(folder), parser.parse_args().size))))
+    with study.begin(study.options(__doc__)) as given:
+        print("\n".join(rows(*measure(given.work, given.size))))
 
 
 if __name__ == "__main__":
