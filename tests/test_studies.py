@@ -26,7 +26,9 @@ def run(name: str, work: Path, *more: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.needs("embreex")
-@pytest.mark.parametrize("name", [name for name in STUDIES if name not in ("cameras", "real")])  # these have tests of their own
+@pytest.mark.parametrize(
+    "name", [name for name in STUDIES if name not in ("cameras", "real")]
+)  # these have tests of their own
 def test_a_study_runs_in_miniature(name: str, tmp_path: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in (ROOT / "docs").rglob("*") if "__pycache__" not in path.parts}
     printed = run(name, tmp_path)
@@ -60,4 +62,4 @@ def test_every_study_is_on_a_page_and_every_other_module_belongs_to_a_study() ->
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_study_takes_the_size_of_a_run(name: str) -> None:
-    assert '--size' in SCRIPTS[name] or "study.options(" in SCRIPTS[name]
+    assert "--size" in SCRIPTS[name] or "study.options(" in SCRIPTS[name]

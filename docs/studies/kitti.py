@@ -85,7 +85,10 @@ def row(name: str, run: str, total: TruthScore) -> str:
 def main() -> None:
     """Convert, make grids by each rule, score them, draw one scene."""
     clock = study.Clock()
-    lines = [f"| grid | rule | {' | '.join(CLASSES)} | Vehicle recall | false Vehicle voxels |", "|---|---|" + "---:|" * 7]
+    lines = [
+        f"| grid | rule | {' | '.join(CLASSES)} | Vehicle recall | false Vehicle voxels |",
+        "|---|---|" + "---:|" * 7,
+    ]
     with study.begin(study.options(__doc__)) as given:
         drive = TownDrive(SEED, "heavy", Lidar(points=8_000) if study.is_tiny() else Lidar())
         write_kitti(given.work / "in", drive, study.few(FRAMES, 7), voxels_every=0)
@@ -101,7 +104,9 @@ def main() -> None:
             made = {}
             for run, (rule, flow) in RUNS.items():
                 made[run] = make(given.work / flow, rule, name)
-                scores = (score_truth(grid, truths[frame][name], CARLA.num_channels) for frame, grid in made[run].items())
+                scores = (
+                    score_truth(grid, truths[frame][name], CARLA.num_channels) for frame, grid in made[run].items()
+                )
                 print(row(name, run, reduce(add, scores)), flush=True)
                 clock(f"{run}, {name}")
         out = given.work if study.is_tiny() else IMAGES

@@ -238,7 +238,13 @@ def main() -> None:
             place = given.work / f"town{seed}"
             lidar = Lidar(channels=32, points=4_000) if study.is_tiny() else LIDAR
             capture = SimulatedCapture(
-                count=18 if study.is_tiny() else FRAMES, first_frame=FIRST, sensors=1, seed=seed, traffic="heavy", lidar=lidar, bev=False
+                count=18 if study.is_tiny() else FRAMES,
+                first_frame=FIRST,
+                sensors=1,
+                seed=seed,
+                traffic="heavy",
+                lidar=lidar,
+                bev=False,
             )
             carlasc.regrid(capture, SPEC, place, run=Run(workers=1))
             whole = next(iter(carlasc.open(place).values()))
@@ -273,7 +279,9 @@ def show(rows: dict[int, tuple[dict[str, float], dict[str, float], dict[str, flo
     print("\n| maker | S | truth | CPU s per frame |\n|---|---:|---:|---:|")
     for name in next(iter(rows.values()))[0]:
         scores, truths, seconds = ([row[part][name] for row in rows.values()] for part in range(3))
-        print(f"| {name} | {study.interval(scores, '.3f')} | {study.interval(truths, '.3f')} | {np.mean(seconds):.2f} |")
+        print(
+            f"| {name} | {study.interval(scores, '.3f')} | {study.interval(truths, '.3f')} | {np.mean(seconds):.2f} |"
+        )
     taus = [kendall(list(scores.values()), list(truths.values())) for scores, truths, _ in rows.values()]
     print(
         f"\nKendall's tau: {np.mean(taus):.2f} in the mean of {len(taus)} drives ({min(taus):.2f} to {max(taus):.2f})"

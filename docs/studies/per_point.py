@@ -2,7 +2,8 @@
 
 Simulated drives are given as points and poses only, and `carlasc label --from motion` says which points move: those with a velocity above
 0.5 m/s. The truth is the flow of the recording. The IoU is over all points of every fifth scan. The worlds are the town and the street of
-`movers.py`, and the street with rails, fences and hedges of `railed.py`. WORK keeps the drives; the default is a temporary folder."""
+`movers.py`, and the street with rails, fences and hedges of `railed.py`. WORK keeps the drives; the default is a temporary folder.
+"""
 
 from __future__ import annotations
 

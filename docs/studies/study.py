@@ -12,13 +12,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 T = TypeVar("T")
-_tiny = False
+_TINY = ContextVar("tiny", default=False)
 
 
 def options(text: str | None, seeds: Mapping[str, Iterable[int]] | None = None) -> argparse.ArgumentParser:
@@ -39,37 +40,36 @@ def options(text: str | None, seeds: Mapping[str, Iterable[int]] | None = None) 
 @contextmanager
 def begin(parser: argparse.ArgumentParser) -> Iterator[argparse.Namespace]:
     """Yield the options that are given; `work` is a folder. Drives are small from now on if the size is tiny."""
-    global _tiny
     given = parser.parse_args()
-    _tiny = given.size == "tiny"
+    token = _TINY.set(given.size == "tiny")
     with tempfile.TemporaryDirectory(prefix="study-") as temporary:
         given.work = (given.work or Path(temporary)) / given.size
         given.work.mkdir(parents=True, exist_ok=True)
         try:
             yield given
         finally:
-            _tiny = False
+            _TINY.reset(token)
 
 
 def is_tiny() -> bool:
     """Return whether the study that runs is a tiny one."""
-    return _tiny
+    return _TINY.get()
 
 
 def few(things: Iterable[T], count: int = 1) -> list[T]:
     """Return all things, or the first of them in a tiny study."""
-    return list(things)[: count if _tiny else None]
+    return list(things)[: count if is_tiny() else None]
 
 
 def drives(given: argparse.Namespace, seeds: Iterable[str]) -> list[tuple[str, int]]:
     """Return the kind and the seed of each drive that was asked for; one street, which is soon made, in a tiny study."""
-    kinds = ["street"] if _tiny else list(seeds)
+    kinds = ["street"] if is_tiny() else list(seeds)
     return few((kind, seed) for kind in kinds for seed in getattr(given, kind))
 
 
 def do_all(function: Callable[[T], None], tasks: Iterable[T], workers: int) -> None:
     """Call a function for each task, in several processes; in this one in a tiny study."""
-    if _tiny:
+    if is_tiny():
         for task in tasks:
             function(task)
         return
