@@ -284,17 +284,25 @@ def test_error_messages_that_are_quoted_exist():
         assert any(pattern.fullmatch(expected) for pattern in patterns), f"{page}: no error says: expected {expected}"
 
 
-def test_every_command_has_a_page_and_every_page_a_command():
-    pages = {page.removeprefix("commands/").removesuffix(".md") for page in PAGES if page.startswith("commands/")}
-    assert pages == set(group().commands)
-
-
-def test_option_tables_name_every_option():
+@pytest.fixture(scope="session")
+def hooks():
     sys.path.insert(0, str(DOCS))
     try:
-        from hooks import command_names, options_of
+        import hooks
     finally:
         sys.path.remove(str(DOCS))
+    return hooks
+
+
+def test_every_command_has_a_page_and_every_page_a_command(hooks):
+    pages = {page.removeprefix("commands/").removesuffix(".md") for page in PAGES if page.startswith("commands/")}
+    assert pages == {hooks.PAGE_OF.get(command, command) for command in group().commands}
+    for command, page in hooks.PAGE_OF.items():
+        assert f"## carlasc {command}\n" in PAGES[f"commands/{page}.md"].read_text()
+
+
+def test_option_tables_name_every_option(hooks):
+    options_of, command_names = hooks.options_of, hooks.command_names
     assert command_names() == list(group().commands)
     for name, command in group().commands.items():
         table = options_of(name)

@@ -1,4 +1,4 @@
-"""A model of large runs: `python docs/studies/scale.py` prints the table of docs/scale.md: time and cost of making grids on a cluster.
+"""A model of large runs: `python docs/studies/scale.py` prints the table of docs/studies/scale.md: time and cost of making grids on a cluster.
 
 The model takes figures that were measured on one machine (`Measured`) and prices (`Prices`), and assumes that
 
