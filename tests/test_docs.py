@@ -313,27 +313,6 @@ def test_option_tables_name_every_option(hooks):
                     assert f"`{option}`" in table, f"{name}: {option}"
 
 
-@pytest.mark.needs("mkdocs", "material", "mkdocstrings")
-def test_the_site_builds_without_a_warning(tmp_path):
-    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    arguments = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")]
-    ran = subprocess.run(arguments, check=False, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr
-    html = (tmp_path / "site" / "format.html").read_text()
-    assert "velodyne/000000.bin" in html and "generated:" not in html
-    assert "--free-step-m" in (tmp_path / "site" / "commands" / "regrid.html").read_text()
-    assert not list((tmp_path / "site").rglob("*.py"))
-    # Opened from the disk, the menu leads to files and the search has its index; nothing is fetched from another host.
-    assert (tmp_path / "site" / "search" / "search_index.js").is_file()
-    assert 'href="commands/regrid.html"' in (tmp_path / "site" / "index.html").read_text()
-    assert not [page for page in (tmp_path / "site").rglob("*.html") if re.search(r'src="https?:', page.read_text())]
-    tutorial = (tmp_path / "site" / "tutorials" / "1_first_look.html").read_text()
-    assert (
-        'src="1_first_look_1.png"' in tutorial
-        and (tmp_path / "site/tutorials/1_first_look_1.png").stat().st_size > 10_000
-    )
-
-
 def test_no_page_is_only_api():
     for page, path in PAGES.items():
         prose = re.sub(r"^:::.*\n(?: {4}.*\n)*|^#.*\n", "", path.read_text(), flags=re.MULTILINE)
