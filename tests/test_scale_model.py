@@ -1,4 +1,4 @@
-"""The model of large runs in docs/scale.md: the table is what the script prints, and the model behaves as its text says."""
+"""The model of large runs in docs/studies/scale.md: the table is what the script prints, and the model behaves as its text says."""
 
 import importlib.util
 import sys
@@ -21,7 +21,7 @@ def model():
 
 
 def test_the_table_of_the_page_is_what_the_script_prints(model):
-    page = (DOCS / "scale.md").read_text()
+    page = (DOCS / "studies" / "scale.md").read_text()
     assert page.partition("<!-- model begin -->\n")[2].partition("<!-- model end -->")[0].strip() == model.table()
 
 

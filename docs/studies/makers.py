@@ -1,7 +1,7 @@
 """Who makes ground truth how well, and does an audit by held-out rays alone say so? `python docs/studies/makers.py`.
 
 Simulated drives of moving actors. Every 5th scan is left out of every maker, and the makers' grids at the frames of some of these scans are
-scored twice: by the held-out rays (the formula S of docs/howto/audit.md) and by a reference of 40 sensors (truth: the mean of the IoU of
+scored twice: by the held-out rays (the formula S of docs/studies/makers.md) and by a reference of 40 sensors (truth: the mean of the IoU of
 occupied space and of Vehicle). Prints a table with intervals over drives, the times, and Kendall's tau of both orders, by drive.
 
 DUFOMap, dynamic-object-removal and OctoMap take part if `dufomap`, `dynamic_object_removal` and `pyoctomap` can be imported. SurroundOcc's recipe is

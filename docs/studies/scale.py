@@ -1,4 +1,4 @@
-"""A model of large runs: `python docs/studies/scale.py` prints the table of docs/scale.md: time and cost of making grids on a cluster.
+"""A model of large runs: `python docs/studies/scale.py` prints the table of docs/studies/scale.md: time and cost of making grids on a cluster.
 
 The model takes figures that were measured on one machine (`Measured`) and prices (`Prices`), and assumes that
 
@@ -135,15 +135,14 @@ def estimate(job: Job, workers: int, measured: Measured = Measured(), prices: Pr
 
 def table() -> str:
     """Return the table of the documentation, as Markdown."""
-    rows = ["| frames | workers | time | limited by | core hours | GET | PUT | cores and requests | storage a month |"]
-    rows.append("|---:|---:|---:|---|---:|---:|---:|---:|---:|")
+    rows = ["| frames | workers | time | limited by | core hours | cores and requests | storage a month |"]
+    rows.append("|---:|---:|---:|---|---:|---:|---:|")
     for frames in (43_200, 432_000):
         for workers in WORKERS:
             found = estimate(replace(Job(), frames=frames), workers)
             hours = f"{found.hours:.1f} h" if found.hours >= 1 else f"{found.hours * 60:.0f} min"
             rows.append(
-                f"| {frames:,} | {workers:,} | {hours} | {found.limit} | {found.core_hours:.0f} | {found.gets:,} | {found.puts:,}"
-                f" | ${found.dollars:.2f} | ${found.monthly:.2f} |"
+                f"| {frames:,} | {workers:,} | {hours} | {found.limit} | {found.core_hours:.0f} | ${found.dollars:.2f} | ${found.monthly:.2f} |"
             )
     return "\n".join(rows)
 

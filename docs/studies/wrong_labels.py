@@ -1,4 +1,4 @@
-"""What merging scans makes of wrong labels: `python docs/studies/wrong_labels.py` prints the table of docs/howto/label.md.
+"""What merging scans makes of wrong labels: `python docs/studies/wrong_labels.py` prints the table of docs/studies/wrong-labels.md.
 
 Drives of 61 frames through the simulated town, each by one LiDAR with 64 channels. Some labels are made wrong, the middle frame is made from its own scan and from
 all 61, and each voxel is compared with the one that the same scans make with the labels of the simulator. The share of right points is counted over all scans.
