@@ -29,6 +29,7 @@ COLUMNS = (  # heading, figure, number of decimals
     ("ECE, uncertain", "ECE, uncertain", 3),
 )
 _WITHOUT_CLASSES = ("Vehicle found", "Vehicle free", "wrongly occupied", "ECE", "ECE, uncertain")  # found is occupied
+FEWEST = 5  # drives of which a standard deviation is shown
 _RATIOS = ("wrongly Vehicle", "wrongly occupied")  # shown beside that of `tube`
 
 
@@ -71,7 +72,8 @@ class Table:
             for _, figure, decimals in COLUMNS:
                 mean, deviation = means[figure], deviations[figure]
                 is_shown = not np.isnan(mean) and (row != UNLABELLED or figure in _WITHOUT_CLASSES)
-                cell = "" if not is_shown else f"{mean:.{decimals}f} ± {deviation:.{decimals}f}"
+                spread = f" ± {deviation:.{decimals}f}" if len(self.drives) >= FEWEST else ""
+                cell = f"{mean:.{decimals}f}{spread}" if is_shown else ""
                 if is_shown and figure in _RATIOS and row != "tube" and tube:
                     cell = f"{mean:.0f} (1/{tube[figure] / mean:.0f})" if mean >= 1 else f"{mean:.0f}"
                 cells.append(cell)

@@ -20,7 +20,9 @@ _MEASURED = re.compile(
     r"| ?x(?! ?\d)\b)"  # with the unit of a time, a size, a rate, a share or a ratio
     r"|(?<![\w.,/-])[01]\.\d\d+(?![\d.,]*\d| (?:to|and|or) |,? ?(?:m|cm|mm|degrees?|rad|m/s|Hz)\b)"  # a score
 )
-_CELL = re.compile(r"[*±~$]*\d[\d,]*(?:\.\d+| ?%| (?:ms|s|MB|GB))(?! ?(?:m|cm|mm|degrees)\b)\**(?: ?(?:±|to |\(|/ ?|/s).*)?")
+_CELL = re.compile(
+    r"[*±~$]*\d[\d,]*(?:\.\d+| ?%| (?:ms|s|MB|GB))(?! ?(?:m|cm|mm|degrees)\b)\**(?: ?(?:±|to |\(|/ ?|/s).*)?"
+)
 
 
 def keys(page: str) -> set[str]:
