@@ -56,11 +56,12 @@ def measure(folder: Path, size: str) -> tuple[int, dict[str, dict[str, int]]]:
     """Return the number of frames, and the bytes per field of the files ("published") and of each store."""
     frames, sensors, lidar = SIZES[size]
     drive = folder / "data" / "Train" / "Town"
-    carlasc.simulate(drive, count=frames, sensors=sensors, lidar=lidar)
-    carlasc.regrid(drive, GridSpec.published())
+    run = carlasc.Run(workers=1)
+    carlasc.simulate(drive, count=frames, sensors=sensors, lidar=lidar, run=run)
+    carlasc.regrid(drive, GridSpec.published(), run=run)
     found: dict[str, dict[str, int]] = {}
     for name, (store, small) in STORES.items():
-        result = carlasc.pack(folder / "data", folder / store, small=small)
+        result = carlasc.pack(folder / "data", folder / store, small=small, run=run)
         found |= {"published": result.published_bytes, name: result.stored_bytes}
     return frames, found
 

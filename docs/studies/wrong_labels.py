@@ -74,7 +74,7 @@ def compare(work: Path, seeds: list[int]) -> dict[str, list[list[float]]]:
         for number, (name, (share, clump_m, fixed)) in enumerate(CASES.items()):
             place = work / f"{seed}-{number}"
             row = [write_predictions(drive, Path(f"{place}-files"), share, clump_m, fixed=fixed)]
-            carlasc.label(drive, Path(f"{place}-labelled"), Path(f"{place}-files"), by=name)
+            carlasc.label(drive, Path(f"{place}-labelled"), Path(f"{place}-files"), by=name, run=carlasc.Run(workers=1))
             for window, whole in truth.items():
                 made = merged(Path(f"{place}-labelled"), Path(f"{place}-{window}"), window)
                 both = (whole.labels > 0) & (made.labels > 0)
