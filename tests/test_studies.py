@@ -19,7 +19,7 @@ STUDIES = [name for name, text in SCRIPTS.items() if '__name__ == "__main__"' in
 def run(name: str, work: Path, *more: str) -> str:
     """Return what a tiny run of a study prints."""
     call = [sys.executable, str(FOLDER / f"{name}.py"), *more, "--size", "tiny"]
-    done = subprocess.run(call, capture_output=True, text=True, check=False, cwd=work, timeout=300)
+    done = subprocess.run(call, capture_output=True, text=True, check=False, cwd=work, timeout=1200)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
