@@ -1,6 +1,6 @@
 """What the documentation takes from the code as it is built: options, the layout, classes, and the pages of the navigation.
 
-A page says `<!-- generated: layout -->` where a table goes. Every page of a command ends with the command's options.
+A page says `<!-- generated: layout -->` where a table goes. The page of a command ends with its options.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import tutorials
 
 LOG = logging.getLogger("mkdocs.hooks.carlasc")  # below "mkdocs", so that a strict build counts its warnings
+PAGE_OF = {"unpack": "pack", "finish": "pack", "scores": "evaluate"}  # commands on the page of another one
 _MARKER = re.compile(r"<!-- generated: ([a-z-]+) -->")
 
 
@@ -58,7 +59,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Fill in generated tables."""
     folder, _, name = page.file.src_uri.removesuffix(".md").rpartition("/")
     text = _MARKER.sub(lambda match: _generate(match[1], page.file.src_uri), markdown)
-    return f"{text}\n\n{options_of(name)}" if folder == "commands" and name in command_names() else text
+    commands = [command for command in command_names() if PAGE_OF.get(command, command) == name]
+    return "\n\n".join([text, *map(options_of, commands)]) if folder == "commands" else text
 
 
 def command_names() -> list[str]:
@@ -72,7 +74,7 @@ def options_of(command: str) -> str:
     panels: dict[str, list[str]] = {}
     for row, panel in _parameters(function):
         panels.setdefault(panel, []).append(row)
-    parts = ["## Options", "", f"As `carlasc {command} --help` lists them.", ""]
+    parts = [f"## Options of carlasc {command}", "", f"As `carlasc {command} --help` lists them.", ""]
     for panel, rows in panels.items():
         parts += [f"**{panel}**", ""] if panel else []
         parts += ["| option | default | |", "|---|---|---|", *rows, ""]

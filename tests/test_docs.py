@@ -284,17 +284,25 @@ def test_error_messages_that_are_quoted_exist():
         assert any(pattern.fullmatch(expected) for pattern in patterns), f"{page}: no error says: expected {expected}"
 
 
-def test_every_command_has_a_page_and_every_page_a_command():
-    pages = {page.removeprefix("commands/").removesuffix(".md") for page in PAGES if page.startswith("commands/")}
-    assert pages == set(group().commands)
-
-
-def test_option_tables_name_every_option():
+@pytest.fixture(scope="session")
+def hooks():
     sys.path.insert(0, str(DOCS))
     try:
-        from hooks import command_names, options_of
+        import hooks
     finally:
         sys.path.remove(str(DOCS))
+    return hooks
+
+
+def test_every_command_has_a_page_and_every_page_a_command(hooks):
+    pages = {page.removeprefix("commands/").removesuffix(".md") for page in PAGES if page.startswith("commands/")}
+    assert pages == {hooks.PAGE_OF.get(command, command) for command in group().commands}
+    for command, page in hooks.PAGE_OF.items():
+        assert f"## carlasc {command}\n" in PAGES[f"commands/{page}.md"].read_text()
+
+
+def test_option_tables_name_every_option(hooks):
+    options_of, command_names = hooks.options_of, hooks.command_names
     assert command_names() == list(group().commands)
     for name, command in group().commands.items():
         table = options_of(name)
@@ -303,27 +311,6 @@ def test_option_tables_name_every_option():
             for option in names:
                 if option != "--help":
                     assert f"`{option}`" in table, f"{name}: {option}"
-
-
-@pytest.mark.needs("mkdocs", "material", "mkdocstrings")
-def test_the_site_builds_without_a_warning(tmp_path):
-    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    arguments = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")]
-    ran = subprocess.run(arguments, check=False, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stderr
-    html = (tmp_path / "site" / "format.html").read_text()
-    assert "velodyne/000000.bin" in html and "generated:" not in html
-    assert "--free-step-m" in (tmp_path / "site" / "commands" / "regrid.html").read_text()
-    assert not list((tmp_path / "site").rglob("*.py"))
-    # Opened from the disk, the menu leads to files and the search has its index; nothing is fetched from another host.
-    assert (tmp_path / "site" / "search" / "search_index.js").is_file()
-    assert 'href="commands/regrid.html"' in (tmp_path / "site" / "index.html").read_text()
-    assert not [page for page in (tmp_path / "site").rglob("*.html") if re.search(r'src="https?:', page.read_text())]
-    tutorial = (tmp_path / "site" / "tutorials" / "1_first_look.html").read_text()
-    assert (
-        'src="1_first_look_1.png"' in tutorial
-        and (tmp_path / "site/tutorials/1_first_look_1.png").stat().st_size > 10_000
-    )
 
 
 def test_no_page_is_only_api():

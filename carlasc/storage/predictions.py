@@ -1,4 +1,4 @@
-"""The predictions of a network in files: a class for each point, and probabilities where the files have them. See `docs/howto/label.md`."""
+"""The predictions of a network in files: a class for each point, and probabilities where the files have them. See `docs/commands/label.md`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Samples of 16 scans from a zarr store behind an HTTP server on this machine, with read-ahead, against the same store on disk in the same order.
 
-`python tests/benchmarks/test_bench_reading_ahead.py` measures scans of 120,000 points and prints the table of docs/scale.md. In pytest
+`python tests/benchmarks/test_bench_reading_ahead.py` measures scans of 120,000 points and prints the table of docs/studies/scale.md. In pytest
 every case runs once on small scans, to see that it works.
 """
 
@@ -111,7 +111,7 @@ def test_bench_reading_ahead(tmp_path):
 
 
 def print_table(repeats: int = 3) -> None:
-    """Print the table of docs/scale.md."""
+    """Print the table of docs/studies/scale.md."""
     with tempfile.TemporaryDirectory() as temporary:
         store = write_store(Path(temporary), 2, 128, full=True)
         size = sum((store / path).stat().st_size for path in needed(store))

@@ -1,4 +1,4 @@
-"""The job scripts of the page on parts, as jobs of this machine."""
+"""The job scripts of the page on many machines, as jobs of this machine."""
 
 import os
 import re
@@ -14,7 +14,7 @@ from carlasc import Run
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
 
-PAGE = Path(__file__).parents[2] / "docs" / "howto" / "parts.md"
+PAGE = Path(__file__).parents[2] / "docs" / "howto" / "many-machines.md"
 SPEC = GridSpec.published().with_size((32, 32, 4))
 
 
