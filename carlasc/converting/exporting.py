@@ -20,8 +20,17 @@ from carlasc.converting.results import ExportResult, Failure, StepCounter, check
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Part, Run
-from carlasc.storage.durability import make_folder, rename, sync_tree
-from carlasc.storage.files import has_content, parse_json, remove_stale, to_json, write_atomic, write_many
+from carlasc.storage.files import (
+    has_content,
+    make_folder,
+    parse_json,
+    remove_stale,
+    rename,
+    sync_tree,
+    to_json,
+    write_atomic,
+    write_many,
+)
 
 RECORD = "carlasc-export.json"
 """The file that says what exports wrote to a folder."""

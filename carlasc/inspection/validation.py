@@ -23,9 +23,8 @@ from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
 from carlasc.inspection.image_alignment import compare_images, judge_images
-from carlasc.inspection.pose_quality import PoseQuality, describe_mounting
+from carlasc.inspection.pose_quality import PoseQuality, check_poses, check_times, describe_mounting
 from carlasc.inspection.structure import static_structure
-from carlasc.inspection.trajectory import check_poses, check_times
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout

@@ -19,8 +19,7 @@ from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import SEMANTICKITTI
-from carlasc.core.wording import first_names
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError, MissingDataError, first_names
 from carlasc.metrics.carlaocc import find_carlaocc
 from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid
 from carlasc.storage import Sequence, Source, as_source, layout

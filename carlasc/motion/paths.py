@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_points
-from carlasc.motion.planes import Planes, nearest_points
-from carlasc.motion.registration import pose_of, register
-from carlasc.motion.smoothing import resample, smooth, smooth_at
+from carlasc.motion.planes import Planes, nearest_points, pose_of, register
+from carlasc.motion.solving import resample, smooth, smooth_at
 
 MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
 _MAX_ACCELERATION_M_S2 = 6.0  # hard braking, a sharp bend

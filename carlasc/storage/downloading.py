@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TypeGuard
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choice
-from carlasc.storage.durability import make_folder, remove_file
 from carlasc.storage.extraction import check_space, extract_zip, extracted_size
-from carlasc.storage.files import parse_json, remove_stale, write_json, writing
+from carlasc.storage.files import make_folder, parse_json, remove_file, remove_stale, write_json, writing
 from carlasc.storage.transport.fetching import FileFetch
 
 Progress = Callable[[int, int], None]

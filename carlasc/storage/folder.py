@@ -183,7 +183,7 @@ class FolderWriter(SequenceWriter):
 class WholeFiles:
     """Whether the files of frames in one `<coordinates>` folder are whole, as far as their sizes say; it can be pickled.
 
-    A power failure can leave empty and short files. Files that are written durably (see `carlasc.storage.durability`) are whole as soon as they exist.
+    A power failure can leave empty and short files. Files that are written durably (see `carlasc.storage.files`) are whole as soon as they exist.
     Others, and those of older versions, are checked by their sizes, which costs little more than to ask whether they exist.
 
     Args:

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, ConflictError, import_extra
 from carlasc.groundtruth.maps.surfaces import MESH_ENDINGS, SurfaceMesh
-from carlasc.storage.cloud_files import POINT_ENDINGS, PointPieces, write_points
+from carlasc.storage.cloud_files import POINT_ENDINGS, PointPieces, write_octomap, write_points
 from carlasc.storage.files import writing
-from carlasc.storage.octomap import write_octomap
 
 OCTOMAP = ".bt"
 ACTORS = "actors.json"

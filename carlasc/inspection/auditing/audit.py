@@ -26,8 +26,7 @@ from carlasc.inspection.auditing.counting import OCCUPIED, FrameCounter
 from carlasc.inspection.auditing.geometry import judge_geometry
 from carlasc.inspection.auditing.judging import judge_contents
 from carlasc.inspection.auditing.matching import MatchedGrids, match_grids
-from carlasc.inspection.auditing.sums import Stretches, Sums, add
-from carlasc.inspection.auditing.verdicts import AuditFailure, AuditResult, Verdict
+from carlasc.inspection.auditing.verdicts import AuditFailure, AuditResult, Stretches, Sums, Verdict, add
 from carlasc.metrics.pairs import Place
 from carlasc.motion.options import MotionOptions
 from carlasc.motion.tracks import MovingActors

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
-from carlasc.storage.durability import make_folder, remove_file, rename, replaced, sync_all
-from carlasc.storage.files import storage_error
+from carlasc.storage.files import make_folder, remove_file, rename, replaced, storage_error, sync_all
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
 UNFINISHED_MARK = "unfinished.json"  # in its place until the store is whole

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, MissingDataError, StorageError
-from carlasc.storage.durability import sync_file
+from carlasc.storage.files import sync_file
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree
 

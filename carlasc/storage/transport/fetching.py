@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError, postponed_interrupts, without_credentials
-from carlasc.storage.durability import remove_file, rename, sync_file
-from carlasc.storage.files import parse_json, storage_error, write_json, writing
+from carlasc.storage.files import parse_json, remove_file, rename, storage_error, sync_file, write_json, writing
 from carlasc.storage.transport.failures import WrongAnswerError, describe_failure, fail, is_temporary
 from carlasc.storage.transport.requests import HttpAnswer, Requests
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, MissingDataError, StorageError
-from carlasc.storage.durability import rename, replaced
-from carlasc.storage.files import parse_json, to_json
+from carlasc.storage.files import parse_json, rename, replaced, to_json
 from carlasc.storage.packed.output import remove
 from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
 from carlasc.storage.transport.targets import LocalTarget, Target

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError
-from carlasc.storage.durability import make_folder, sync_all
-from carlasc.storage.files import write_output, writing
+from carlasc.storage.files import make_folder, sync_all, write_output, writing
 from carlasc.storage.packed.output import remove
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content, pack_arrays
