@@ -26,7 +26,7 @@ from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import PoseQuality, check_poses, check_times, describe_mounting
 from carlasc.inspection.structure import static_structure
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
@@ -155,16 +155,9 @@ def validate(
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
     plans = [_plan(sequence, every) for sequence in opened.sequences().values()]
-    total, done = sum(plan.steps for plan in plans), 0
+    step = StepCounter(run.progress, sum(plan.steps for plan in plans))
     findings: list[Finding] = []
     reports = []
-
-    def step(steps: int = 1) -> None:
-        nonlocal done
-        done += steps
-        if run.progress is not None:
-            run.progress(done, total)
-
     if run.is_alone:
         examined: Iterator[_Examined] = (_examine(plan, step) for plan in plans)
     else:

@@ -1,6 +1,6 @@
 """Small linear problems, solved with the same bits on every processor: LAPACK, behind `np.linalg`, rounds differently on different ones.
 
-And what they are solved for: values over time that change as the motion of an actor does, and the same at other times.
+And what they are solved for: values over time that change as the motion of an actor does, the same at other times, and headings.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import multiply
 
+_HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
 _SWEEPS = 12  # of Jacobi's method, which takes about five
 
 
@@ -214,3 +215,18 @@ def resample(
     speed = np.stack([np.interp(at, seconds, velocities[:, axis]) for axis in range(3)], axis=1)
     beyond = np.minimum(at - seconds[0], 0) + np.maximum(at - seconds[-1], 0)
     return path + speed * beyond[:, None], speed
+
+
+def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated while the actor is slow."""
+    fast = fast_rows(velocities)
+    if not len(fast):
+        mean = velocities.mean(axis=0)
+        return np.full(len(velocities), np.arctan2(mean[1], mean[0]))
+    angles = np.unwrap(np.arctan2(velocities[fast, 1], velocities[fast, 0]))
+    return np.interp(np.arange(len(velocities)), fast, angles)
+
+
+def fast_rows(velocities: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return at which of (F, 3) velocities an actor moves fast enough to show where it points."""
+    return np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.files import unfinished
 from carlasc.storage.folder import FolderSink
@@ -128,19 +128,6 @@ def typical_rows(sequence: Sequence) -> dict[str, int]:
     return found
 
 
-def counter(progress: Progress | None, total: int) -> Callable[[int], None]:
-    """Return a function that counts files, and reports the count to `progress`."""
-    done = 0
-
-    def step(files: int) -> None:
-        nonlocal done
-        done += files
-        if progress is not None and files:
-            progress(done, total)
-
-    return step
-
-
 def refuse_overlap(out: str | os.PathLike[str], source: Source) -> None:
     """Refuse to write into the source, or over it.
 
@@ -235,7 +222,7 @@ def unpack(
     missing = ours if overwrite else [block.missing() for block in ours]
     total = sum(block.files for block in ours)
     result.kept = total - sum(block.files for block in missing)
-    step = counter(run.progress, total)
+    step = StepCounter(run.progress, total)
     step(result.kept)
     result.files = copy_blocks(missing, run, step)
     if isinstance(folder, Path) and isinstance(result.out, Path) and folder != result.out:

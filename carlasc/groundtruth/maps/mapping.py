@@ -24,16 +24,15 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.merging import Merger
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
-from carlasc.groundtruth.inputs import GridPlan, RunProgress, choose_frames
+from carlasc.groundtruth.inputs import GridPlan, choose_frames
 from carlasc.groundtruth.maps.growing_cells import STATIC, GrowingCells, Part, cells_of, rows_of_scan, split
-from carlasc.groundtruth.maps.map_files import ACTORS, MapCells, MapFiles
-from carlasc.groundtruth.maps.surfaces import write_distances
+from carlasc.groundtruth.maps.map_files import ACTORS, MapCells, MapFiles, write_distances
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion import HORIZON_S, Track
 from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.cloud_files import POINT_DTYPE, PointPieces, write_points
 from carlasc.storage.files import to_json, write_atomic, writing
@@ -165,7 +164,8 @@ class DriveMap:
     def fill(self, run: Run, movers: bool) -> None:
         """Refine poses, find what moves, and add every scan without it; with `movers`, add their bodies too."""
         inputs = self.inputs
-        progress = RunProgress(run.progress, 0, inputs.steps_before + len(self.frames))
+        progress = StepCounter(run.progress, inputs.steps_before + len(self.frames))
+        progress(0)
         with one_pool(run) as pool:
             inputs.refine(None, pool, progress)
             if inputs.feed.needs_actors:
