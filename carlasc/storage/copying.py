@@ -70,10 +70,17 @@ def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[Fra
     return [FrameBlock(sequence, writer, blocks[number]) for number in sorted(blocks)]
 
 
-def copy_blocks(blocks: Series[FrameBlock], run: Run, step: Callable[[int], None]) -> int:
-    """Copy blocks in parallel, and return the number of files that they are; `step` is called with that of each."""
-    todo = [block for block in blocks if block.files]
-    files = 0
+def copy_blocks(blocks: Series[FrameBlock], run: Run, *, again: bool = False) -> tuple[int, int]:
+    """Copy the blocks of a part of a run in parallel; frames that exist are left as they are, except with `again`.
+
+    Returns:
+        The number of files that were written, and the number of those that were left.
+    """
+    ours = run.part.take(blocks)
+    todo = [block for block in (ours if again else [block.missing() for block in ours]) if block.files]
+    total, files = sum(block.files for block in ours), 0
+    step, left = StepCounter(run.progress, total), total - sum(block.files for block in todo)
+    step(left)
     if run.workers is None and run.executor is None:
         run = replace(run, workers=max(1, min(run.processes, len(todo) // _FEW)))
     for place in {place for block in todo for place in (block.sequence.location, block.writer.location)}:
@@ -82,7 +89,7 @@ def copy_blocks(blocks: Series[FrameBlock], run: Run, step: Callable[[int], None
         for count in copied:
             step(count)
             files += count
-    return files
+    return files, left
 
 
 def _copy(block: FrameBlock) -> int:
@@ -218,13 +225,7 @@ def unpack(
         else:
             copy_documents(sequence, writer)
         blocks += blocks_of(sequence, writer, _BLOCK)
-    ours = run.part.take(blocks)
-    missing = ours if overwrite else [block.missing() for block in ours]
-    total = sum(block.files for block in ours)
-    result.kept = total - sum(block.files for block in missing)
-    step = StepCounter(run.progress, total)
-    step(result.kept)
-    result.files = copy_blocks(missing, run, step)
+    result.files, result.kept = copy_blocks(blocks, run, again=overwrite)
     if isinstance(folder, Path) and isinstance(result.out, Path) and folder != result.out:
         put_in_place(folder, result.out, overwrite=False)
     result.elapsed_s = time.perf_counter() - began

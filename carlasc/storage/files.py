@@ -110,6 +110,14 @@ def _remove(temporary: Path) -> None:
         temporary.unlink()
 
 
+def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
+    """Write all bytes at a place of an open file."""
+    view = memoryview(data)
+    while view:
+        written = os.pwrite(descriptor, view, offset)
+        view, offset = view[written:], offset + written
+
+
 def has_content(path: str | os.PathLike[str]) -> bool:
     """Whether a file exists and is not empty: a power failure can leave an empty file in the place of one that was not written durably."""
     try:

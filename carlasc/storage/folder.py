@@ -165,19 +165,13 @@ class FolderWriter(SequenceWriter):
 
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists. An empty one is replaced."""
-        if data and self._read(name) == b"":
+        if data and self.target.read(name) == b"":
             self.target.remove(name)
         return self.target.put(name, data, create=True)
 
     def read_document(self, name: str) -> bytes | None:
         """Return a text file's bytes, None if it does not exist, or is empty: a power failure can leave that, a run cannot."""
-        return self._read(name) or None
-
-    def _read(self, name: str) -> bytes | None:
-        try:
-            return bytes(self.target.tree.read(name))
-        except MissingDataError:
-            return None
+        return self.target.read(name) or None
 
 
 class WholeFiles:

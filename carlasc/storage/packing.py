@@ -160,11 +160,7 @@ def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) ->
         fields = {name: sequence.frames(name).tolist() for name in sequence.fields()}
         writer.expect(fields, typical_rows(sequence))
         blocks += blocks_of(sequence, writer, writer.block)
-    ours = run.part.take(blocks)
-    missing, total = [block.missing() for block in ours], sum(block.files for block in ours)
-    step = StepCounter(run.progress, total)
-    step(total - sum(block.files for block in missing))
-    copy_blocks(missing, run, step)
+    copy_blocks(blocks, run)
     for writer in writers:
         writer.close()
     for writer in writers:
