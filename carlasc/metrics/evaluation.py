@@ -26,7 +26,7 @@ from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_ban
 from carlasc.metrics.results import Evaluation, FrameScore
 from carlasc.metrics.scoring import Scoring
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 
 _FrameBatch = tuple[Pair, list[int]]  # frames of one pair, which a worker scores together
 _Known = Callable[[Literal["lidar", "camera"]], NDArray[np.bool_] | None]
@@ -340,7 +340,7 @@ def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, 
     """
     chosen = FrameRange.of(frames)
     frames_of = [(pair, chosen.select(pair.truth.frames()).tolist()) for pair in pairs]
-    total, done = sum(len(numbers) for _, numbers in frames_of), 0
+    total = sum(len(numbers) for _, numbers in frames_of)
     if not total:
         raise MissingDataError(
             pairs[0].truth.location, expected="labels of a frame to score", found=f"none in the range {chosen}"
@@ -349,14 +349,12 @@ def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, 
     batches = [
         (pair, numbers[first : first + size]) for pair, numbers in frames_of for first in range(0, len(numbers), size)
     ]
-    score = partial(_score_batch, scorers=scorers)
+    step, score = StepCounter(run.progress, total), partial(_score_batch, scorers=scorers)
     with closing(run_all(score, batches, run, lost=score)) as results:
         for (_, numbers), parts in zip(batches, results, strict=True):
             for scorer, part in zip(scorers, parts, strict=True):
                 scorer.merge(part)
-            done += len(numbers)
-            if run.progress is not None:
-                run.progress(done, total)
+            step(len(numbers))
 
 
 def _score_batch(batch: _FrameBatch, lost: str | None = None, *, scorers: Sequence[Scorer]) -> list[Scorer]:

@@ -17,8 +17,7 @@ from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES, remaps_between, to_table
-from carlasc.core.wording import first_names
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, first_names
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.folder import FolderSequence
 
