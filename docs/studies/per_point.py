@@ -42,9 +42,9 @@ def main() -> None:
             scores = (both / (true + found - both), both / max(found, 1), both / max(true, 1))
             rows.setdefault(kind, []).append(scores)
             print(kind, seed, *(f"{value:.3f}" for value in scores), flush=True)
-    print("\n| world | IoU of moving points | precision | recall |\n|---|---:|---:|---:|")
+    print("\n| world | drives | IoU of moving points | precision | recall |\n|---|---:|---:|---:|---:|")
     for kind, found in rows.items():
-        print(f"| {kind} | {' | '.join(study.interval(values) for values in np.array(found).T)} |")
+        print(f"| {kind} | {len(found)} | {' | '.join(study.interval(values) for values in np.array(found).T)} |")
 
 
 if __name__ == "__main__":
