@@ -27,7 +27,7 @@ Views = Sequence[tuple[CameraModel, Transform | None]]
 """Cameras, and (4, 4) scan_T_camera of each when it took its image; None where it took none."""
 
 _BESIDE = 1.5  # voxels along the longest axis, from a point, that do not hide it
-_BEYOND_M = 0.02  # by which boxes are larger than the points in them. Chosen on simulated drives: see docs/howto/cameras.md
+_BEYOND_M = 0.02  # by which boxes are larger. Chosen on simulated drives: see docs/howto/cameras.md
 
 
 class _Solid(NamedTuple):

@@ -46,8 +46,8 @@ def plain_seen(occupied, spec, one, boxes=None):
             filled += 0.02 / edge * np.array([-1, 1])[:, None, None] if boxes is not None else 0
             stops = np.ones(len(others), bool)
             for low, high in (whole, filled):
-                low, high = ((lower + (others + part) * edge - start) / (eye - start) for part in (low, high))
-                enters, leaves = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
+                near, far = ((lower + (others + part) * edge - start) / (eye - start) for part in (low, high))
+                enters, leaves = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
                 stops &= (enters < leaves) & (leaves > 0) & (enters < 1)
             if not stops.any():
                 seen[voxel] = True
@@ -72,7 +72,8 @@ def test_seen_is_what_plain_rays_say(yaw_deg, has_boxes):
 def test_a_pole_hides_what_is_behind_it_and_not_what_is_beside():
     occupied = np.zeros(SPEC.size, bool)
     occupied[9] = True
-    boxes = np.tile(np.array([0, 0, 0, 255, 20, 255], np.uint8), (SPEC.num_voxels, 1))  # poles at one side of each voxel
+    at_one_side = np.array([0, 0, 0, 255, 20, 255], np.uint8)
+    boxes = np.tile(at_one_side, (SPEC.num_voxels, 1))
     one = camera(0)
     view = [(one, one.sensor_T_camera)]
     behind = see_voxels(occupied, SPEC, view, boxes)[10:]

@@ -18,9 +18,7 @@ def no_boxes(num_voxels: int) -> NDArray[np.uint8]:
 
 
 @cached
-def widen_boxes(
-    cast: Voters, cells: Cells, region: int, regions: NDArray[np.uint16], boxes: NDArray[np.uint8]
-) -> None:
+def widen_boxes(cast: Voters, cells: Cells, region: int, regions: NDArray[np.uint16], boxes: NDArray[np.uint8]) -> None:
     """Widen the boxes of Cartesian voxels by the points of an observation that vote for their classes.
 
     Args:
