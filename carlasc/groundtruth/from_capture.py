@@ -68,9 +68,11 @@ class CaptureFrame(FrameInput):
         step, classes = plan.voting.free_step_m, self.capture.classes
         who = ActorPoints(plan.spec, self._turns(), classes.deformable) if plan.voting.keep_actors else None
         seen = self._observations(ego, who)
-        votes = count_votes(seen, plan.spec, classes, rule=plan.rule, free_step_m=step)
+        boxes = plan.voting.keep_seen
+        votes = count_votes(seen, plan.spec, classes, rule=plan.rule, free_step_m=step, keep_boxes=boxes)
         grid = votes.to_grid()
-        return FrameData(fields, grid, votes, actors=None if who is None else who.of(grid.labels))
+        actors = None if who is None else who.of(grid.labels)
+        return FrameData(fields, grid, votes, actors=actors, boxes=votes.boxes)
 
     def _observations(self, ego: SensorRecording, who: ActorPoints | None) -> Iterator[Observation]:
         for sensor in self.sensors:

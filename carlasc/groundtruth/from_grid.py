@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, most_frequent
@@ -24,6 +25,7 @@ from carlasc.groundtruth.inputs import (
     without_caches,
 )
 from carlasc.groundtruth.options import FromGrid
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
 from carlasc.storage import as_source
 from carlasc.storage.protocol import Sequence, Source
 
@@ -60,6 +62,16 @@ def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
     coarse[voxels] = winners.astype(classes.dtype)
     counts = np.bincount(voxel[inside], weights, spec.num_voxels)
     return Grid(spec, coarse.reshape(spec.size), counts.astype(np.float32).reshape(spec.size))
+
+
+def _boxes(fine: Grid, spec: GridSpec) -> NDArray[np.uint8] | None:
+    """Return the boxes around the occupied cells of a finer grid in each voxel of a coarser one."""
+    corners = np.stack(list(np.ndindex(2, 2, 2))) - 0.5
+    corners *= (1 - 1e-3) * fine.spec.voxel_size  # those on a border belong to the voxel beside it
+    centers = fine.spec.centers()[fine.labels > 0]
+    points = (centers[:, None] + corners).reshape(-1, 3).astype(np.float32)
+    seen = Observation(points, np.ones(len(points), np.uint8), np.eye(4))
+    return count_votes([seen], spec, free_step_m=1e9, keep_boxes=True).boxes
 
 
 def check_coarser(fine: GridSpec, coarse: GridSpec) -> None:
@@ -110,7 +122,8 @@ class ResampledFrame(FrameInput):
         """Read the frame and resample its grid."""
         fields = {name: self.sequence.read(name, self.number) for name in self.fields()}
         finer = self.sequence.grid(self.finer, self.number)
-        return FrameData(fields, resample(finer, plan.spec, self.sequence.metadata.classes), None)
+        boxes = _boxes(finer, plan.spec) if plan.voting.keep_seen else None
+        return FrameData(fields, resample(finer, plan.spec, self.sequence.metadata.classes), None, boxes=boxes)
 
 
 class ResampledSequence(StoredSequence):

@@ -109,6 +109,7 @@ class FrameData:
         votes: the votes that decided the grid; None for a resampled grid.
         evidence: how certain each voxel is; None unless the plan needs it (`GridPlan.needs_evidence`).
         actors: who is in each voxel; None unless the plan asks for it.
+        boxes: (V, 6) the boxes around the points in each voxel; None unless the plan asks what cameras see.
     """
 
     fields: Mapping[str, NDArray[Any]]
@@ -116,6 +117,7 @@ class FrameData:
     votes: Votes | None
     evidence: VoxelCertainty | None = None
     actors: VoxelActors | None = None
+    boxes: NDArray[np.uint8] | None = None
 
 
 class FrameInput(ABC):

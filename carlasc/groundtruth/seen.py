@@ -1,13 +1,14 @@
 """Which voxels of a grid each camera sees: the field `seen`, one bit per camera.
 
-A voxel is seen if a ray from the camera's centre reaches it before another occupied voxel stops it, as in Occ3D, whose masks are made from rays to
-the centres of voxels. Here, an occupied voxel whose centre is hidden is tried at its faces and corners too: rays reach the ground at so
-flat an angle that those to the centres of its voxels pass through voxels of the ground before. Unknown voxels stop nothing.
+A voxel is seen if a ray from the camera's centre to its own centre is not stopped by an occupied voxel before. This is the rule of Occ3D, with one
+deviation: where the points in a voxel are known, only the box around them stops rays (`carlasc.groundtruth.voting.boxes`), because a pole or a
+kerb fills a small part of its voxels. An occupied voxel is also seen if a ray reaches the middle of its box. Unknown voxels stop nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from carlasc.core.compiling import cached, jit
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
+from carlasc.groundtruth.voting.boxes import STEPS
 
 MOST_CAMERAS = 8
 """The number of cameras that the bits of a voxel have room for."""
@@ -25,7 +27,30 @@ Views = Sequence[tuple[CameraModel, Transform | None]]
 """Cameras, and (4, 4) scan_T_camera of each when it took its image; None where it took none."""
 
 _BESIDE = 1.5  # voxels along the longest axis, from a point, that do not hide it
-_HALF = 0.499  # of a voxel: from its centre to where it is tried, just inside of its faces and corners
+_BEYOND_M = 0.02  # by which boxes are larger. Chosen on simulated drives: see docs/howto/cameras.md
+
+
+class _Solid(NamedTuple):
+    """What stops rays in a grid, in units of voxels.
+
+    Attributes:
+        size: (3,) numbers of voxels.
+        occupied: (V,) bool, voxels that stop rays.
+        boxes: (V, 6) where they do, in 1/256 from first to last; (0, 6): everywhere.
+        beyond: (3,) by which the boxes are larger.
+    """
+
+    size: NDArray[np.int64]
+    occupied: NDArray[np.bool_]
+    boxes: NDArray[np.uint8]
+    beyond: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, occupied: NDArray[np.bool_], spec: GridSpec, boxes: NDArray[np.uint8] | None) -> _Solid:
+        """Return what stops rays in a grid: its occupied voxels, or, where points in them are known, the boxes around these."""
+        blocks = np.ascontiguousarray(occupied, np.bool_).reshape(-1)
+        filled = np.empty((0, 6), np.uint8) if boxes is None else boxes
+        return cls(np.array(spec.size), blocks, filled, _BEYOND_M / np.array(spec.voxel_size, np.float64))
 
 
 def check_views(spec: GridSpec, views: Views, where: str) -> None:
@@ -45,21 +70,23 @@ def check_views(spec: GridSpec, views: Views, where: str) -> None:
         )
 
 
-def see_voxels(occupied: NDArray[np.bool_], spec: GridSpec, views: Views) -> NDArray[np.uint8]:
+def see_voxels(
+    occupied: NDArray[np.bool_], spec: GridSpec, views: Views, boxes: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
     """Return which cameras see each voxel.
 
     Args:
         occupied: (X, Y, Z) voxels that stop rays.
         spec: the grid, which is Cartesian.
         views: at most eight cameras, and where they are.
+        boxes: (V, 6) the boxes around the points in each voxel; None: voxels stop rays as a whole, as in Occ3D.
 
     Returns:
         (X, Y, Z) uint8: bit i is set where camera i sees the voxel. Its centre is in the image.
     """
     seen = np.zeros(spec.num_voxels, np.uint8)
-    blocks = np.ascontiguousarray(occupied, np.bool_).reshape(-1)
-    centers = spec.centers().reshape(-1, 3)
-    lower, edge, size = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64), np.array(spec.size)
+    solid, centers = _Solid.of(occupied, spec, boxes), spec.centers().reshape(-1, 3)
+    lower, edge = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64)
     for bit, (camera, place) in enumerate(views):
         if place is None:
             continue
@@ -67,8 +94,7 @@ def see_voxels(occupied: NDArray[np.bool_], spec: GridSpec, views: Views) -> NDA
         ahead = np.flatnonzero(_in_front(centers, camera_T_scan, camera.model == "fisheye"))
         pixels = camera.project(transform_points(camera_T_scan, centers[ahead]))
         voxels = ahead[camera.contains(pixels)]
-        eye = (place[:3, 3] - lower) / edge
-        _mark_seen(voxels, blocks, eye, size, np.uint8(1 << bit), seen)
+        _mark_seen(voxels, (place[:3, 3] - lower) / edge, solid, np.uint8(1 << bit), seen)
     return seen.reshape(spec.size)
 
 
@@ -78,37 +104,26 @@ def _in_front(centers: NDArray[np.float64], camera_T_scan: Transform, is_wide: b
 
 
 @cached
-def _mark_seen(voxels, blocks, eye, size, bit, seen):  # type: ignore[no-untyped-def]
+def _mark_seen(voxels, eye, solid, bit, seen):  # type: ignore[no-untyped-def]
     """Set a bit of the voxels that rays from an eye reach. Everything is in units of voxels."""
-    for n in range(len(voxels)):
-        flat = voxels[n]
-        z = flat % size[2]
-        y = (flat // size[2]) % size[1]
-        x = flat // (size[2] * size[1])
-        near_x = _HALF if eye[0] > x + 0.5 else -_HALF
-        near_y = _HALF if eye[1] > y + 0.5 else -_HALF
-        near_z = _HALF if eye[2] > z + 0.5 else -_HALF
-        reached = _reaches(x + 0.5, y + 0.5, z + 0.5, eye, x, y, z, size, blocks)
-        if not blocks[flat]:
-            if reached:
-                seen[flat] |= bit
-            continue
-        reached = reached or _reaches(x + 0.5, y + 0.5, z + 0.5 + near_z, eye, x, y, z, size, blocks)
-        reached = reached or _reaches(x + 0.5 + near_x, y + 0.5, z + 0.5, eye, x, y, z, size, blocks)
-        reached = reached or _reaches(x + 0.5, y + 0.5 + near_y, z + 0.5, eye, x, y, z, size, blocks)
-        k = 0
-        while not reached and k < 8:
-            at_x = x + 0.5 + (_HALF if k & 1 else -_HALF)
-            at_y = y + 0.5 + (_HALF if k & 2 else -_HALF)
-            at_z = z + 0.5 + (_HALF if k & 4 else -_HALF)
-            reached = _reaches(at_x, at_y, at_z, eye, x, y, z, size, blocks)
-            k += 1
+    size, boxes, middle = solid.size, solid.boxes, np.empty(3)
+    for voxel in voxels:
+        cell = voxel // (size[2] * size[1]), (voxel // size[2]) % size[1], voxel % size[2]
+        reached = _reaches((cell[0] + 0.5, cell[1] + 0.5, cell[2] + 0.5), eye, cell, solid)
+        if not reached and solid.occupied[voxel] and len(boxes) and boxes[voxel, 0] <= boxes[voxel, 3]:
+            for axis in range(3):
+                middle[axis] = cell[axis] + (1.0 + boxes[voxel, axis] + boxes[voxel, 3 + axis]) / (2 * STEPS)
+            reached = _reaches((middle[0], middle[1], middle[2]), eye, cell, solid)
         if reached:
-            seen[flat] |= bit
+            seen[voxel] |= bit
 
 
 def see_points(
-    points: NDArray[np.floating], occupied: NDArray[np.bool_], spec: GridSpec, eye: NDArray[np.float64]
+    points: NDArray[np.floating],
+    occupied: NDArray[np.bool_],
+    spec: GridSpec,
+    eye: NDArray[np.float64],
+    boxes: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.bool_]:
     """Return (N,) which points no voxel of a grid hides from a place. What is outside of the grid hides nothing.
 
@@ -120,17 +135,19 @@ def see_points(
         occupied: (X, Y, Z) voxels that stop rays.
         spec: the grid, which is Cartesian.
         eye: (3,) metres, the place.
+        boxes: (V, 6) the boxes around the points in each voxel; None: voxels stop rays as a whole.
     """
-    lower, edge, size = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64), np.array(spec.size)
-    blocks = np.ascontiguousarray(occupied, np.bool_).reshape(-1)
+    lower, edge = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64)
     reached = np.empty(len(points), np.bool_)
-    _reach_points((np.asarray(points, np.float64) - lower) / edge, blocks, (eye - lower) / edge, size, reached)
+    cells = (np.asarray(points, np.float64) - lower) / edge
+    _reach_points(cells, (eye - lower) / edge, _Solid.of(occupied, spec, boxes), reached)
     return reached
 
 
 @cached
-def _reach_points(points, blocks, eye, size, reached):  # type: ignore[no-untyped-def]
+def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
     """Find which points rays from an eye reach. Everything is in units of voxels."""
+    size = solid.size
     for n in range(len(points)):
         reached[n] = False
         for raised in range(2):
@@ -151,22 +168,23 @@ def _reach_points(points, blocks, eye, size, reached):  # type: ignore[no-untype
             if x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]:
                 reached[n] = True
                 break
-            if _reaches(at_x, at_y, at_z, eye, x, y, z, size, blocks):
+            if _reaches((at_x, at_y, at_z), eye, (x, y, z), solid):
                 reached[n] = True
                 break
 
 
 @jit
-def _reaches(at_x, at_y, at_z, eye, x, y, z, size, blocks):  # type: ignore[no-untyped-def]
-    """Return whether nothing occupied lies between a place in a voxel and the eye."""
-    way_x, way_y, way_z = eye[0] - at_x, eye[1] - at_y, eye[2] - at_z
+def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
+    """Return whether nothing lies between a place in a voxel and the eye that stops rays."""
+    size, (x, y, z) = solid.size, cell
+    way = way_x, way_y, way_z = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
     step_x, step_y, step_z = (1 if way_x > 0 else -1), (1 if way_y > 0 else -1), (1 if way_z > 0 else -1)
     each_x = abs(1.0 / way_x) if way_x != 0 else np.inf
     each_y = abs(1.0 / way_y) if way_y != 0 else np.inf
     each_z = abs(1.0 / way_z) if way_z != 0 else np.inf
-    next_x = ((x + (1 if way_x > 0 else 0)) - at_x) / way_x if way_x != 0 else np.inf
-    next_y = ((y + (1 if way_y > 0 else 0)) - at_y) / way_y if way_y != 0 else np.inf
-    next_z = ((z + (1 if way_z > 0 else 0)) - at_z) / way_z if way_z != 0 else np.inf
+    next_x = ((x + (1 if way_x > 0 else 0)) - at[0]) / way_x if way_x != 0 else np.inf
+    next_y = ((y + (1 if way_y > 0 else 0)) - at[1]) / way_y if way_y != 0 else np.inf
+    next_z = ((z + (1 if way_z > 0 else 0)) - at[2]) / way_z if way_z != 0 else np.inf
     while True:
         if next_x <= next_y and next_x <= next_z:
             if next_x >= 1.0:
@@ -189,5 +207,23 @@ def _reaches(at_x, at_y, at_z, eye, x, y, z, size, blocks):  # type: ignore[no-u
             next_z += each_z
             if z < 0 or z >= size[2]:
                 return True
-        if blocks[(x * size[1] + y) * size[2] + z]:
-            return next_x >= 1.0 and next_y >= 1.0 and next_z >= 1.0  # what the eye itself is in stops nothing
+        voxel = (x * size[1] + y) * size[2] + z
+        if solid.occupied[voxel]:
+            if next_x >= 1.0 and next_y >= 1.0 and next_z >= 1.0:  # what the eye itself is in stops nothing
+                return True
+            if _is_stopped(at, way, (x, y, z), voxel, solid):
+                return False
+
+
+@jit
+def _is_stopped(at, way, cell, voxel, solid):  # type: ignore[no-untyped-def]
+    """Return whether an occupied voxel stops a ray that goes through it: the box around its points, if they are known."""
+    boxes, first, last = solid.boxes, 0.0, 1.0
+    if not len(boxes) or boxes[voxel, 0] > boxes[voxel, 3]:
+        return True
+    for axis in range(3):
+        low = cell[axis] + boxes[voxel, axis] / STEPS - solid.beyond[axis] - at[axis]
+        high = cell[axis] + (1.0 + boxes[voxel, 3 + axis]) / STEPS + solid.beyond[axis] - at[axis]
+        enter, leave = low / way[axis], high / way[axis]
+        first, last = max(first, min(enter, leave)), min(last, max(enter, leave))
+    return first < last

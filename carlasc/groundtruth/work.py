@@ -84,9 +84,10 @@ class MakeFrame(FrameTask):
         plan, number = self.plan, self.number
         try:
             thinned = self.frame.thinned(plan) if self.sampled else None  # first, while there are no outputs to keep
-            outputs, grid = _outputs_of(self.frame.make(plan), plan, number)
+            data = self.frame.make(plan)
+            outputs, grid = _outputs_of(data, plan, number)
             if plan.voting.keep_seen:
-                outputs[f"{plan.grid}/seen"] = see_voxels(grid.labels > 0, plan.spec, self.frame.views())
+                outputs[f"{plan.grid}/seen"] = see_voxels(grid.labels > 0, plan.spec, self.frame.views(), data.boxes)
             changes = None if thinned is None else Changes.between(grid, thinned)
             facts = FrameFacts.of(number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals())
         except MemoryError as error:
@@ -147,10 +148,7 @@ def run_batch(batch: Batch) -> list[FrameResult]:
         ConflictError: a scan exists already, and differs from that of this run.
         StorageError: nothing can be written, so every other batch would fail in the same way.
     """
-    done: list[FrameResult] = []
-    for task in batch.tasks:
-        result = task.run()
-        done.append(result)
+    done = [task.run() for task in batch.tasks]
     if not batch.writer.concurrent:
         return done
     try:

@@ -278,8 +278,8 @@ def test_a_projection_that_is_none_is_refused_in_one_line(copy, tmp_path):
 
 @pytest.mark.slow
 def test_boxes_of_the_real_sample_are_where_the_image_says(sample):
-    """The right edges fit to hundredths of a pixel. The other edges of the label file differ by up to 2.6 pixels from the boxes in space."""
-    recording, errors = recording_of(sample), []
+    """The van's edges fit to 2 pixels, all right edges to hundredths. The left edge of who rides differs by up to 2.6 from the box in space."""
+    recording, errors, of_van = recording_of(sample), [], []
     camera = {one.name: one for one in recording.cameras()}["image_02"]
     boxes = recording.boxes()
     for line in (Path(recording.folder) / "label_02/0000.txt").read_text().splitlines():
@@ -291,6 +291,8 @@ def test_boxes_of_the_real_sample_are_where_the_image_says(sample):
         (number,) = np.flatnonzero(boxes[frame].tracks == track)
         pixels = corners_in(camera, boxes[frame].sensor_T_box[number], boxes[frame].sizes[number])
         errors.append(np.abs(np.array([*pixels.min(axis=0), *pixels.max(axis=0)]) - own))
+        of_van += [errors[-1]] * (row[2] == "Van")
+    assert len(of_van) == 40 and np.max(of_van) < 2
     errors = np.array(errors)
     assert len(errors) > 100
     assert errors[:, 2].max() < 0.05

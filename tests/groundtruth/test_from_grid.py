@@ -11,6 +11,7 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth import FromGrid, regrid, resample
+from carlasc.groundtruth.from_grid import _boxes
 from carlasc.storage import FolderSink, layout
 from carlasc.storage.files import to_json
 
@@ -47,6 +48,17 @@ def test_cylindrical_grids_resample_too():
     coarse = resample(fine, spec.with_size((8, 8, 2)), CARLA)
     assert (coarse.labels == 7).all()
     assert (coarse.counts == 8).all()
+
+
+def test_what_hides_in_a_coarse_voxel_are_its_occupied_fine_cells():
+    fine = random_grid(2)
+    labels = np.zeros_like(fine.labels)
+    labels[1, 0, 1] = labels[2, 0, 0] = 7
+    coarse = fine.spec.with_size(tuple(size // 2 for size in fine.spec.size))
+    found = _boxes(Grid(fine.spec, labels, fine.counts), coarse)
+    filled = np.flatnonzero(found[:, 0] <= found[:, 3])
+    assert filled.tolist() == [0, coarse.size[1] * coarse.size[2]]
+    assert found[filled].tolist() == [[128, 0, 128, 255, 127, 255], [0, 0, 0, 127, 127, 127]]
 
 
 def test_a_finer_or_larger_grid_is_refused():

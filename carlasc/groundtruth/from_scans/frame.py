@@ -292,6 +292,7 @@ class _FrameSteps:
             free_step_m=self.plan.voting.free_step_m,
             regions=self.regions.of_voxel,
             count_views=count_views,
+            keep_boxes=self.plan.voting.keep_seen,
         )
         for observation in observations:
             ballot.add(observation)

@@ -92,7 +92,7 @@ class ScanFrame(FrameInput):
         feed = self.inputs.feed
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
         merged = merge_frame(plan, feed, self.inputs.actors, self.number, feed.reaching(self.number, plan.spec))
-        return FrameData(fields, merged.grid, merged.votes, merged.evidence, merged.actors)
+        return FrameData(fields, merged.grid, merged.votes, merged.evidence, merged.actors, merged.votes.boxes)
 
     def thinned(self, plan: GridPlan) -> Grid:
         """Return the grid without every tenth of the scans of other frames."""

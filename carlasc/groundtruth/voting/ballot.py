@@ -94,6 +94,7 @@ def count_votes(
     *,
     rule: VoteRule = "sensor",
     free_step_m: float = 1.5,
+    keep_boxes: bool = False,
 ) -> Votes:
     """Count the votes of observations. They are taken one at a time: memory does not grow with their number.
 
@@ -104,12 +105,13 @@ def count_votes(
         rule: "sensor": at most one vote per observation, voxel and class, as in the published files; "sample" and "ray": every sample
             counts (they differ in what the votes decide: see `carlasc.groundtruth.voting.certainty`).
         free_step_m: distance between two free samples on a ray, in metres.
+        keep_boxes: also keep how much of each voxel its points fill, of a Cartesian grid.
 
     Raises:
         ArgumentError: an unknown rule, or a distance that is not positive.
         FormatError: a label is not below `classes.num_channels`.
     """
-    ballot = Ballot(spec, classes, rule=rule, free_step_m=free_step_m)
+    ballot = Ballot(spec, classes, rule=rule, free_step_m=free_step_m, keep_boxes=keep_boxes)
     for observation in observations:
         ballot.add(observation)
     return ballot.votes(copy=False)
@@ -139,6 +141,7 @@ class Ballot:
         free_step_m: distance between two free samples on a ray, in metres.
         count_views: also count how many observations saw each voxel; not with "sensor".
         regions: (V,) uint16, region of each voxel, for observations that vote in one region only.
+        keep_boxes: also keep how much of each voxel its points fill, of a Cartesian grid.
 
     Raises:
         ArgumentError: an unknown rule, a distance that is not positive, or regions that do not fit.
@@ -153,9 +156,10 @@ class Ballot:
         free_step_m: float = 1.5,
         regions: NDArray[np.uint16] | None = None,
         count_views: bool = False,
+        keep_boxes: bool = False,
     ) -> None:
         from carlasc.core.cells import Cells
-        from carlasc.groundtruth.voting import kernel
+        from carlasc.groundtruth.voting import boxes, kernel
 
         check_rule(rule, free_step_m)
         if regions is not None and regions.shape != (spec.num_voxels,):
@@ -165,6 +169,7 @@ class Ballot:
         once = rule == "sensor"
         viewed = spec.num_voxels + 1 if count_views else 0
         self._cells, self._outside = Cells.of(spec), dict[int, NDArray[np.int64]]()
+        self._boxes = boxes.no_boxes(spec.num_voxels) if keep_boxes else None
         self._tally = kernel.Tally(
             once,
             free=np.zeros(spec.num_voxels + 1, np.uint32),
@@ -184,7 +189,7 @@ class Ballot:
             FormatError: a label is not below the class table's number of channels; no vote was added.
             ArgumentError: it votes in a region, and the ballot has none.
         """
-        from carlasc.groundtruth.voting import kernel
+        from carlasc.groundtruth.voting import boxes, kernel
 
         self.classes.check(observation.labels, "observation labels")
         hit_region = kernel.ANYWHERE if observation.hit_region is None else observation.hit_region
@@ -214,6 +219,8 @@ class Ballot:
             self._apart(free_region),
             self._tally,
         )
+        if self._boxes is not None:
+            boxes.widen_boxes(cast, self._cells, hit_region, self._tally.regions, self._boxes)
         self.num_observations += len(ends)
 
     def _apart(self, region: int) -> NDArray[np.int64]:
@@ -258,7 +265,8 @@ class Ballot:
         occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
         kernel.collect(self._tally.heads, candidates, occupied)
         free = self._tally.free[:-1].reshape(self.spec.size)
-        return Votes(self.spec, self.classes, free.copy() if copy else free, occupied)
+        boxes = self._boxes.copy() if copy and self._boxes is not None else self._boxes
+        return Votes(self.spec, self.classes, free.copy() if copy else free, occupied, boxes)
 
     def _make_room(self, points: int) -> None:
         """Make room for one more candidate per point, the most that an observation can add."""
@@ -279,12 +287,14 @@ class Votes:
         free: (X, Y, Z) unsigned integer, votes for free space.
         occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0) and `voters`
             (int32), the number of observations that they are of, and `sure` (float32), the sum of their probabilities; one row per voxel and class, sorted by voxel, then by label.
+        boxes: (V, 6) uint8, the box around the points of each voxel: see `carlasc.groundtruth.voting.boxes`; None unless they are kept.
     """
 
     spec: GridSpec
     classes: ClassTable
     free: NDArray[Any]
     occupied: NDArray[Any]
+    boxes: NDArray[np.uint8] | None = None
 
     def to_grid(self) -> Grid:
         """Return the grid: the class with most votes of each voxel, free space included, and the sum of its votes. Ties go to the lowest id."""

@@ -1,0 +1,50 @@
+"""How much of each voxel its points fill: the box around them. A pole, a roof or a kerb hides what is behind this box, not all behind its voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.cells import Cells, transform
+from carlasc.core.compiling import cached
+from carlasc.groundtruth.voting.kernel import ANYWHERE, Voters
+
+STEPS = 256  # of an edge of a voxel, in which boxes are measured
+
+
+def no_boxes(num_voxels: int) -> NDArray[np.uint8]:
+    """Return (V, 6) the boxes of voxels without points: first x, y, z, which are after the last x, y, z."""
+    return np.tile(np.array([255, 255, 255, 0, 0, 0], np.uint8), (num_voxels, 1))
+
+
+@cached
+def widen_boxes(cast: Voters, cells: Cells, region: int, regions: NDArray[np.uint16], boxes: NDArray[np.uint8]) -> None:
+    """Widen the boxes of Cartesian voxels by the points of an observation that vote for their classes.
+
+    Args:
+        cast: the observation.
+        cells: the cells of the grid.
+        region: region in which points vote, or ANYWHERE.
+        regions: (V + 1,) region of each voxel; empty if the grid has none.
+        boxes: (V, 6) uint8; widened: first and last x, y, z in 1/256 of a voxel, from its lower corner.
+    """
+    points, labels, hits, _, _, poses, ends = cast
+    scaled, begin = np.empty(3), 0
+    for place in range(len(ends)):
+        p = poses[place]
+        pose = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
+        for i in range(begin, ends[place]):
+            if labels[i] == 0 or (len(hits) and not hits[i]):
+                continue
+            at = transform(pose, points[3 * i], points[3 * i + 1], points[3 * i + 2])
+            voxel, inside = 0, True
+            for axis in range(3):
+                scaled[axis] = (at[axis] - cells.lower[axis]) / cells.voxel_size[axis]
+                inside &= 0 <= scaled[axis] < cells.size[axis]
+                voxel = voxel * cells.size[axis] + int(scaled[axis])
+            if inside and (region == ANYWHERE or regions[voxel] == region):
+                for axis in range(3):
+                    step = np.uint8((scaled[axis] - int(scaled[axis])) * STEPS)
+                    boxes[voxel, axis] = min(boxes[voxel, axis], step)
+                    boxes[voxel, 3 + axis] = max(boxes[voxel, 3 + axis], step)
+        begin = ends[place]
