@@ -1,7 +1,7 @@
 """A small benchmark that anyone can reproduce: `python examples/benchmark.py OUT --size small` (`--size full` on a GPU).
 
 Simulates drives, labels them in four ways, trains the networks, scores them on capture truth, and writes `results.json`, of which
-`docs/studies/networks.py` makes tables: the networks of the paper and our own, what labels are worth, and what history is worth. Seeds and
+`benchmark_page.py` makes tables: the networks of the paper and our own, what labels are worth, and what history is worth. Seeds and
 settings are fixed in `benchmarking/`. Each drive and each run is kept when it is finished, and a training that was stopped continues after its
 last epoch. The first seeds of all rows are run first: a study that was stopped has equally many runs of each row, or one more of some.
 """

@@ -1,4 +1,4 @@
-"""One file with the results of all runs, small enough to be kept beside the pages: what `docs/studies/networks.py` makes tables of."""
+"""One file with the results of all runs, small enough to be kept beside the pages: what `benchmark_page.py` makes tables of."""
 
 from __future__ import annotations
 

@@ -33,17 +33,17 @@ def network_rows(size: Size) -> list[Row]:
     """Return the networks, with the optimizers and losses of their papers, trained on capture truth with both kinds of class weights."""
     motionsc, baseline = _shared(size), _baseline(size)
     networks = {
+        "Baseline T=5": baseline,
+        "MotionSC T=5": replace(motionsc, history=5),
         "LMSCNet SS": replace(motionsc, network="lmscnet_ss", decay=0.98),
         "SSCNet full": replace(motionsc, network="sscnet_full", decay=1.0, free_ratio=2.0),
         "MotionSC T=1": motionsc,
-        "MotionSC T=5": replace(motionsc, history=5),
         "Baseline T=1": replace(baseline, history=1),
-        "Baseline T=5": baseline,
     }
     return [
         Row(f"{name}, {weighting}", replace(config, weighting=weighting), size.seeds)
-        for weighting in WEIGHTINGS
         for name, config in networks.items()
+        for weighting in WEIGHTINGS
     ]
 
 
