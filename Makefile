@@ -58,7 +58,7 @@ figures: $(VENV)/ready ## measure every figure of the documentation, on an idle 
 	@mkdir -p build
 	PYTHONPATH=tests:tests/tools $(RUN)/python -m measuring --size $(or $(SIZE),quick) $(if $(ONLY),--only $(ONLY)) $(if $(filter tiny,$(SIZE)),--out build/figures.json)
 
-benchmark-ssc: $(VENV)/ready ## train networks on simulated drives and print the tables, 20 minutes (SIZE=medium: hours, SIZE=full: on a GPU)
+benchmark-ssc: $(VENV)/ready ## train networks on simulated drives and keep the results, 20 minutes (SIZE=medium: an hour, SIZE=long: a day, SIZE=full: on a GPU)
 	$(RUN)/python examples/benchmark.py build/benchmark-ssc --size $(or $(SIZE),small)
 
 notebooks: $(VENV)/ready ## run the notebooks and keep what they show in them

@@ -1,10 +1,11 @@
-"""Simulated drives with three kinds of labels: what many sensors saw, and what one sensor's scans give, with and without traces.
+"""Simulated drives with four kinds of labels: what many sensors saw, and what one sensor's scans give, with and without ghost trails.
 
 Every scan of a drive is that of the ego LiDAR. The grids of its middle frames are named after their labels:
 
     evaluation  capture truth: what all sensors of a capture saw at the instant of the frame
     tube        the scans around the frame, merged as they are (SemanticKITTI): what moves leaves traces
     align       the same scans, with each moving actor completed at its place in the frame; with the probability of each class
+    wrong       as align, but 20 % of the points of each scan have a wrong label, in clumps of 1 m
 """
 
 from __future__ import annotations
@@ -13,35 +14,45 @@ import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarking.sizes import SPLITS, Scenes, settings_of
-from carlasc import FromScans, Grid, GridSpec, Run, Voting, regrid
+from carlasc import FromScans, Grid, GridSpec, Run, Voting, label, regrid
+from carlasc import open as open_source
 from carlasc.captures import TownDrive, TrafficLevel
 from carlasc.core import CARLA, invert, relative_to, transform_points
 from carlasc.errors import ConflictError
 from carlasc.groundtruth import Observation, count_votes
 from carlasc.motion import MotionOptions
 from carlasc.storage import FolderSink, SequenceWriter
+from carlasc.testing import wrong_labels
 
 TRAFFIC: TrafficLevel = "heavy"
 _FIRST, _LAST, _EVERY = 50, 650, 10  # frames of a drive that are looked at to choose a stretch
 _MOVES_M_S = 1.0
 _PERIOD_S = 0.1
+_WRONG, _CLUMP_M = 0.2, 1.0
 _SETTINGS = "scenes.json"
 
 
 def build_drives(
-    out: Path, scenes: Scenes, *, workers: int | None = None, progress: Callable[[int, int], None] | None = None
+    out: Path,
+    scenes: Scenes,
+    *,
+    merge: bool = True,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Simulate the drives and label them. A drive that exists is not made again.
 
     Args:
         out: root of the data set.
         scenes: what is simulated.
+        merge: whether the scans are merged, too; if not, the only labels are capture truth.
         workers: number of processes that merge scans; None uses all cores.
         progress: called with the number of finished drives and the number of all drives.
 
@@ -64,7 +75,7 @@ def build_drives(
         writer = FolderSink(out).sequence(f"{path}/cartesian")
         if writer.read_document("evaluation/params.json") is None:  # written last
             record_drive(writer, TownDrive(seed, TRAFFIC, scenes.lidar), scenes)
-        if split != "Test":  # all runs are scored on capture truth
+        if merge and split != "Test":  # all runs are scored on capture truth
             merge_scans(out / path, scenes, workers)
         if progress:
             progress(done, len(towns))
@@ -110,8 +121,29 @@ def merge_scans(folder: Path, scenes: Scenes, workers: int | None) -> None:
         FromScans(window=window, dynamic="align", motion=MotionOptions("flow")),
     )
     regrid(folder, scenes.spec, observe=tube, name="tube", frames=frames, run=Run(workers=workers))
-    evidence = Voting(keep_evidence=True)
-    regrid(folder, scenes.spec, observe=align, voting=evidence, name="align", frames=frames, run=Run(workers=workers))
+    run, evidence = Run(workers=workers), Voting(keep_evidence=True)
+    regrid(folder, scenes.spec, observe=align, voting=evidence, name="align", frames=frames, run=run)
+    if (folder / "cartesian" / "wrong").exists():
+        return
+    with TemporaryDirectory(dir=folder.parent.parent, prefix=".wrong-") as temporary:
+        files, copy = Path(temporary) / "files", Path(temporary) / "copy"
+        write_wrong_labels(folder, files)
+        label(folder, copy, files, by="simulated errors", run=run)
+        regrid(copy, scenes.spec, observe=align, name="wrong", frames=frames, run=run)
+        (grid,) = copy.rglob("wrong")
+        grid.rename(folder / "cartesian" / "wrong")
+
+
+def write_wrong_labels(drive: Path, out: Path) -> None:
+    """Write labels of all scans of a drive, of which 20 % are wrong: in clumps of 1 m, which are others in each scan."""
+    out.mkdir()
+    (sequence,) = open_source(drive).sequences().values()
+    for frame in sequence.frames("points").tolist():
+        scan = sequence.scan(frame, ["labels"])
+        if scan.labels is not None:
+            np.save(
+                out / f"{frame:06d}.npy", wrong_labels(scan.labels, scan.points, _WRONG, clump_m=_CLUMP_M, seed=frame)
+            )
 
 
 def choose_stretch(drive: TownDrive, scenes: Scenes) -> int:

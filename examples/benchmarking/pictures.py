@@ -1,14 +1,16 @@
-"""Two pictures of what labels are worth: the figures of all runs, and one frame as the networks complete it."""
+"""A picture of what labels are worth: one frame as the networks complete it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from completion.data import open_split
 from completion.networks import build_network
+from completion.processes import Processes
 from completion.scoring import predict
 from completion.tasks import Batch
 from completion.training import BEST
@@ -18,59 +20,26 @@ from PIL import Image
 from torch import nn
 
 from benchmarking.rows import Row
-from benchmarking.runs import Result, on_truth, settings_of_run
-from benchmarking.sizes import Scenes, key_of
-from benchmarking.tables import FIGURES, FREE, PEDESTRIAN, VEHICLE
+from benchmarking.runs import choose_rate, on_truth, run_folder
+from benchmarking.sizes import Size
+from benchmarking.tables import FREE, PEDESTRIAN, VEHICLE
 from carlasc import Grid, collate
 from carlasc.core import CARLASC11
-from carlasc.errors import import_extra
 from carlasc.viewing import ClassColors, Panel, draw_panels, grid_drawing
 
-CHART, SCENE = "labels.svg", "labels.png"
-_SHOWN = (
-    ("mIoU", "mIoU, %"),
-    ("Vehicle", "IoU of vehicles, %"),
-    ("Pedestrian", "IoU of pedestrians, %"),
-    ("phantom actors, voxels per frame", "phantom actors, voxels per frame"),
-)
-
-
-def draw_chart(groups: Mapping[str, Sequence[Result]], path: Path) -> None:
-    """Draw a bar for the mean of each group of runs, and a dot for each run.
-
-    Raises:
-        DependencyError: Matplotlib is not installed.
-    """
-    matplotlib = import_extra("matplotlib", "plots")
-    figures, backend = (
-        import_extra("matplotlib.figure", "plots"),
-        import_extra("matplotlib.backends.backend_svg", "plots"),
-    )
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "carlasc", "font.size": 9}):
-        figure = figures.Figure(figsize=(10, 2.6), layout="constrained")
-        backend.FigureCanvasSVG(figure)
-        for axis, (name, title) in zip(figure.subplots(1, len(_SHOWN)), _SHOWN, strict=True):
-            for place, runs in enumerate(groups.values()):
-                values = [FIGURES[name](run) for run in runs]
-                axis.bar(place, np.mean(values), color=f"C{place}", alpha=0.5)
-                axis.plot([place] * len(values), values, ".", color=f"C{place}")
-            axis.set_title(title, fontsize=9)
-            axis.set_xticks(
-                range(len(groups)), [group.replace(", ", ",\n") for group in groups], rotation=30, fontsize=8
-            )
-            axis.spines[["top", "right"]].set_visible(False)
-        figure.savefig(path, format="svg", metadata={"Date": None, "Creator": None})
+SCENE = "labels.png"
 
 
 @torch.no_grad()
-def draw_scene(rows: Sequence[Row], scenes: Scenes, folder: Path, path: Path) -> None:
+def draw_scene(rows: Sequence[Row], size: Size, folder: Path, path: Path) -> None:
     """Draw a frame of the test split as the first run of each row of hard labels completes it, and the truth.
 
     It is the frame in which the first row has the median number of phantom voxels of actors, so neither its best nor its worst one. Voxels
     that no sensor saw are left out of all panels.
     """
     rows = [row for row in rows if not row.config.soft_labels]
-    networks = [_trained(row, scenes, folder) for row in rows]
+    scenes = size.scenes
+    networks = [_trained(row, size, folder) for row in rows]
     test = open_split(folder / "data", "test", on_truth(rows[0].config))
     samples = [test[index] for index in range(len(test))]
     phantoms = [_count_phantoms(networks[0], sample) for sample in samples]
@@ -85,10 +54,12 @@ def draw_scene(rows: Sequence[Row], scenes: Scenes, folder: Path, path: Path) ->
     Image.fromarray(draw_panels(panels, size=(1800, 460))).quantize(128).save(path, optimize=True)
 
 
-def _trained(row: Row, scenes: Scenes, folder: Path) -> nn.Module:
-    config = row.runs()[0]
-    weights = folder / "runs" / key_of(settings_of_run(scenes, config)) / BEST
-    network = build_network(config.network, len(CARLASC11.names), scenes.spec, config.history).eval()
+def _trained(row: Row, size: Size, folder: Path) -> nn.Module:
+    alone = Processes(0, 1, torch.device("cpu"))
+    rate = choose_rate(size.scenes, row.config, size.trial_epochs, folder, alone)
+    config = replace(row.config, learning_rate=rate)
+    weights = run_folder(size.scenes, config, folder) / BEST
+    network = build_network(config.network, len(CARLASC11.names), size.scenes.spec, config.history).eval()
     load_weights(network, read_weights(weights), str(weights))
     return network
 

@@ -52,6 +52,7 @@ class Size:
     Attributes:
         scenes: what is simulated.
         epochs: number of epochs of every network but JS3C-Net.
+        trial_epochs: number of epochs after which the learning rate is chosen.
         js3cnet_epochs: number of epochs of JS3C-Net, of which a step takes several times longer on a CPU.
         batch_size: samples per step.
         seeds: number of runs of each row.
@@ -60,6 +61,7 @@ class Size:
 
     scenes: Scenes
     epochs: int
+    trial_epochs: int
     js3cnet_epochs: int
     batch_size: int = 4
     seeds: int = 1
@@ -68,10 +70,11 @@ class Size:
 
 _NEAR = Lidar(channels=32, points=32_000, range_m=30.0)
 SIZES = {
-    "tiny": Size(Scenes((1, 1, 1), 3, 1, 2, Lidar(channels=16, points=6_000, range_m=20.0), 6.4, (16, 16, 8)), 1, 1),
-    "small": Size(Scenes((8, 2, 4), 21, 15, 12, _NEAR, 6.4, (32, 32, 8)), 12, 3),
-    "medium": Size(Scenes((20, 4, 6), 21, 15, 12, _NEAR, 6.4, (32, 32, 8)), 10, 1, seeds=3),
-    "full": Size(Scenes((24, 3, 6), 100, 30, 20, Lidar(), 25.6, (128, 128, 8)), 10, 10, 8, seeds=3, workers=8),
+    "tiny": Size(Scenes((1, 1, 2), 3, 1, 2, Lidar(channels=16, points=6_000, range_m=20.0), 6.4, (16, 16, 8)), 1, 1, 1),
+    "small": Size(Scenes((6, 2, 4), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 3, 1, 1, batch_size=2),
+    "medium": Size(Scenes((10, 3, 8), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 3, 1, 1, batch_size=2, seeds=3),
+    "long": Size(Scenes((20, 4, 12), 21, 15, 12, _NEAR, 6.4, (32, 32, 8)), 10, 3, 3, seeds=3),
+    "full": Size(Scenes((24, 3, 6), 100, 30, 20, Lidar(), 25.6, (128, 128, 8)), 10, 3, 10, 8, seeds=3, workers=8),
 }
 
 

@@ -1,88 +1,132 @@
-"""The tables: the paper's two for networks, and one of what labels are worth; mean and standard deviation over seeds."""
+"""The figures of runs, tables of them, and how sure differences are: intervals over test drives and seeds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarking.runs import Result
 from carlasc.core import CARLASC11
-from carlasc.metrics import FigureTable, geometric_table, semantic_table
+from carlasc.metrics import FigureTable
 
 VEHICLE, PEDESTRIAN = CARLASC11.id_of("Vehicles"), CARLASC11.id_of("Pedestrian")
 FREE = 0
+Counts = NDArray[np.floating | np.integer]  # (..., K, K) confusion matrices, rows are the truth
+Figure = Callable[[Counts], NDArray[np.float64]]
+_DRAWS = 2000
 
 
-def miou(result: Result) -> float:
-    """Mean IoU over the eleven classes, in percent."""
-    return 100 * result.evaluation("").miou
+def iou(counts: Counts, label: int) -> NDArray[np.float64]:
+    """IoU of a class in percent; 0 if it is neither in the truth nor predicted, as in the paper."""
+    right = counts[..., label, label]
+    either = counts[..., label, :].sum(-1) + counts[..., label].sum(-1) - right
+    return 100 * right / np.maximum(either, 1)
 
 
-def iou(result: Result, label: int) -> float:
-    """IoU of a class in percent; NaN if it is neither in the truth nor predicted."""
-    return 100 * float(result.matrix.iou[label])
+def miou(counts: Counts) -> NDArray[np.float64]:
+    """Mean IoU over all classes, free included, in percent."""
+    return np.mean([iou(counts, label) for label in range(counts.shape[-1])], axis=0)
 
 
-def false_free(result: Result) -> float:
+def geometric(counts: Counts) -> NDArray[np.float64]:
+    """IoU of occupied space in percent."""
+    right = counts[..., 1:, 1:].sum((-1, -2))
+    return 100 * right / (counts.sum((-1, -2)) - counts[..., FREE, FREE])
+
+
+def false_free(counts: Counts) -> NDArray[np.float64]:
     """Percentage of the occupied voxels that are called free."""
-    return 100 * result.evaluation("").score.false_free
+    return 100 * counts[..., 1:, FREE].sum(-1) / counts[..., 1:, :].sum((-1, -2))
 
 
-def actors_called_free(result: Result) -> float:
-    """Percentage of the voxels of vehicles and pedestrians that are called free."""
-    counts = result.matrix.counts[[VEHICLE, PEDESTRIAN]]
-    return float(100 * counts[:, FREE].sum() / counts.sum())
+def phantoms(counts: Counts) -> NDArray[np.float64]:
+    """Percentage of the free voxels that are called Vehicle or Pedestrian."""
+    return 100 * counts[..., FREE, [VEHICLE, PEDESTRIAN]].sum(-1) / counts[..., FREE, :].sum(-1)
 
 
-def phantoms(result: Result) -> float:
-    """Number of voxels per frame that are called Vehicle or Pedestrian and are free."""
-    return float(result.matrix.counts[FREE, [VEHICLE, PEDESTRIAN]].sum() / result.frames)
+def class_figures() -> dict[str, Figure]:
+    """Return the IoU of each class by its name."""
+    return {name: lambda counts, label=label: iou(counts, label) for label, name in CARLASC11.names.items()}  # type: ignore[misc]
 
 
-FIGURES: Mapping[str, Callable[[Result], float]] = {
-    "mIoU": miou,
-    "Vehicle": lambda result: iou(result, VEHICLE),
-    "Pedestrian": lambda result: iou(result, PEDESTRIAN),
-    "false free": false_free,
-    "actors called free": actors_called_free,
-    "phantom actors, voxels per frame": phantoms,
-    "ECE, free": lambda result: 100 * result.ece_free,
-    "ECE, occupied": lambda result: 100 * result.ece_occupied,
+MIOU, VEHICLES = "mIoU", "Vehicles"
+NETWORK: Mapping[str, Figure] = {
+    MIOU: miou,
+    VEHICLES: lambda counts: iou(counts, VEHICLE),
+    "Pedestrian": lambda counts: iou(counts, PEDESTRIAN),
+    "IoU": geometric,
 }
-"""The columns of the table of labels."""
+LABELS: Mapping[str, Figure] = {
+    **{name: NETWORK[name] for name in (MIOU, VEHICLES, "Pedestrian")},
+    "false free": false_free,
+    "phantom actors": phantoms,
+}
+CAUSES: Mapping[str, Figure] = {
+    "IoU": NETWORK[VEHICLES],
+    "missed: called free": lambda counts: _share(counts, counts[..., VEHICLE, FREE]),
+    "missed: another class": lambda counts: _share(
+        counts, counts[..., VEHICLE, 1:].sum(-1) - counts[..., VEHICLE, VEHICLE]
+    ),
+    "false: is free": lambda counts: _share(counts, counts[..., FREE, VEHICLE]),
+    "false: another class": lambda counts: _share(
+        counts, counts[..., 1:, VEHICLE].sum(-1) - counts[..., VEHICLE, VEHICLE]
+    ),
+}
+"""Why the IoU of vehicles is not 100: errors in percent of the true voxels of vehicles."""
 
 
-def label_table(groups: Mapping[str, Sequence[Result]]) -> FigureTable:
-    """Return what each kind of labels gives: one row per group of runs."""
-    rows = tuple(
-        (name, *(spread([figure(run) for run in runs]) for figure in FIGURES.values())) for name, runs in groups.items()
+def _share(counts: Counts, errors: Counts) -> NDArray[np.float64]:
+    return 100 * errors / np.maximum(counts[..., VEHICLE, :].sum(-1), 1)
+
+
+def figure_row(runs: Sequence[Result], figures: Mapping[str, Figure]) -> tuple[str, ...]:
+    """Return mean and standard deviation of the figures of a row's runs, over all test drives."""
+    return tuple(spread([float(figure(run.drives.sum(0))) for run in runs]) for figure in figures.values())
+
+
+def figure_table(title: str, groups: Mapping[str, Sequence[Result]], figures: Mapping[str, Figure]) -> FigureTable:
+    """Return a table with one row per group of runs."""
+    return FigureTable(
+        title, ("", *figures), tuple((name, *figure_row(runs, figures)) for name, runs in groups.items())
     )
-    return FigureTable("What labels are worth, scored on capture truth", ("trained on", *FIGURES), rows)
 
 
-def network_tables(groups: Mapping[str, Sequence[Result]]) -> list[FigureTable]:
-    """Return the paper's two tables with one row per group of runs."""
-    tables = []
-    for make in (semantic_table, geometric_table):
-        rows: list[tuple[str, ...]] = []
-        for name, runs in groups.items():
-            table = make([run.evaluation(name) for run in runs])
-            columns = list(zip(*table.rows, strict=True))[1:]
-            rows.append((name, *(spread([float(value) for value in column]) for column in columns)))
-        tables.append(FigureTable(table.title, table.header, tuple(rows)))
-    return tables
+def difference(first: Sequence[Result], second: Sequence[Result], figure: Figure) -> tuple[float, float, float]:
+    """Return by how much a figure of the first runs is higher than that of the second, and the bounds of its 95 % interval.
+
+    The test drives are drawn again (bootstrap), the same for both; and the runs of each, so that the interval holds for other towns and other
+    seeds. With one run of each it holds for other towns only.
+    """
+    rng = np.random.default_rng(0)
+    drives = len(first[0].drives)
+    drawn = rng.multinomial(drives, np.full(drives, 1 / drives), _DRAWS)
+    drawn[0] = 1  # the drives as they are
+    means = []
+    for runs in (first, second):
+        values = figure(np.einsum("rd,sdkl->rskl", drawn, np.stack([run.drives for run in runs])))
+        chosen = rng.integers(0, len(runs), (_DRAWS, len(runs)))
+        chosen[0] = range(len(runs))
+        means.append(np.take_along_axis(values, chosen, 1).mean(1))
+    found = means[0] - means[1]
+    return float(found[0]), *map(float, np.percentile(found[1:], (2.5, 97.5)))  # type: ignore[return-value]
+
+
+def with_interval(found: tuple[float, float, float]) -> str:
+    """Return a difference and its interval as text; bold where the interval does not hold zero."""
+    value, low, high = found
+    text = f"{value:+.1f} ({low:+.1f} to {high:+.1f})"
+    return f"**{text}**" if low * high > 0 else text
 
 
 def spread(values: Sequence[float]) -> str:
-    """Return mean and standard deviation as text: a dash where a value is not defined, and no deviation of a single value."""
-    if np.isnan(values).any():  # a class that never occurs
-        return "-"
-    deviation = f" ± {np.std(values, ddof=1):.2f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.2f}{deviation}"
+    """Return mean and standard deviation as text; no deviation of a single value."""
+    deviation = f" ± {np.std(values, ddof=1):.1f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.1f}{deviation}"
 
 
 def to_markdown(table: FigureTable) -> str:
-    """Return a table as Markdown, under its title."""
+    """Return a table as Markdown."""
     rows = [list(table.header), ["---", *["---:"] * (len(table.header) - 1)], *table.texts()]
-    return "\n".join([table.title, "", *(f"| {' | '.join(row)} |" for row in rows)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -149,12 +149,16 @@ class EpochSampler(DistributedSampler[int]):
 
 
 class Kept(TorchDataset[Values]):
-    """Keeps the samples of a data set in memory, as they are before they are transformed."""
+    """Keeps the samples of a data set in memory, as they are before they are transformed; for all runs of this process on the same data."""
 
-    def __init__(self, data: Dataset) -> None:
+    _samples_of: ClassVar[dict[tuple[Any, ...], dict[int, Sample]]] = {}
+
+    def __init__(self, data: Dataset, config: Config) -> None:
         self.data, self.transform = copy.copy(data), data.transform
         self.data.transform = None
-        self._samples: dict[int, Sample] = {}
+        places = tuple(sequence.location for sequence in data.sequences)
+        same = places, data.fields, config.history, config.align, config.grid, config.remap
+        self._samples = self._samples_of.setdefault(same, {})
 
     def __len__(self) -> int:
         return len(self.data)
@@ -196,7 +200,7 @@ class TrainLoader:
             self.sampler = ShardSampler(data, seed=config.seed, rank=rank, world=world)
         else:
             self.sampler = EpochSampler(data, world, rank, shuffle=True, seed=config.seed)
-        samples: Any = Kept(data) if config.keep_samples else data
+        samples: Any = Kept(data, config) if config.keep_samples else data
         self.loader = _loader(samples, config, config.batch_size // world, sampler=self.sampler)
 
     def __len__(self) -> int:
@@ -220,7 +224,7 @@ def _share_files(data: Dataset) -> bool:
 
 def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) -> DataLoader[Values]:
     """Return a loader that gives each sample once, in order. Each process takes every `world`-th sample."""
-    samples: Any = Kept(data) if config.keep_samples else data
+    samples: Any = Kept(data, config) if config.keep_samples else data
     mine: Any = samples if world == 1 else Subset(samples, range(rank, len(data), world))
     return _loader(mine, config, max(1, config.batch_size // world))
 
@@ -290,10 +294,12 @@ def _merge(counts: NDArray[np.integer], remap: Remap | None, num_classes: int) -
 
 def _count_voxels(source: str | Path | Source, config: Config, num_classes: int) -> NDArray[np.int64]:
     """Count the known voxels of each class over the training split."""
-    data = open_split(source, config.train, replace(config, history=1, shuffle_history=False))
+    config = replace(config, history=1, shuffle_history=False)
+    data = open_split(source, config.train, config)
+    samples: Any = Kept(data, config) if config.keep_samples else data
     counts = np.zeros(num_classes, np.int64)
     for index in range(len(data)):
-        sample = data[index]
+        sample = samples[index]
         counts += np.bincount(sample["labels"][sample["known"]], minlength=num_classes)
     return counts
 

@@ -89,7 +89,9 @@ def train(
 
     torch.manual_seed(config.seed)
     network = build_network(config.network, num_classes, data.spec, config.history).to(processes.device)
-    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    optimizer = torch.optim.Adam(
+        network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+    )
     schedule = torch.optim.lr_scheduler.StepLR(optimizer, config.decay_every, config.decay)
     parts: dict[str, Any] = {"network": network, "optimizer": optimizer, "schedule": schedule}
     progress = _resume(out, config, parts) if resume else _begin(out, config, processes)

@@ -14,18 +14,19 @@ from carlasc import open as open_source
 from carlasc.captures import Lidar
 from carlasc.core import CARLA, CARLASC11, translation
 from carlasc.errors import ConflictError
-from carlasc.metrics import ConfusionMatrix
 
 pytest.importorskip("torch", reason="needs carlasc[torch]")
 
 import benchmark
+import benchmark_page
 import published
 import torch
 from benchmarking.drives import build_drives, choose_stretch
-from benchmarking.rows import history_rows, label_rows, network_rows
-from benchmarking.runs import Result, result_of, settings_of_run
+from benchmarking.kept import note, read
+from benchmarking.rows import history_rows, js3cnet_rows, label_rows, network_rows
+from benchmarking.runs import RATES, Result, result_of, settings_of_run
 from benchmarking.sizes import SIZES, SPLITS, key_of, settings_of
-from benchmarking.tables import FIGURES, label_table, network_tables, to_markdown
+from benchmarking.tables import LABELS, MIOU, NETWORK, VEHICLES, difference, figure_table, to_markdown, with_interval
 from completion.processes import Processes
 
 ALONE = Processes(0, 1, torch.device("cpu"))
@@ -42,17 +43,18 @@ def folder(tmp_path_factory):
 
 
 def result(correct: int = 50, phantoms: int = 0, seed: int = 0) -> Result:
-    """Return a result over two frames: 100 voxels of vehicles, 1000 free ones."""
-    matrix = ConfusionMatrix(11)
-    matrix.counts[VEHICLE, VEHICLE], matrix.counts[VEHICLE, 0] = correct, 100 - correct
-    matrix.counts[0, PEDESTRIAN], matrix.counts[0, 0] = phantoms, 1000 - phantoms
-    return Result({"run": {"seed": seed}}, matrix, 2, 0.01, 0.2, 12.0, 3, 0.5)
+    """Return a result over two frames of two drives, which are alike: 50 voxels of vehicles, 500 free ones in each."""
+    counts = np.zeros((2, 11, 11), np.int64)
+    counts[:, VEHICLE, VEHICLE], counts[:, VEHICLE, 0] = correct // 2, 50 - correct // 2
+    counts[:, 0, PEDESTRIAN], counts[:, 0, 0] = phantoms // 2, 500 - phantoms // 2
+    run = {"seed": seed, "epochs": 3, "learning_rate": 1e-3}
+    return Result({"scenes": {}, "run": run}, counts, 2, 0.01, 0.2, 12.0, 3, 0.5)
 
 
 @pytest.mark.slow
-def test_the_same_frames_of_a_drive_have_three_kinds_of_labels(folder):
+def test_the_same_frames_of_a_drive_have_four_kinds_of_labels(folder):
     samples = {}
-    for name in ("evaluation", "tube", "align"):
+    for name in ("evaluation", "tube", "align", "wrong"):
         data = Dataset(folder / "data", "train", grid=name, fields=("labels", "known", "visibility"))
         assert [data[i]["frame"] for i in range(len(data))] == [1, 2, 3]
         assert data.spec == TINY.scenes.spec
@@ -61,10 +63,12 @@ def test_the_same_frames_of_a_drive_have_three_kinds_of_labels(folder):
         assert not np.array_equal(samples[name]["labels"], samples["evaluation"]["labels"])
         both = samples[name]["known"] & samples["evaluation"]["known"]
         assert (samples[name]["labels"] == samples["evaluation"]["labels"])[both].mean() > 0.7
+    errors = (samples["wrong"]["labels"] != samples["align"]["labels"]).mean()
+    assert 0 < errors < 0.2
     soft = Dataset(folder / "data", "train", grid="align", fields=("posterior",))[1]["posterior"]
     assert soft.shape == (11, *TINY.scenes.cells)
-    (test,) = open_source(folder / "data" / "Test").sequences().values()
-    assert set(test.grids) == {"evaluation"}
+    for test in open_source(folder / "data" / "Test").sequences().values():
+        assert set(test.grids) == {"evaluation"}
 
 
 @pytest.mark.slow
@@ -72,7 +76,7 @@ def test_drives_are_made_once_and_other_scenes_do_not_mix_with_them(folder):
     files = {path: path.stat().st_mtime_ns for path in (folder / "data").rglob("*.bin")}
     done = []
     build_drives(folder / "data", TINY.scenes, workers=1, progress=lambda *steps: done.append(steps))
-    assert done == [(1, 3), (2, 3), (3, 3)]
+    assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert {path: path.stat().st_mtime_ns for path in files} == files
     with pytest.raises(ConflictError, match="scenes.json: expected .* found other scenes"):
         build_drives(folder / "data", dataclasses.replace(TINY.scenes, sensors=5), workers=1)
@@ -81,20 +85,22 @@ def test_drives_are_made_once_and_other_scenes_do_not_mix_with_them(folder):
 @pytest.mark.slow
 def test_a_run_is_kept_and_made_again_only_with_other_settings(folder):
     row = label_rows(TINY)[-1]
-    first = result_of(TINY.scenes, row.runs()[0], folder, ALONE)
+    first = result_of(TINY.scenes, row.config, folder, ALONE)
     (kept,) = (folder / "results").iterdir()
     assert kept.stem == key_of(settings_of_run(TINY.scenes, row.config))
     written = kept.stat().st_mtime_ns
     again = result_of(TINY.scenes, dataclasses.replace(row.config, workers=3, keep_samples=False), folder, ALONE)
     assert kept.stat().st_mtime_ns == written
     np.testing.assert_array_equal(again.matrix.counts, first.matrix.counts)
-    assert (again.frames, again.best_epoch) == (first.frames, first.best_epoch) == (3, 1)
+    assert (again.frames, again.best_epoch) == (first.frames, first.best_epoch) == (6, 1)
+    assert first.drives.shape == (2, 11, 11)
+    assert (first.drives.sum((1, 2)) > 0).all()
     result_of(TINY.scenes, dataclasses.replace(row.config, seed=1), folder, ALONE)
     assert len(list((folder / "results").iterdir())) == 2
 
 
 @pytest.mark.slow
-def test_the_benchmark_prints_its_tables_and_a_second_run_trains_nothing(folder, tmp_path, capsys):
+def test_the_benchmark_keeps_its_results_and_a_second_run_trains_nothing(folder, tmp_path):
     pytest.importorskip("matplotlib", reason="the pictures need carlasc[plots]")
     from PIL import Image
 
@@ -102,17 +108,21 @@ def test_the_benchmark_prints_its_tables_and_a_second_run_trains_nothing(folder,
     (tmp_path / "tiny" / "data").symlink_to(folder / "data")
     arguments = {"size": "tiny", "study": list(benchmark.Study), "device": "cpu", "workers": 1}
     benchmark.main(tmp_path, **arguments, pictures=tmp_path / "pictures")
-    printed = capsys.readouterr().out
-    rows = {"LMSCNet SS": 2, "JS3C-Net": 2, "Baseline T=5": 4, "align, soft labels": 1, "T=5, not aligned": 2}
-    assert {name: printed.count(f"| {name} |") for name in rows} == rows
-    assert (tmp_path / "pictures" / "labels.svg").read_text().count("IoU of vehicles") == 1
     assert Image.open(tmp_path / "pictures" / "labels.png").size == (1800, 460)
-    figures = json.loads((tmp_path / "tiny" / "results.json").read_text())
-    runs = [run for study in ("labels", "networks", "history") for runs in figures[study].values() for run in runs]
-    assert all(0 < run["scored_voxels"] == runs[0]["scored_voxels"] for run in runs)
+    results = tmp_path / "tiny" / "results.json"
+    kept = read(results)
+    assert {study: list(rows) for study, rows in kept.items()} == {
+        study: [row.name for row in rows(TINY)] for study, rows in benchmark.ROWS.items()
+    }
+    runs = [run for study in kept.values() for (run,) in study.values()]
+    assert len({run.drives.sum() for run in runs}) == 1
+    assert {run.settings["run"]["learning_rate"] for run in runs} <= set(RATES)
+    made = benchmark_page.tables(kept)
+    assert not [text for text in made.values() if "Not run" in text]
     written = {path: path.stat().st_mtime_ns for path in (tmp_path / "tiny" / "runs").rglob("best.safetensors")}
+    before = results.read_text()
     benchmark.main(tmp_path, **arguments)
-    assert capsys.readouterr().out == printed
+    assert results.read_text() == before
     assert {path: path.stat().st_mtime_ns for path in written} == written
 
 
@@ -146,19 +156,25 @@ def test_seeds_of_the_splits_are_apart_and_a_part_fits_the_size():
 def test_every_row_trains_as_its_paper_says():
     size = SIZES["full"]
     networks = {row.name: row.config for row in network_rows(size)}
-    assert (networks["SSCNet full"].free_ratio, networks["SSCNet full"].decay) == (2.0, 1.0)
-    assert (networks["LMSCNet SS"].decay, networks["MotionSC T=5"].decay) == (0.98, 0.96)
-    assert (networks["JS3C-Net"].decay, networks["JS3C-Net"].decay_every) == (0.7, 10)
+    assert len(networks) == 12
+    for weighting in ("log", "root"):
+        sscnet = networks[f"SSCNet full, {weighting}"]
+        assert (sscnet.free_ratio, sscnet.decay, sscnet.weighting) == (2.0, 1.0, weighting)
+        decays = networks[f"LMSCNet SS, {weighting}"].decay, networks[f"MotionSC T=5, {weighting}"].decay
+        assert decays == (0.98, 0.96)
+    (js3cnet,) = js3cnet_rows(size)
+    assert (js3cnet.config.decay, js3cnet.config.decay_every) == (0.7, 10)
     labels = {row.name: row for row in label_rows(size)}
     assert {name: row.config.grid for name, row in labels.items()} == {
         "tube": "tube",
         "align": "align",
+        "align, 20 % of the points wrong": "wrong",
         "align, soft labels": "align",
         "capture truth": "evaluation",
     }
-    assert labels["capture truth"].config == networks["Baseline T=5"]  # one run for both tables
-    assert [row.config.history for row in history_rows(size)] == [1, 5, 5, 5]
-    assert [run.seed for run in labels["tube"].runs()] == [0, 1, 2]
+    assert labels["capture truth"].config == networks["Baseline T=5, root"]  # one run for both tables
+    assert [row.config.history for row in history_rows(size)] == [1, 5, 5, 5] * 2
+    assert {row.seeds for row in (*labels.values(), *network_rows(size), *history_rows(size))} == {3}
 
 
 def test_settings_that_change_a_result_change_its_key():
@@ -178,37 +194,64 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
     one = result(40, 10)
     one.write(tmp_path / "results" / "a.json")
     other = Result.read(tmp_path / "results" / "a.json")
-    np.testing.assert_array_equal(other.matrix.counts, one.matrix.counts)
-    assert {**vars(other), "matrix": None} == {**vars(one), "matrix": None}
-    assert other.to_dict("x")["ece_occupied"] == 0.2
+    np.testing.assert_array_equal(other.drives, one.drives)
+    assert {**vars(other), "drives": None} == {**vars(one), "drives": None}
+    for seed in (1, 0):
+        note(tmp_path / "results.json", "labels", "tube", result(40, 10, seed))
+    assert [run.settings["run"]["seed"] for run in read(tmp_path / "results.json")["labels"]["tube"]] == [0, 1]
 
 
 def test_figures_are_those_of_the_counts():
-    figures = {name: figure(result(40, 10)) for name, figure in FIGURES.items()}
-    assert figures == pytest.approx(
+    counts = result(40, 10).drives.sum(0)
+    assert {name: float(figure(counts)) for name, figure in LABELS.items()} == pytest.approx(
         {
             "mIoU": (100 * 990 / 1060 + 40) / 11,
-            "Vehicle": 40.0,
+            "Vehicles": 40.0,
             "Pedestrian": 0.0,
             "false free": 60.0,
-            "actors called free": 60.0,
-            "phantom actors, voxels per frame": 5.0,
-            "ECE, free": 1.0,
-            "ECE, occupied": 20.0,
+            "phantom actors": 1.0,
         }
     )
+    whole = result(40, 10).matrix
+    assert NETWORK[MIOU](counts) == pytest.approx(100 * whole.miou)
+    assert NETWORK["IoU"](counts) == pytest.approx(100 * whole.completeness().iou)
 
 
 def test_seeds_are_averaged_and_their_spread_is_told():
     groups = {"two": [result(40), result(60, seed=1)], "one": [result(50)]}
-    table = label_table(groups)
-    assert table.rows[0][table.header.index("Vehicle")] == "50.00 ± 14.14"
-    assert table.rows[1][table.header.index("Vehicle")] == "50.00"
-    semantic, geometric = network_tables(groups)
-    assert semantic.rows[0][semantic.header.index("Vehicles")] == "50.00 ± 14.14"
-    assert semantic.rows[0][semantic.header.index("Pole")] == "-"
-    assert geometric.rows[0][1:] == ("100.00 ± 0.00", "50.00 ± 14.14", "50.00 ± 14.14", "50.00 ± 14.14")
-    assert "| two | " in to_markdown(geometric)
+    table = figure_table("", groups, NETWORK)
+    assert [row[table.header.index("Vehicles")] for row in table.rows] == ["50.0 ± 14.1", "50.0"]
+    assert "| two | " in to_markdown(table)
+
+
+def test_a_difference_that_every_drive_and_seed_shows_is_sure_and_one_of_a_single_drive_is_not():
+    vehicles = NETWORK[VEHICLES]
+    assert difference([result(60), result(62)], [result(40), result(42)], vehicles)[1] > 0
+    same = difference([result(60), result(40)], [result(40), result(60)], vehicles)
+    assert same[0] == 0
+    assert same[1] < 0 < same[2]
+    better = result(40)
+    better.drives[0] = result(80).drives[0]
+    value, low, high = difference([better], [result(40)], vehicles)
+    assert (value, low, high) == pytest.approx((20, 0, 40))
+    assert with_interval((20.0, 0.0, 40.0)) == "+20.0 (+0.0 to +40.0)"
+    assert with_interval((2.0, 1.0, 3.0)) == "**+2.0 (+1.0 to +3.0)**"
+
+
+def test_a_study_that_was_stopped_has_equally_many_seeds_of_each_row():
+    rows = {"MotionSC T=5, root": [result(40), result(44, seed=1)], "Baseline T=5, root": [result(60)]}
+    made = benchmark_page.tables({"networks": rows})
+    assert "| MotionSC T=5 | root | 0.001 | 12.2 | 40.0 |" in made["networks"]
+    assert "one seed, 3 epochs, 2 test drives of 1 frames" in made["networks"]
+    assert "Not run yet: Baseline T=5, log; MotionSC T=5, log; LMSCNet SS, log" in made["networks"]
+    assert made["history"].startswith("Not run: `python examples/benchmark.py WORK --size medium --study history`")
+
+
+def test_the_page_has_the_tables_of_the_results_that_are_kept():
+    kept = read(benchmark_page.KEPT)
+    page = benchmark_page.PAGE.read_text()
+    assert benchmark_page.fill(page, benchmark_page.tables(kept)) == page
+    assert benchmark_page.EVERY_CLASS.read_text() == benchmark_page.every_class(kept["networks"])
 
 
 @pytest.mark.slow
