@@ -7,6 +7,9 @@ RUN := $(VENV)/bin
 SIDE_BY_SIDE := -q -n auto --dist worksteal
 COVERAGE := 90 # percent; below it, `make coverage` fails
 
+# Tests start hundreds of processes: each would compile the modules of all packages again, for a second.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-slow test-lowest test-newest test-wheel coverage faults lint types unit benchmark figures benchmark-ssc docs notebooks page clean
 

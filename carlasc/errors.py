@@ -1,4 +1,4 @@
-"""The few kinds of error that a user can meet, the check for optional packages, and Ctrl-C that waits.
+"""The few kinds of error that a user can meet, numbers and names in messages, the check for optional packages, and Ctrl-C that waits.
 
 Every message is one line: what it is about (a file, a field, an argument), what was expected, what was found, what to do. Parts of it come
 from files and from other libraries: `printable` shows what a terminal would obey, and no part is longer than a few lines.
@@ -10,9 +10,10 @@ import importlib
 import os
 import re
 import signal
+import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from types import FrameType, ModuleType
 from typing import Any, Self, get_args
 
@@ -174,7 +175,7 @@ def import_extra(module: str, extra: str) -> ModuleType:
         DependencyError: the module is not installed or fails to load.
     """
     try:
-        with postponed_interrupts():
+        with nullcontext() if module in sys.modules else postponed_interrupts():
             return importlib.import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
@@ -221,3 +222,24 @@ def postponed_interrupts() -> Iterator[None]:
             handler(*caught[0])
         elif caught:
             os.kill(os.getpid(), signal.SIGINT)
+
+
+def carlasc_version() -> str:
+    """Return the version of the installed package; "unknown" if it is only found on the path."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("carlasc")
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def count(number: int, noun: str, plural: str = "") -> str:
+    """Return "1 frame", "2 frames"."""
+    return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
+
+
+def first_names(names: Iterable[str], most: int = 8) -> str:
+    """Return names separated by commas, without those after the first few."""
+    names = list(names)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -22,6 +22,8 @@ from carlasc.errors import (
     FormatError,
     MissingDataError,
     StorageError,
+    count,
+    first_names,
     import_extra,
     install_command,
     postponed_interrupts,
@@ -227,3 +229,21 @@ def test_a_program_that_is_interrupted_while_its_threads_start_ends():
         [sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=60, check=False, start_new_session=True
     )
     assert (ran.returncode, ran.stdout) == (0, "interrupted\n"), ran.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments, text",
+    [
+        ((1, "frame"), "1 frame"),
+        ((0, "frame"), "0 frames"),
+        ((12345, "file"), "12,345 files"),
+        ((2, "box", "boxes"), "2 boxes"),
+    ],
+)
+def test_a_noun_agrees_with_its_number(arguments, text):
+    assert count(*arguments) == text
+
+
+def test_names_after_the_first_few_are_counted():
+    assert first_names(["a", "b", "c"], most=2) == "a, b and 1 more"
+    assert first_names(["a", "b"], most=2) == "a, b"

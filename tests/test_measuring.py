@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from measuring import __main__ as command
 from measuring import benchmarks
-from measuring.figures import FILE, HISTORY, PAGES, ROOT, STRICT, Figure, Figures, pages, ratio, typed, within
-from measuring.places import fill, keys, typed_by_hand
+from measuring.facts import CONSTANTS, EXCEPTIONS, is_right, value_of
+from measuring.figures import FILE, PAGES, ROOT, Figure, Figures, pages, ratio, unwritten, within
+from measuring.places import commands, fill, keys, typed_by_hand
 from measuring.sizes import SIZES, by_turns
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT / "tests" / "tools")])}
@@ -28,28 +29,42 @@ def test_the_pages_show_the_figures_of_the_file() -> None:
         )
 
 
-def test_no_page_holds_a_figure_that_is_not_in_the_file() -> None:
-    others = Figures.read().others
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_number_of_a_page_has_a_command(path: Path) -> None:
+    page, new = path.relative_to(ROOT).as_posix(), unwritten(path)
+    assert not new, (
+        f"{page}: {new}: nothing writes these numbers. Name the study that makes them in their section (docs/studies/NAME.py), measure them"
+        " (tests/tools/measuring) and put them into a place, name the constant of the code (tests/tools/measuring/facts.py), or leave them out"
+    )
+
+
+def test_pages_name_studies_that_there_are() -> None:
     for path in PAGES:
-        page = path.relative_to(ROOT).as_posix()
-        new = set(typed(path)) - set(others.get(page, ()))
-        assert not new, (
-            f"{page} holds {sorted(new)}: measure it (tests/measuring) and put it into a place; if it is no figure of a machine,"
-            " run `PYTHONPATH=tests:tests/tools python -m measuring --accept`"
-        )
+        for script in commands(path.read_text()):
+            assert (ROOT / script).is_file(), f"{path}: {script}"
 
 
-def test_pages_whose_figures_are_all_measured_hold_hardly_another_number() -> None:
-    others = Figures.read().others
-    for path in STRICT:
-        assert set(others.get(path.relative_to(ROOT).as_posix(), ())) <= {"20 minutes"}  # what the size promises
+@pytest.mark.parametrize("page", CONSTANTS)
+def test_constants_of_pages_are_those_of_the_code(page: str) -> None:
+    found = typed_by_hand((ROOT / page).read_text())
+    for text, name in CONSTANTS[page].items():
+        assert text in found, f"{page} does not hold {text} any more: remove it from tests/tools/measuring/facts.py"
+        assert is_right(text, name), f"{page} says {text}, {name} is {value_of(name)}"
+
+
+def test_there_are_few_exceptions_and_all_are_on_their_pages() -> None:
+    assert len(EXCEPTIONS) <= 20
+    for (page, text), reason in EXCEPTIONS.items():
+        assert reason
+        whole = (ROOT / page).read_text()
+        assert text in whole if text.startswith("## ") else text in typed_by_hand(whole), f"{page} does not hold {text}"
 
 
 def test_every_figure_says_how_and_where_it_was_measured_and_belongs_to_what_the_pages_show() -> None:
     held = Figures.read()
     for key, figure in held.figures.items():
         assert figure.how, key
-        assert figure.run in held.runs or (figure.run == HISTORY and figure.date and figure.machine), key
+        assert figure.run in held.runs, key
     for run in held.runs.values():
         assert run.keys() >= RUN.keys()
     shown = set().union(*(keys(path.read_text()) for path in PAGES))
@@ -83,14 +98,22 @@ def test_no_place_of_a_line_begins_a_line_where_markdown_would_end_the_paragraph
     [
         ("It takes 12.5 ms, or 3 to 4 s.", ["12.5 ms", "3 to 4 s"]),
         ("16x as fast, 1,442 MB, 2.5 times", ["16x", "1,442 MB", "2.5 times"]),
-        ("a grid of 128 x 128 x 8 voxels of 0.4 m, T = 16, 20 LiDARs", []),
-        ("`--timeout 10 s` and\n```\n5 ms\n```\n", []),
+        ("IoU 0.74 instead of 0.39, 7% and 3 to 16 % called free", ["0.74", "0.39", "7%", "3 to 16 %"]),
+        ("a grid of 128 x 128 x 8 voxels of 0.25 m, T = 16, 20 LiDARs, 0.15 m or 0.5 degrees", []),
+        (
+            "| rule | IoU | false |\n|---|---:|---:|\n| tube | 0.11 ± 0.03 | 6,675 |\n| 0.4 m | **51.2 %** | 7 ms |",
+            None,
+        ),
+        ("`--timeout 10 s` and\n```\n5 ms\n```\n<!-- 3 s --> [x](1.25.md)", []),
         ("<!-- figures {a} -->7 ms<!-- figures end --> and 8 ms", ["8 ms"]),
+        (
+            "# a\n\n8 ms\n\n## b\n\n`docs/studies/movers.py` finds 7%.\n\n### c\n\n9 ms\n\n## d\n\n6 ms",
+            ["8 ms", "6 ms"],
+        ),
     ],
 )
-def test_figures_that_were_typed_are_found(text: str, found: list[str]) -> None:
-    assert typed_by_hand(text) == found
-    assert typed_by_hand(f"{text} 7 %", shares=True) == [*found, "7 %"]
+def test_numbers_that_nothing_writes_are_found(text: str, found: list[str] | None) -> None:
+    assert typed_by_hand(text) == (["0.11 ± 0.03", "51.2 %", "7 ms"] if found is None else found)
 
 
 @pytest.mark.parametrize(
@@ -126,13 +149,13 @@ def test_what_is_compared_takes_turns_and_the_least_time_counts() -> None:
 
 
 def test_a_run_replaces_what_it_measured_and_keeps_the_rest(tmp_path: Path) -> None:
-    first = Figures({}, {}, {"page.md": ["1 s"]}).updated(RUN, {"a": Figure(1.0, "s", "a"), "b": Figure(2.0, "s", "b")})
+    first = Figures({}, {}).updated(RUN, {"a": Figure(1.0, "s", "a"), "b": Figure(2.0, "s", "b")})
     second = first.updated(RUN | {"date": "2030-02-03"}, {"a": Figure(1.23456, "s", "a")})
     assert set(second.runs) == {"2030-01-02 quick", "2030-02-03 quick"}
     second.write(tmp_path / "figures.json")
     read = Figures.read(tmp_path / "figures.json")
     assert read.figures["a"] == Figure(1.235, "s", "a", run="2030-02-03 quick")
-    assert read.figures["b"].run == "2030-01-02 quick" and read.others == {"page.md": ["1 s"]}
+    assert read.figures["b"].run == "2030-01-02 quick"
     third = read.updated(RUN | {"date": "2030-02-03"}, {"b": Figure(2.0, "s", "b")})
     assert set(third.runs) == {"2030-02-03 quick"}
 
@@ -141,7 +164,7 @@ def test_a_group_that_fails_is_reported_and_keeps_its_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "figures.json"
-    Figures({}, {}, {}).updated(RUN, {"a": Figure(1.0, "s", "a"), "b": Figure(2.0, "s", "b")}).write(file)
+    Figures({}, {}).updated(RUN, {"a": Figure(1.0, "s", "a"), "b": Figure(2.0, "s", "b")}).write(file)
     answers = {"loading": ({"a": Figure(3.0, "s", "a")}, "it failed:\nValueError: too slow"), "stores": ({}, "")}
     monkeypatch.setattr(command, "_describe_run", lambda size: RUN | {"date": "2030-02-03"})
     monkeypatch.setattr(command, "_measure_in_a_process", lambda group, size: answers[group])

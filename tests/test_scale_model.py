@@ -1,6 +1,7 @@
 """The model of large runs in docs/studies/scale.md: the table is what the script prints, and the model behaves as its text says."""
 
 import importlib.util
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 @pytest.fixture(scope="module")
 def model():
-    import sys
-
+    sys.path.insert(0, str(DOCS / "studies"))
     spec = importlib.util.spec_from_file_location("scale_model", DOCS / "studies" / "scale.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

@@ -23,7 +23,7 @@ from carlasc.captures.raw import (
     times_path,
 )
 from carlasc.core.geometry import check_rigid
-from carlasc.errors import ConflictError, FormatError, MissingDataError
+from carlasc.errors import ConflictError, FormatError
 from carlasc.storage.files import has_content, parse_json, remove_stale, to_json
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.storage.transport.targets import LocalTarget, Target, target_of
@@ -178,9 +178,7 @@ class CaptureWriter:
     def _times_of(self, sensor: int) -> dict[int, str]:
         """Return the lines of a sensor's times file by frame; none if the file does not exist."""
         path = times_path(sensor)
-        try:
-            data = self.target.tree.read(path)
-        except MissingDataError:
+        if (data := self.target.read(path)) is None:
             return {}
         return {frame: line for frame, (_, line) in parse_times(data, self.target.tree.where(path)).items()}
 

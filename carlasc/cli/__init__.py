@@ -156,7 +156,7 @@ def _root(
     ] = None,
 ) -> None:
     if durable is not None:
-        from carlasc.storage.durability import set_durable
+        from carlasc.storage.files import set_durable
 
         set_durable(durable)
 

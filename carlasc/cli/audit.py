@@ -11,7 +11,7 @@ import carlasc
 from carlasc.cli.common import FAILED, FramesOption, Json, console, echo, file_option, line, place_argument, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import parse_window
-from carlasc.core.wording import count
+from carlasc.errors import count
 
 if TYPE_CHECKING:
     from carlasc.inspection import AuditResult

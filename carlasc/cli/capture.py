@@ -11,8 +11,8 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json, progress_bar
 from carlasc.cli.flags import Flags
-from carlasc.core import wording
 from carlasc.core.choices import TrafficLevel
+from carlasc.errors import count as counted
 
 OutArgument = Annotated[
     str, place_argument("Folder of the sequence, or its URL: the capture is written to OUT/raw.", "OUT")
@@ -100,7 +100,7 @@ def capture(
         print_json(result)
         return
     echo(
-        f"{result.out}: {wording.count(result.written, 'frame')} of {wording.count(result.sensors, 'LiDAR')} written,"
+        f"{result.out}: {counted(result.written, 'frame')} of {counted(result.sensors, 'LiDAR')} written,"
         f" {result.count - result.written} existed already"
         f" (CARLA {result.server_version}, {result.vehicles} vehicles, {result.walkers} pedestrians)"
     )

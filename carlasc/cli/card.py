@@ -11,8 +11,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, report_failures
 from carlasc.cli.flags import Flags, OneWorkerFlags
-from carlasc.core.wording import count
-from carlasc.errors import MissingDataError
+from carlasc.errors import MissingDataError, count
 
 
 @dataclass(frozen=True)

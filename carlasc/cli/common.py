@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from carlasc.core.wording import count
-from carlasc.errors import ArgumentError, printable
+from carlasc.errors import ArgumentError, count, printable
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -22,8 +22,7 @@ from carlasc.cli.common import (
 from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags, declared_by
 from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
 from carlasc.core.choices import Axes, FlowSource, Images, SplitName
-from carlasc.core.wording import count
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, count
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ def demo(
     ] = 20,
     seed: Annotated[int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)] = 0,
 ) -> None:
-    """Simulate two drives, for training and validation, make their ground truth in the published grids, check it, and draw it in pictures and a page. This takes a minute or two."""
+    """Simulate two drives, for training and validation, make their ground truth in the published grids, check it, and draw it in pictures and a page. This takes about a minute."""
     from carlasc.demo import demonstrate
 
     with work.spread("demo", shown=False) as run:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from carlasc.cli.common import Json, echo, file_argument, print_json, progress_bar
-from carlasc.core.wording import count
+from carlasc.errors import count
 
 
 def download(

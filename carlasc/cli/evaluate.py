@@ -26,8 +26,7 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
 from carlasc.core.choices import Around, Voxels
-from carlasc.core.wording import count
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, count
 
 if TYPE_CHECKING:
     from carlasc.metrics import Evaluation, FigureTable

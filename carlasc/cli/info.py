@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import carlasc
 from carlasc.cli.common import Json, console, line, place_argument, print_json
-from carlasc.core.wording import count
+from carlasc.errors import count
 
 if TYPE_CHECKING:
     from carlasc.inspection.overview import GridOverview, Overview, SequenceOverview

@@ -9,8 +9,7 @@ import typer
 import carlasc
 from carlasc.cli.common import FramesOption, Json, echo, place_argument, place_option, print_json
 from carlasc.cli.flags import RunFlags
-from carlasc.core.wording import count
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, count
 
 
 def label(

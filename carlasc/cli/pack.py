@@ -9,7 +9,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, console, echo, line, place_argument, print_json
 from carlasc.cli.flags import RunFlags
-from carlasc.core.wording import count
+from carlasc.errors import count
 
 
 def pack(

@@ -10,7 +10,7 @@ import carlasc
 from carlasc.cli.common import Json, echo, place_argument, place_option, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import PoseFlags
-from carlasc.core.wording import count
+from carlasc.errors import count
 
 
 def refine(

@@ -12,7 +12,7 @@ from carlasc.cli.capture import CamerasOption, OutArgument, SensorFlags, camera_
 from carlasc.cli.common import Json, console, print_frames, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import GridFlags
-from carlasc.core.wording import count as count_of  # `count` is an option
+from carlasc.errors import count as count_of  # `count` is an option
 
 
 def simulate(

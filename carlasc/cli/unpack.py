@@ -9,7 +9,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json
 from carlasc.cli.flags import RunFlags
-from carlasc.core.wording import count
+from carlasc.errors import count
 
 
 def unpack(

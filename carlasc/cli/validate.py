@@ -19,8 +19,7 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
 from carlasc.cli.grid_flags import GridFlags, WindowFlags
-from carlasc.core.wording import count
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, count
 
 if TYPE_CHECKING:
     from carlasc.inspection.findings import ValidationResult

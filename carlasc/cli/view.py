@@ -21,8 +21,7 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import Flags
 from carlasc.core.choices import PaletteName
-from carlasc.core.wording import count
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, count
 
 
 @dataclass(frozen=True)

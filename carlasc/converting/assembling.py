@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, FrameHandle, Sensor, Trajectory
 from carlasc.core.geometry import Transform, invert, transform_points
-from carlasc.core.sweeps import move_each, ticks_of
 from carlasc.errors import CarlascError, FormatError, describe
+from carlasc.motion.odometry import move_each, ticks_of
 from carlasc.storage import layout
 
 _APART_M = 0.25  # places of one sensor within a sweep that are nearer to each other count as one

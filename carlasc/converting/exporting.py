@@ -16,12 +16,21 @@ from numpy.typing import NDArray
 from carlasc import storage
 from carlasc.converting.exporter import Exported, Exporter, FrameExporter, SequenceExporter, SequenceFile
 from carlasc.converting.registry import load_exporter, read_options
-from carlasc.converting.results import ExportResult, Failure, StepCounter, check_outside
+from carlasc.converting.results import ExportResult, Failure, check_outside
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.running.processes import one_pool, run_all
-from carlasc.running.spreading import Part, Run
-from carlasc.storage.durability import make_folder, rename, sync_tree
-from carlasc.storage.files import has_content, parse_json, remove_stale, to_json, write_atomic, write_many
+from carlasc.running.spreading import Part, Run, StepCounter
+from carlasc.storage.files import (
+    has_content,
+    make_folder,
+    parse_json,
+    remove_stale,
+    rename,
+    sync_tree,
+    to_json,
+    write_atomic,
+    write_many,
+)
 
 RECORD = "carlasc-export.json"
 """The file that says what exports wrote to a folder."""

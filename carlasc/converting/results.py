@@ -1,14 +1,11 @@
-"""What a conversion or an export returns, and what both need: the counting of steps, and the check of the place that is written to."""
+"""What a conversion or an export returns, and what both need: the check of the place that is written to."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from carlasc.errors import ConflictError
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -70,33 +67,6 @@ class ExportResult:
     failures: tuple[Failure, ...]
     notes: tuple[str, ...]
     elapsed_s: float
-
-
-class StepCounter:
-    """Counts the steps of several stages for one progress callback. A stage adds its steps when it knows their number."""
-
-    def __init__(self, progress: Progress | None, total: int = 0) -> None:
-        self._progress, self._done, self._total = progress, 0, total
-
-    def expect(self, more: int) -> None:
-        """Add steps to the total."""
-        self._total += more
-
-    def __call__(self, steps: int = 1) -> None:
-        """Count finished steps, and report them."""
-        self._done += steps
-        if self._progress:
-            self._progress(self._done, self._total)
-
-    def stage(self) -> Progress:
-        """Return the progress callback of a stage that counts its own steps."""
-        before, total = self._done, self._total
-
-        def advance(done: int, of: int) -> None:
-            self._total = total + of
-            self(before + done - self._done)
-
-        return advance
 
 
 def check_outside(out: Path, source: str) -> None:

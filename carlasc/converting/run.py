@@ -18,7 +18,7 @@ from carlasc.converting.layout_options import LayoutOptions
 from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import find_recordings, open_converter
-from carlasc.converting.results import ConvertResult, Failure, StepCounter, check_outside
+from carlasc.converting.results import ConvertResult, Failure, check_outside
 from carlasc.converting.stages import Conversion
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError, check_choice
@@ -27,7 +27,7 @@ from carlasc.groundtruth.options import FromScans, GridOptions, Voting
 from carlasc.groundtruth.run import RegridResult, regrid
 from carlasc.motion.options import PoseOptions
 from carlasc.running.processes import one_pool
-from carlasc.running.spreading import Part, Run
+from carlasc.running.spreading import Part, Run, StepCounter
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.opening import as_sink
 from carlasc.storage.protocol import Sequence, Source

@@ -19,14 +19,14 @@ from carlasc.converting.layout_options import AxesAndClasses
 from carlasc.converting.motion_stage import MotionBlock, MotionJob
 from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
 from carlasc.converting.protocol import Converter, FrameHandle
-from carlasc.converting.results import Failure, StepCounter
+from carlasc.converting.results import Failure
 from carlasc.converting.scan_stage import ConvertedFrame, ScanBlock, ScanJob, StageBlock, in_blocks, write_frames
 from carlasc.converting.trajectory import estimate_poses, fill_gaps, odometry_range
 from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage.metadata import Metadata
 
 _GROUND_FRAMES = 5  # scans in which the ground is looked for

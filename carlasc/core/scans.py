@@ -13,8 +13,7 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.notebook import describe
-from carlasc.core.wording import count
-from carlasc.errors import FormatError
+from carlasc.errors import FormatError, count
 
 _TURN = 65_000  # steps of azimuth, of 0.1 mrad: they fit 16 bits
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.core.notebook import describe
-from carlasc.core.wording import count
 from carlasc.dataset.fields import ACTOR_FIELDS, ALWAYS, CAMERA_FIELDS, EVIDENCE_FIELDS, FIELDS, Sample, Values
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
 from carlasc.dataset.photographs import OF_CAMERAS, frames_with_images, read_cameras, stored_images
@@ -33,7 +32,7 @@ from carlasc.dataset.selection import (
     find_grid_name,
     find_grid_sequences,
 )
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, count
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.metadata import Axes
 from carlasc.storage.transport.caching import CachedTree

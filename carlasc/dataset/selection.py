@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.frames import compact, expand
 from carlasc.core.grids import Coordinates, GridSpec
-from carlasc.core.wording import first_names
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, first_names
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
 

@@ -118,20 +118,6 @@ class FrameData:
     actors: VoxelActors | None = None
 
 
-class RunProgress:
-    """Counts the steps of a run: scans of the passes before, and frames."""
-
-    def __init__(self, progress: Callable[[int, int], None] | None, done: int, total: int) -> None:
-        self.progress, self.done, self.total = progress, done, total
-        self(0)
-
-    def __call__(self, steps: int) -> None:
-        """Count some more steps."""
-        self.done += steps
-        if self.progress is not None:
-            self.progress(self.done, self.total)
-
-
 class FrameInput(ABC):
     """One frame of a sequence; it holds only paths and numbers.
 

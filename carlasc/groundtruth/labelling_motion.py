@@ -24,9 +24,8 @@ from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion.ground import ground_points
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.running.processes import one_pool
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.copying import counter
 from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence, sequences_with_scans
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
@@ -99,14 +98,13 @@ def label_motion(
         overwrite=overwrite,
         run=run,
     )
-    progress = run.progress or (lambda done, total: None)
     scans = sum(one.steps_before for one in inputs.values())
     files = sum(
         len(one.frames("points" if name in _WRITTEN else name))
         for one in given.values()
         for name in {name for name in one.fields() if "/" not in name} | set(_WRITTEN)
     )
-    step, moving, notes = counter(progress, scans + files), dict[str, _MovingSequence](), list[str]()
+    step, moving, notes = StepCounter(run.progress, scans + files), dict[str, _MovingSequence](), list[str]()
     with one_pool(run) as pool:
         for path, one in inputs.items():
             find_moving(one, copy.writer(path), pool, step)
@@ -116,7 +114,7 @@ def label_motion(
         if tables and any("labels" in one.fields() for one in given.values()):
             found = f"the classes {', '.join(sorted(tables))} do not tell what moves from what stands"
             notes.append(f"{found}: labels are as they were; instances and flow say what moves")
-        after = replace(pool, progress=lambda done, total: progress(scans + done, scans + total))
+        after = replace(pool, progress=step.stage(files))
         copied = copy.write(moving, after)
     return MotionResult(
         **vars(copied) | {"elapsed_s": time.perf_counter() - began},

@@ -21,9 +21,8 @@ from carlasc.motion.mounting import Mounting, find_mounting
 from carlasc.motion.options import PoseOptions
 from carlasc.motion.refinement import RefinedPoses
 from carlasc.running.processes import one_pool
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.copying import counter
 from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence, sequences_with_scans
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence, Source
@@ -100,12 +99,11 @@ def refine(
     )
     scans = sum(len(one.frames("points")) for one in given.values())
     files = sum(len(one.frames(name)) for one in given.values() for name in one.fields() if "/" not in name)
-    progress = run.progress or (lambda done, total: None)
-    step, refined = counter(progress, scans + files), dict[str, _RefinedSequence]()
+    step, refined = StepCounter(run.progress, scans + files), dict[str, _RefinedSequence]()
     with one_pool(run) as pool:
         for path, one in given.items():
             refined[path] = _refine(one, options, copy.writer(path), pool, step)
-        after = replace(pool, progress=lambda done, total: progress(scans + done, scans + total))
+        after = replace(pool, progress=step.stage(files))
         copied = copy.write(refined, after)
     return RefineResult(
         **vars(copied) | {"elapsed_s": time.perf_counter() - began},

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Generator, Iterator, Set
+from collections.abc import Iterator, Set
 from collections.abc import Sequence as Series
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, is_confident
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
-from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, RunProgress, SequenceInput
+from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput
 from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.groundtruth.seen import see_voxels
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.resuming import check_scan
 from carlasc.storage.sinks import SequenceWriter
@@ -309,8 +309,8 @@ class SequenceJob:
         found = {name: writer.read_document(name) for name in names}
         documents = {name: data for name, data in found.items() if data is not None}
         if facts:
-            classes, actors = self.inputs.metadata.classes, self.inputs.summaries()
-            poses = self.inputs.pose_facts()
+            inputs = self.inputs
+            classes, actors, poses = inputs.metadata.classes, inputs.summaries(), inputs.pose_facts()
             report = Report.make(grid, facts, self.params, classes, documents, actors=actors, poses=poses)
             writer.write_document(layout.report_file(grid), report.to_json())
 
@@ -347,7 +347,8 @@ class Work:
         self.wanted = sum(map(len, ours))
         self.skipped = sum(map(len, dealt)) - self.wanted
         passes = sum(job.inputs.steps_before for job, missing in zip(self.jobs, ours, strict=True) if missing)
-        steps = RunProgress(self.spread.progress, self.skipped, self.skipped + self.wanted + passes)
+        steps = StepCounter(self.spread.progress, self.skipped + self.wanted + passes, self.skipped)
+        steps(0)
         under_way: deque[SequenceJob] = deque()  # the job of each batch, in order
 
         def batches() -> Iterator[Batch]:
@@ -359,7 +360,7 @@ class Work:
                     yield batch
 
         made: dict[int, list[FrameResult]] = {id(job): [] for job in self.jobs}
-        with closing(self._results(batches())) as results:
+        with closing(run_all(run_batch, batches(), self.spread, lost=fail_batch)) as results:
             for job, missing in zip(self.jobs, ours, strict=True):
                 while len(made[id(job)]) < len(missing):
                     done = next(results)
@@ -375,10 +376,7 @@ class Work:
         dealt = set(self.spread.part.take(blocks))
         return [{i for i in job.numbers if (n, job.block_of(i)) in dealt} for n, job in enumerate(self.jobs)]
 
-    def _results(self, batches: Iterator[Batch]) -> Generator[list[FrameResult], None, None]:
-        return run_all(run_batch, batches, self.spread, lost=fail_batch)
-
-    def _finish(self, job: SequenceJob, made: list[FrameResult], steps: RunProgress) -> None:
+    def _finish(self, job: SequenceJob, made: list[FrameResult], steps: StepCounter) -> None:
         """Note what failed, and write the report; where other parts make frames of the sequence, the last of them writes it."""
         self.has_written |= bool(made)
         for done in made:
@@ -387,10 +385,10 @@ class Work:
         if (not made and job.is_reported) or (self.spread.part.count > 1 and job.missing()):
             return
         if not made:
-            job.inputs.prepare(job.writer, self.spread, RunProgress(None, 0, 0))
+            job.inputs.prepare(job.writer, self.spread, StepCounter(None))
         self.has_written = True
         tried = {done.task.number for done in made}
-        with closing(self._results(_batches(job, job.measure(tried)))) as results:
+        with closing(run_all(run_batch, _batches(job, job.measure(tried)), self.spread, lost=fail_batch)) as results:
             job.write_report([*made, *(done for batch in results for done in batch)])
 
 

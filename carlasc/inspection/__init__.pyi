@@ -1,5 +1,4 @@
 from .auditing.audit import audit as audit
-from .auditing.page import write_audit_page as write_audit_page
 from .auditing.verdicts import AuditFailure as AuditFailure
 from .auditing.verdicts import AuditResult as AuditResult
 from .auditing.verdicts import Verdict as Verdict
@@ -17,6 +16,7 @@ from .installation import Installation as Installation
 from .installation import doctor as doctor
 from .overview import Overview as Overview
 from .overview import info as info
+from .report_page import write_audit_page as write_audit_page
 from .report_page import write_report_page as write_report_page
 from .reports import ReportResult as ReportResult
 from .reports import report as report

@@ -21,11 +21,11 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
-from carlasc.groundtruth.inputs import GridPlan, RunProgress
+from carlasc.groundtruth.inputs import GridPlan
 from carlasc.inspection.heldout_scores import HeldOutScores
 from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
 
@@ -132,12 +132,13 @@ def holdout(
     inputs = [sequence for sequence in scan_sequences(source, plan, observe) if isinstance(sequence, ScanSequence)]
     drives = [_HeldOutDrive.of(sequence, every) for sequence in inputs]
     refining = sum(len(sequence.feed.frames) for sequence in inputs if sequence.refines)
-    steps = RunProgress(run.progress, 0, refining + sum(drive.steps for drive in drives))
+    steps = StepCounter(run.progress, refining + sum(drive.steps for drive in drives))
+    steps(0)
     for row, sequence in enumerate(inputs):
         given = sequence.feed
         sequence.refine(None, run, steps)
         if sequence.feed is not given:
-            steps.total += drives[row].steps
+            steps.expect(drives[row].steps)
             drives.append(replace(drives[row], is_used=False))
             drives[row] = _HeldOutDrive.of(sequence, every)
     tasks = [task for drive in drives for task in drive.tasks(run, steps)]

@@ -18,11 +18,18 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from carlasc.core.versions import carlasc_version
-from carlasc.errors import ArgumentError, DependencyError, StorageError, describe, import_extra, install_command
+from carlasc.errors import (
+    ArgumentError,
+    DependencyError,
+    StorageError,
+    carlasc_version,
+    describe,
+    import_extra,
+    install_command,
+)
 from carlasc.running import count_cores
 from carlasc.running.pools import ONE_THREAD
-from carlasc.storage.durability import is_durable
+from carlasc.storage.files import is_durable
 
 FOR_DEVELOPERS = ("all", "dev", "docs", "faults", "study")
 """Extras that are not listed: `all` is a set of others, and the rest is for those who work on the package."""

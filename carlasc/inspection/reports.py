@@ -13,14 +13,14 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError, MissingDa
 from carlasc.groundtruth import FrameFailure, FromScans, Voting
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
-from carlasc.groundtruth.inputs import GridPlan, RunProgress, without_caches
+from carlasc.groundtruth.inputs import GridPlan, without_caches
 from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.heldout import EVERY
 from carlasc.inspection.heldout import holdout as leave_out
 from carlasc.motion.options import MotionOptions, PoseOptions
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import write_output
 from carlasc.storage.folder import FolderSequence
@@ -118,7 +118,8 @@ _Measured = FrameFacts | FrameFailure
 
 def _measure_all(makers: list[_ReportMaker], run: Run) -> list[list[_Measured]]:
     """Return what was measured of the frames of each report."""
-    steps = RunProgress(run.progress, 0, sum(len(maker.frames) + maker.steps_before for maker in makers))
+    steps = StepCounter(run.progress, sum(len(maker.frames) + maker.steps_before for maker in makers))
+    steps(0)
     for maker in makers:
         maker.find_actors(run, steps)
     tasks = [(row, task) for row, maker in enumerate(makers) for task in maker.tasks()]

@@ -16,7 +16,7 @@ from carlasc.core.notebook import data_frame
 from carlasc.core.tables import benchmark_remap, remap_named, remaps_between, to_table
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.layout import EVALUATION
 from carlasc.storage.protocol import Sequence, Source
@@ -214,7 +214,7 @@ def stats(
         raise MissingDataError(opened.location, expected=f"labels of points or the grid {grid}", found="neither")
     classes = _common_table(tasks, opened.location)
     chosen = _choose_remap(remap, classes)
-    total, done = sum(len(frames) for _, _, frames in tasks), 0
+    step = StepCounter(run.progress, sum(len(frames) for _, _, frames in tasks))
     histograms = {path: Histogram.empty(classes) for path in sequences}
     failures: list[tuple[str, str]] = []
     count, lost = partial(_count, classes=classes), partial(_fail, classes=classes)
@@ -222,9 +222,7 @@ def stats(
     for (sequence, _, frames), (histogram, failed) in zip(tasks, counted, strict=True):
         histograms[sequence.path] += histogram
         failures += failed
-        done += len(frames)
-        if run.progress is not None:
-            run.progress(done, total)
+        step(len(frames))
     splits = {path: sequence.split or "none" for path, sequence in sequences.items()}
     return Statistics(opened.location, classes, chosen, histograms, splits, tuple(failures))
 

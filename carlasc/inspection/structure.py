@@ -83,13 +83,6 @@ def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDA
     return found
 
 
-def upright(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the structure (M, 3) of a scan without labels from its points (N, 3), metres, in the frame of the sensor."""
-    distance = np.linalg.norm(points, axis=1)
-    near = points[(distance > MIN_RANGE_M) & (distance < MAX_RANGE_M)]
-    return near[_is_upright(near)].astype(np.float64)
-
-
 def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[Any] | None:
     """Return a field of the points; None if it is missing or cannot be read, which other checks report."""
     if field not in sequence.fields():

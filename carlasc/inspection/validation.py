@@ -23,11 +23,10 @@ from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
 from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
 from carlasc.inspection.image_alignment import compare_images, judge_images
-from carlasc.inspection.pose_quality import PoseQuality, describe_mounting
+from carlasc.inspection.pose_quality import PoseQuality, check_poses, check_times, describe_mounting
 from carlasc.inspection.structure import static_structure
-from carlasc.inspection.trajectory import check_poses, check_times
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
@@ -156,16 +155,9 @@ def validate(
         raise ArgumentError("every", expected="1 or more", found=str(every))
     opened = as_source(source)
     plans = [_plan(sequence, every) for sequence in opened.sequences().values()]
-    total, done = sum(plan.steps for plan in plans), 0
+    step = StepCounter(run.progress, sum(plan.steps for plan in plans))
     findings: list[Finding] = []
     reports = []
-
-    def step(steps: int = 1) -> None:
-        nonlocal done
-        done += steps
-        if run.progress is not None:
-            run.progress(done, total)
-
     if run.is_alone:
         examined: Iterator[_Examined] = (_examine(plan, step) for plan in plans)
     else:

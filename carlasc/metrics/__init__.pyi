@@ -42,10 +42,10 @@ from .results import geometric_table as geometric_table
 from .results import semantic_table as semantic_table
 from .scoring import Scoring as Scoring
 from .temporal import Consistency as Consistency
+from .temporal import TrackingQuality as TrackingQuality
+from .temporal import TrackingScore as TrackingScore
 from .temporal import moved_grid as moved_grid
 from .temporal import shape_consistency as shape_consistency
-from .tracking import TrackingQuality as TrackingQuality
-from .tracking import TrackingScore as TrackingScore
 from .uncertainty import Reliability as Reliability
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import UncertaintyScore as UncertaintyScore

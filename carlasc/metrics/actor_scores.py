@@ -17,7 +17,7 @@ from carlasc.metrics.conventions import Convention
 from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Pair
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore
-from carlasc.metrics.tracking import TrackingQuality, TrackingScore
+from carlasc.metrics.temporal import TrackingQuality, TrackingScore
 from carlasc.storage.field_files import dense_velocity
 
 SPEEDS_M_S = (0.0, 2.0, 5.0, 10.0)

@@ -192,8 +192,7 @@ class Convention:
 
     def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.uint8]:
         lookup = self._lookups[table.name]
-        beyond = len(lookup) - 1  # the last entry is for all ids beyond those of the table
-        found = lookup[labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)]
+        found = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")  # the last entry is for all ids beyond
         if (unknown := found == _UNKNOWN).any():
             bad = int(labels[unknown][0])
             raise FormatError(

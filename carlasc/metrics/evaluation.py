@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from copy import copy
-from functools import partial
+from functools import cache, partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +26,12 @@ from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_ban
 from carlasc.metrics.results import Evaluation, FrameScore
 from carlasc.metrics.scoring import Scoring
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 
 _FrameBatch = tuple[Pair, list[int]]  # frames of one pair, which a worker scores together
-LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger]]  # of a prediction and of the truth
+_Known = Callable[[Literal["lidar", "camera"]], NDArray[np.bool_] | None]
+# Labels of a prediction and of the truth, and `known` of the truth, which is read once for all conventions.
+LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], _Known]
 _DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
 _TOGETHER = 8  # frames that a worker scores in one task
 
@@ -89,7 +92,7 @@ class Scorer:
         try:
             if isinstance(content, CarlascError):
                 raise content
-            matrix = self._score(pair, frame, *content)
+            matrix = self._score(pair, frame, content)
         except ArgumentError:
             raise  # the error is the same in every frame
         except CarlascError as error:
@@ -151,11 +154,9 @@ class Scorer:
             )
         return prediction, truth
 
-    def _score(
-        self, pair: Pair, frame: int, prediction: NDArray[np.unsignedinteger], truth: NDArray[np.unsignedinteger]
-    ) -> ConfusionMatrix:
-        tables = self.tables[pair.truth.path]
-        known, spec = self._known(pair, frame, truth.shape), pair.spec
+    def _score(self, pair: Pair, frame: int, content: LabelPair) -> ConfusionMatrix:
+        (prediction, truth, known_by), tables = content, self.tables[pair.truth.path]
+        known, spec = self._known(pair, frame, known_by, truth.shape), pair.spec
         region = None
         if self.scoring.region is not None and spec is not None:
             region = self.scoring.region(spec).reshape(truth.shape)
@@ -170,9 +171,8 @@ class Scorer:
                 for masks in self._masks(pair, frame, spec, true, known, tables[1]):
                     self.breakdown.update(pred, true, masks, counted)
                 if self.rays is not None and isinstance(pair.truth, SequenceGrid):
-                    numbers = (
-                        pair.truth.frames().tolist()
-                    )  # rays begin where the sensor was in the frames with a true grid
+                    # Rays begin where the sensor was in the frames with a true grid.
+                    numbers = pair.truth.frames().tolist()
                     poses = np.stack([pair.truth.sequence.read_pose(number) for number in numbers])
                     self.rays.update(pred, true, spec, ray_origins(poses, numbers.index(frame), spec))
         except FormatError as error:  # the message must name the side
@@ -180,11 +180,11 @@ class Scorer:
             raise error.within(f"{side.location}: frame {pair.truth.name_of(frame)}") from error
         return matrix
 
-    def _known(self, pair: Pair, frame: int, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    def _known(self, pair: Pair, frame: int, known_by: _Known, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """Return which voxels the truth evaluated; None: all of them."""
         if self.scoring.voxels == "all":
             return None
-        known = pair.truth.known(frame, self.convention.seen_by)
+        known = known_by(self.convention.seen_by)
         if known is None and self.convention.unknown == "left out":
             raise MissingDataError(
                 f"{pair.truth.location}: frame {pair.truth.name_of(frame)}",
@@ -340,7 +340,7 @@ def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, 
     """
     chosen = FrameRange.of(frames)
     frames_of = [(pair, chosen.select(pair.truth.frames()).tolist()) for pair in pairs]
-    total, done = sum(len(numbers) for _, numbers in frames_of), 0
+    total = sum(len(numbers) for _, numbers in frames_of)
     if not total:
         raise MissingDataError(
             pairs[0].truth.location, expected="labels of a frame to score", found=f"none in the range {chosen}"
@@ -349,14 +349,12 @@ def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, 
     batches = [
         (pair, numbers[first : first + size]) for pair, numbers in frames_of for first in range(0, len(numbers), size)
     ]
-    score = partial(_score_batch, scorers=scorers)
+    step, score = StepCounter(run.progress, total), partial(_score_batch, scorers=scorers)
     with closing(run_all(score, batches, run, lost=score)) as results:
         for (_, numbers), parts in zip(batches, results, strict=True):
             for scorer, part in zip(scorers, parts, strict=True):
                 scorer.merge(part)
-            done += len(numbers)
-            if run.progress is not None:
-                run.progress(done, total)
+            step(len(numbers))
 
 
 def _score_batch(batch: _FrameBatch, lost: str | None = None, *, scorers: Sequence[Scorer]) -> list[Scorer]:
@@ -381,7 +379,7 @@ def _score_batch(batch: _FrameBatch, lost: str | None = None, *, scorers: Sequen
 
 
 def _read(pair: Pair, frame: int, predicted: set[int]) -> LabelPair:
-    """Return a frame's predicted and true labels, of one shape."""
+    """Return a frame's predicted and true labels, of one shape, and what is known."""
     if frame not in predicted:
         raise MissingDataError(
             pair.prediction.location, expected=f"a prediction for frame {pair.truth.name_of(frame)}", found="none"
@@ -390,4 +388,4 @@ def _read(pair: Pair, frame: int, predicted: set[int]) -> LabelPair:
     if prediction.size != truth.size:
         where = f"{pair.prediction.location}: frame {pair.truth.name_of(frame)}"
         raise FormatError(where, expected=f"the truth's shape {truth.shape}", found=str(prediction.shape))
-    return prediction.reshape(truth.shape), truth
+    return prediction.reshape(truth.shape), truth, cache(partial(pair.truth.known, frame))

@@ -19,10 +19,8 @@ from carlasc.core.benchmarks import OCC3D, OPENOCCUPANCY
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import SEMANTICKITTI
-from carlasc.core.wording import first_names
-from carlasc.errors import FormatError, MissingDataError
-from carlasc.metrics.carlaocc import find_carlaocc
-from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid
+from carlasc.errors import FormatError, MissingDataError, first_names
+from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid, find_carlaocc
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
 from carlasc.storage.layout import identity_of

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from carlasc.core.compiling import cached
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import check_ids, ratio, to_numpy
-from carlasc.metrics.summing import Summed
+from carlasc.metrics.scoring import Summed
 
 Variant = Literal["standard", "pasco"]
 _SLOTS = 256  # of the tables of latest segments and pairs; a power of two

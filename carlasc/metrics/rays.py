@@ -19,7 +19,7 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.casting import cast_rays, cast_rays_on_device, rayiou_directions
 from carlasc.metrics.confusion import device_of, ratio, to_numpy
 from carlasc.metrics.panoptic import PanopticQuality, PanopticScore, match_segments
-from carlasc.metrics.summing import Summed
+from carlasc.metrics.scoring import Summed
 
 THRESHOLDS_M = (1.0, 2.0, 4.0)
 _MOST_ORIGINS = 8

@@ -1,9 +1,10 @@
-"""What is scored of each frame, beside the classes."""
+"""What is scored of each frame, beside the classes; and what metrics have in common that add up frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,3 +44,26 @@ class Scoring:
             raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
         if unknown := [name for name in self.by if name not in BREAKDOWNS]:
             raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
+
+
+class Summed:
+    """A metric that is made of sums."""
+
+    _SETTINGS: ClassVar[tuple[str, ...]]
+    """Names of the attributes in which metrics must be equal to be merged."""
+    _SUMS: ClassVar[tuple[str, ...]]
+    """Names of the attributes that are added."""
+
+    def merge(self, other: Self) -> Self:
+        """Add what another metric of the same settings has added up, in any order.
+
+        Raises:
+            ArgumentError: its settings differ.
+        """
+        for name in self._SETTINGS:
+            if (mine := getattr(self, name)) != (theirs := getattr(other, name)):
+                kind = type(self).__name__
+                raise ArgumentError("other", expected=f"a {kind} with {name} {mine}", found=f"one with {theirs}")
+        for name in self._SUMS:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        return self

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.metrics.confusion import check_ids, to_numpy
-from carlasc.metrics.summing import Summed
+from carlasc.metrics.scoring import Summed
 
 _BINS = 15
 _TOLERANCE = 1e-3  # largest deviation of the sum of the probabilities of a voxel from one: half precision gives 5e-4

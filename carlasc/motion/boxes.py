@@ -1,9 +1,14 @@
-"""Tracks from annotated boxes: the boxes of one object over time, smoothed, and the points of a scan that are in them."""
+"""Tracks from annotated boxes: the boxes of one object over time, smoothed, and the points of a scan that are in them.
+
+A person draws each box some centimetres and a degree off, which blurs what is merged. Boxes therefore follow the points that are in them: the
+sightings of a moving object are laid on each other, as those of actors without boxes are, but each stays near the smoothed box of its
+scan. So objects that few rays hit stay where they were drawn.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +17,9 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
 from carlasc.core.scans import Scan, finite
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent
+from carlasc.motion.paths import MIN_POINTS, best_sighting, corrections
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
-from carlasc.motion.smoothing import resample, smooth
-from carlasc.motion.solving import nearest_rotation
+from carlasc.motion.solving import nearest_rotation, resample, smooth
 from carlasc.motion.tracks import Track
 
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
@@ -266,3 +271,36 @@ def _fastest(path: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
     whole = (elapsed >= min(_HOLD_S, float(seconds[-1] - seconds[0])) - 1e-9) & (elapsed > 0)
     way = np.linalg.norm(path[then, :2] - path[:, :2], axis=1)
     return float((way[whole] / elapsed[whole]).max(initial=0.0))
+
+
+_DRAWN = np.array([0.05, 0.05, 0.03, 0.01])  # error of a smoothed box: x, y, z in metres, yaw in radians
+_MIN_SIGHTINGS = 5  # with fewer, there is nothing to lay on each other
+
+
+def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int, float]) -> Track:
+    """Return the track of an object's boxes with poses under which its sightings fit each other.
+
+    The mean of all boxes stays where it is, in the object's frame. Objects that stand, and those that change their shape, stay as they are.
+
+    Args:
+        track: the track of the boxes.
+        segments: the points in its boxes, one segment for each scan, in order of frames.
+        times: seconds by frame.
+    """
+    hit = {s.frame: s for s in segments if len(s.points) >= MIN_POINTS and track.pose(s.frame) is not None}
+    if not (track.moves and track.rigid) or len(hit) < _MIN_SIGHTINGS:
+        return track
+    rows, seconds = np.array([*hit]) - track.first, np.array([times[frame] for frame in hit])
+    points = [segment.points for segment in hit.values()]
+    poses = track.world_T_actor
+    drawn = np.column_stack([poses[rows, :3, 3], np.unwrap(np.arctan2(poses[rows, 1, 0], poses[rows, 0, 0]))])
+    change, rates = corrections(points, seconds, drawn, _DRAWN, best_sighting(points))
+    axes = np.stack([rotation_z(-yaw)[:3, :3] for yaw in drawn[:, 3].tolist()])
+    own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
+    own -= np.average(own, axis=0, weights=[len(some) for some in points])
+    every = np.arange(len(poses))
+    x, y, z, yaw = (np.interp(every, rows, own[:, axis]) for axis in range(4))
+    moved = np.stack([rotation_z(angle) for angle in yaw])
+    moved[:, :3, 3] = np.column_stack([x, y, z])
+    faster = np.column_stack([np.interp(every, rows, rates[:, axis], left=0, right=0) for axis in range(3)])
+    return replace(track, world_T_actor=multiply(poses, moved), velocity=track.velocity + faster)

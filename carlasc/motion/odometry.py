@@ -1,4 +1,7 @@
-"""Odometry: the poses of scans, estimated by KISS-ICP (Vizzo et al., RA-L 2023) through its Python API."""
+"""Odometry: the poses of scans, estimated by KISS-ICP (Vizzo et al., RA-L 2023) through its Python API, and the points of a sweep.
+
+The points of a sweep are taken one after the other, by a sensor that moves meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.cells import distinct
+from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, slerp
 from carlasc.core.scans import finite
-from carlasc.core.sweeps import move_each, ticks_of
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_points
 
@@ -182,3 +186,34 @@ def _elapsed(times: Sequence[float] | NDArray[np.floating] | None, number: int) 
         return _PERIOD_S
     number = max(1, min(number, len(times) - 1))
     return float(times[number] - times[number - 1])
+
+
+_TICK_S = 1e-4  # points of so short a time have the same pose: at 30 m/s this is 3 mm
+
+
+def ticks_of(seconds: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the (T,) different times among those of (N,) points, in seconds, rounded and increasing, and the (N,) place of each point's among them."""
+    ticks, tick_of = distinct(np.round(np.asarray(seconds, np.float64) / _TICK_S).astype(np.int64))
+    return np.asarray(ticks * _TICK_S, np.float64), tick_of
+
+
+@cached
+def move_each(
+    points: NDArray[np.floating], dst_T_then: NDArray[np.float64], tick_of: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Move each point by the transform of its time.
+
+    Args:
+        points: (N, 3 or more) metres, in the frame of the sensor at the time of each.
+        dst_T_then: (T, 4, 4) transforms.
+        tick_of: (N,) which of them is that of each point.
+
+    Returns:
+        (N, 3) metres.
+    """
+    moved = np.empty((len(points), 3))
+    for i in range(len(points)):
+        pose = dst_T_then[tick_of[i]]
+        for a in range(3):
+            moved[i, a] = pose[a, 0] * points[i, 0] + pose[a, 1] * points[i, 1] + pose[a, 2] * points[i, 2] + pose[a, 3]
+    return moved

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_points
-from carlasc.motion.planes import Planes, nearest_points
-from carlasc.motion.registration import pose_of, register
-from carlasc.motion.smoothing import resample, smooth, smooth_at
+from carlasc.motion.planes import Planes, nearest_points, pose_of, register
+from carlasc.motion.solving import fast_rows, headings_of, resample, smooth, smooth_at
 
 MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
 _MAX_ACCELERATION_M_S2 = 6.0  # hard braking, a sharp bend
@@ -28,7 +27,6 @@ _POINTS = 200  # number of points of a sighting that are compared
 _PAIRS, _APART_S = 12, 1.0  # pairs of sightings that are compared, and their distance in time
 _MAX_DISTANCE_M, _DOUBT_M = 0.5, 0.02
 _STANDING_M = 0.38  # sightings of a standing actor are closer to each other, although they show different sides of it
-_HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
 _TURN_S = 1.0  # half width of the window in which directions correct registered turns
 _MIN_TURNS = 4  # the fewest directions that do
 
@@ -135,16 +133,6 @@ def _limit_acceleration(
     return bounded
 
 
-def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated while the actor is slow."""
-    fast = _fast(velocities)
-    if not len(fast):
-        mean = velocities.mean(axis=0)
-        return np.full(len(velocities), np.arctan2(mean[1], mean[0]))
-    angles = np.unwrap(np.arctan2(velocities[fast, 1], velocities[fast, 0]))
-    return np.interp(np.arange(len(velocities)), fast, angles)
-
-
 def headings_by_turns(
     velocities: NDArray[np.float64], turns: NDArray[np.float64], seconds: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -160,16 +148,11 @@ def headings_by_turns(
     Returns:
         (F,) radians, unwrapped; those of `headings_of` if the actor is fast too seldom.
     """
-    fast, directions = _fast(velocities), headings_of(velocities)
+    fast, directions = fast_rows(velocities), headings_of(velocities)
     if len(fast) < _MIN_TURNS:
         return directions
     left = smooth((directions - turns)[fast, None], seconds[fast], np.ones(len(fast)), _TURN_S)[0][:, 0]
     return turns + np.interp(np.arange(len(velocities)), fast, left)
-
-
-def _fast(velocities: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return at which of (F, 3) velocities an actor moves fast enough to show where it points."""
-    return np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
 
 
 def follow(

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
-from carlasc.motion.paths import estimate_path, headings_of, is_standing
+from carlasc.motion.paths import estimate_path, is_standing
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
-from carlasc.motion.smoothing import resample
+from carlasc.motion.solving import headings_of, resample
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
 

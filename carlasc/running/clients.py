@@ -17,8 +17,7 @@ from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from carlasc.core.versions import carlasc_version
-from carlasc.errors import CarlascError, import_extra
+from carlasc.errors import CarlascError, carlasc_version, import_extra
 from carlasc.running.pools import ONE_THREAD, LostTaskError
 from carlasc.running.spreading import DaskClient, LazyClient
 

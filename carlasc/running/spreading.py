@@ -143,6 +143,33 @@ class Run:
         return self.executor is None and self.processes == 1
 
 
+class StepCounter:
+    """Counts the steps of a run for its progress callback. A stage adds its steps when it knows their number."""
+
+    def __init__(self, progress: Callable[[int, int], None] | None, total: int = 0, done: int = 0) -> None:
+        self._progress, self._done, self._total = progress, done, total
+
+    def expect(self, more: int) -> None:
+        """Add steps to the total."""
+        self._total += more
+
+    def __call__(self, steps: int = 1) -> None:
+        """Count finished steps, and report them; none of them reports the total."""
+        self._done += steps
+        if self._progress is not None:
+            self._progress(self._done, self._total)
+
+    def stage(self, expected: int = 0) -> Callable[[int, int], None]:
+        """Return the progress callback of a stage that counts its own steps, of which some are in the total already."""
+        before, total = self._done, self._total - expected
+
+        def advance(done: int, of: int) -> None:
+            self._total = total + of
+            self(before + done - self._done)
+
+        return advance
+
+
 def count_cores() -> int:
     """Return the number of cores that this process may use."""
     cores_of = getattr(os, "sched_getaffinity", None)  # macOS does not say which cores a process may use

@@ -1,6 +1,7 @@
 from .camera_files import cameras_of as cameras_of
 from .camera_files import read_image as read_image
 from .camera_files import scan_T_camera as scan_T_camera
+from .copying import unpack as unpack
 from .downloading import download as download
 from .folder import FolderSink as FolderSink
 from .folder import FolderSource as FolderSource
@@ -15,5 +16,4 @@ from .protocol import Source as Source
 from .sinks import SequenceWriter as SequenceWriter
 from .sinks import Sink as Sink
 from .transport.caching import Cache as Cache
-from .unpacking import unpack as unpack
 from .zarr.zarr_finish import finish as finish

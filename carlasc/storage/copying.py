@@ -1,12 +1,16 @@
-"""Copying frames from a source to a store, block by block, in any number of processes: what packing and unpacking share."""
+"""Copying frames from a source to a store, block by block, in any number of processes: what packing and unpacking share; and unpacking.
+
+Unpacking writes every sequence of a store as published files again.
+"""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from collections.abc import Sequence as Series
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
@@ -15,8 +19,12 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
+from carlasc.storage.files import unfinished
+from carlasc.storage.folder import FolderSink
+from carlasc.storage.opening import as_source
+from carlasc.storage.packed.output import put_in_place
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 from carlasc.storage.transport.targets import check_shared
@@ -62,10 +70,17 @@ def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[Fra
     return [FrameBlock(sequence, writer, blocks[number]) for number in sorted(blocks)]
 
 
-def copy_blocks(blocks: Series[FrameBlock], run: Run, step: Callable[[int], None]) -> int:
-    """Copy blocks in parallel, and return the number of files that they are; `step` is called with that of each."""
-    todo = [block for block in blocks if block.files]
-    files = 0
+def copy_blocks(blocks: Series[FrameBlock], run: Run, *, again: bool = False) -> tuple[int, int]:
+    """Copy the blocks of a part of a run in parallel; frames that exist are left as they are, except with `again`.
+
+    Returns:
+        The number of files that were written, and the number of those that were left.
+    """
+    ours = run.part.take(blocks)
+    todo = [block for block in (ours if again else [block.missing() for block in ours]) if block.files]
+    total, files = sum(block.files for block in ours), 0
+    step, left = StepCounter(run.progress, total), total - sum(block.files for block in todo)
+    step(left)
     if run.workers is None and run.executor is None:
         run = replace(run, workers=max(1, min(run.processes, len(todo) // _FEW)))
     for place in {place for block in todo for place in (block.sequence.location, block.writer.location)}:
@@ -74,7 +89,7 @@ def copy_blocks(blocks: Series[FrameBlock], run: Run, step: Callable[[int], None
         for count in copied:
             step(count)
             files += count
-    return files
+    return files, left
 
 
 def _copy(block: FrameBlock) -> int:
@@ -120,19 +135,6 @@ def typical_rows(sequence: Sequence) -> dict[str, int]:
     return found
 
 
-def counter(progress: Progress | None, total: int) -> Callable[[int], None]:
-    """Return a function that counts files, and reports the count to `progress`."""
-    done = 0
-
-    def step(files: int) -> None:
-        nonlocal done
-        done += files
-        if progress is not None and files:
-            progress(done, total)
-
-    return step
-
-
 def refuse_overlap(out: str | os.PathLike[str], source: Source) -> None:
     """Refuse to write into the source, or over it.
 
@@ -148,3 +150,83 @@ def refuse_overlap(out: str | os.PathLike[str], source: Source) -> None:
             found="one inside it or around it",
             advice="choose another path",
         )
+
+
+_BLOCK = 16  # frames that one task unpacks
+
+
+@dataclass
+class UnpackResult:
+    """What `unpack` did.
+
+    Attributes:
+        out: the folder: a path, or a URL.
+        sequences: paths of the sequences in it.
+        files: number of files written.
+        kept: number of files that an interrupted run had written.
+        elapsed_s: seconds that it took.
+    """
+
+    out: Path | str
+    sequences: list[str] = field(default_factory=list)
+    files: int = 0
+    kept: int = 0
+    elapsed_s: float = 0.0
+
+
+def unpack(
+    source: str | os.PathLike[str] | Source,
+    out: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    run: Run = Run(),  # noqa: B008 (frozen)
+) -> UnpackResult:
+    """Write all sequences of `source` as published files: for a packed store, the same bytes that were packed.
+
+    An interrupted run leaves `<out>.part`; the same call again continues with the files that are missing. In an object store, and where
+    only a part of the files is written, they are in `out` from the beginning. Processes import the main module again: call this under
+    `if __name__ == "__main__":` in scripts, or with `workers=1`.
+
+    Args:
+        source: a packed store, or anything else that `carlasc.open` takes, or a source.
+        out: the folder to write: a path, or a URL of an object store.
+        overwrite: write into a folder that exists and replace files of the same names; other files stay.
+        run: how the work is spread: by one process per core, and fewer where there are few frames, unless `workers` is given. Steps of
+            progress are files.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ConflictError: something exists at `out`, or `out` lies inside `source`.
+        FormatError, MissingDataError: a part of the source is damaged or missing.
+        StorageError: the files cannot be written: a full disk, a folder without write permission.
+    """
+    began = time.perf_counter()
+    source = as_source(source)
+    refuse_overlap(out, source)
+    result = UnpackResult(str(out) if is_url(out) else Path(out))
+    in_place = overwrite or run.part.count > 1 or not isinstance(result.out, Path)
+    if isinstance(result.out, Path) and result.out.exists() and not in_place:
+        raise ConflictError(
+            result.out,
+            expected="nothing there",
+            found="a folder" if result.out.is_dir() else "a file",
+            advice="choose another name, or give `overwrite=True`",
+        )
+    folder = result.out if in_place or not isinstance(result.out, Path) else unfinished(result.out)
+    sink, blocks = FolderSink(folder), []
+    for path, sequence in source.sequences().items():
+        result.sequences.append(path)
+        writer = sink.sequence(path)
+        if overwrite:
+            for name in sequence.documents():
+                writer.write_document(name, sequence.read_document(name))
+        else:
+            copy_documents(sequence, writer)
+        blocks += blocks_of(sequence, writer, _BLOCK)
+    result.files, result.kept = copy_blocks(blocks, run, again=overwrite)
+    if isinstance(folder, Path) and isinstance(result.out, Path) and folder != result.out:
+        put_in_place(folder, result.out, overwrite=False)
+    result.elapsed_s = time.perf_counter() - began
+    return result

@@ -21,16 +21,14 @@ from numpy.typing import NDArray
 from carlasc.errors import ConflictError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
-from carlasc.storage.copying import refuse_overlap
-from carlasc.storage.durability import make_folder, replaced, sync_all, unfinished
-from carlasc.storage.files import to_json, write_atomic
+from carlasc.storage.copying import UnpackResult, refuse_overlap, unpack
+from carlasc.storage.files import make_folder, replaced, sync_all, to_json, unfinished, write_atomic
 from carlasc.storage.folder import FolderSequence, FolderSink, FolderSource
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.packed.output import remove
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 from carlasc.storage.transport.trees import is_url
-from carlasc.storage.unpacking import UnpackResult, unpack
 from carlasc.storage.views import ChosenSequences, SequenceView
 
 _MOST_UNREAD = 64  # frames

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TypeGuard
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choice
-from carlasc.storage.durability import make_folder, remove_file
+from carlasc.running.spreading import StepCounter
 from carlasc.storage.extraction import check_space, extract_zip, extracted_size
-from carlasc.storage.files import parse_json, remove_stale, write_json, writing
+from carlasc.storage.files import make_folder, parse_json, remove_file, remove_stale, write_json, writing
 from carlasc.storage.transport.fetching import FileFetch
 
 Progress = Callable[[int, int], None]
@@ -226,15 +226,7 @@ def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float)
 
 def _extract(result: Downloaded, folder: Path, archive: Archive, keep: bool, progress: Progress | None) -> Downloaded:
     path, target = folder / archive.name, folder / archive.folder
-    total, count = extracted_size(path), 0
-
-    def advance(number: int) -> None:
-        nonlocal count
-        count += number
-        if progress is not None:
-            progress(count, total)
-
-    files = extract_zip(path, target, advance)
+    files = extract_zip(path, target, StepCounter(progress, extracted_size(path)))
     if not keep:  # record that it was extracted: the next run would fetch it again
         write_json(_record(folder, archive), {"size": path.stat().st_size, "files": files})
         with writing(path):

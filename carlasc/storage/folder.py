@@ -165,25 +165,19 @@ class FolderWriter(SequenceWriter):
 
     def create_document(self, name: str, data: bytes) -> bool:
         """Write a text file unless it exists. An empty one is replaced."""
-        if data and self._read(name) == b"":
+        if data and self.target.read(name) == b"":
             self.target.remove(name)
         return self.target.put(name, data, create=True)
 
     def read_document(self, name: str) -> bytes | None:
         """Return a text file's bytes, None if it does not exist, or is empty: a power failure can leave that, a run cannot."""
-        return self._read(name) or None
-
-    def _read(self, name: str) -> bytes | None:
-        try:
-            return bytes(self.target.tree.read(name))
-        except MissingDataError:
-            return None
+        return self.target.read(name) or None
 
 
 class WholeFiles:
     """Whether the files of frames in one `<coordinates>` folder are whole, as far as their sizes say; it can be pickled.
 
-    A power failure can leave empty and short files. Files that are written durably (see `carlasc.storage.durability`) are whole as soon as they exist.
+    A power failure can leave empty and short files. Files that are written durably (see `carlasc.storage.files`) are whole as soon as they exist.
     Others, and those of older versions, are checked by their sizes, which costs little more than to ask whether they exist.
 
     Args:

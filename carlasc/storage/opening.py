@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.running.spreading import Part
-from carlasc.storage.durability import unfinished
+from carlasc.storage.files import unfinished
 from carlasc.storage.folder import FolderSink, FolderSource
 from carlasc.storage.packed.output import TABLES_MARK, UNFINISHED_MARK, unfinished_error
 from carlasc.storage.packed.stores import PackedSink, PackOptions

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, ConflictError, StorageError
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout
 from carlasc.storage.copying import (
     FrameBlock,
@@ -24,7 +24,6 @@ from carlasc.storage.copying import (
     blocks_of,
     copy_blocks,
     copy_documents,
-    counter,
     refuse_overlap,
     typical_rows,
 )
@@ -161,11 +160,7 @@ def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) ->
         fields = {name: sequence.frames(name).tolist() for name in sequence.fields()}
         writer.expect(fields, typical_rows(sequence))
         blocks += blocks_of(sequence, writer, writer.block)
-    ours = run.part.take(blocks)
-    missing, total = [block.missing() for block in ours], sum(block.files for block in ours)
-    step = counter(run.progress, total)
-    step(total - sum(block.files for block in missing))
-    copy_blocks(missing, run, step)
+    copy_blocks(blocks, run)
     for writer in writers:
         writer.close()
     for writer in writers:
@@ -194,7 +189,7 @@ def _append(
 ) -> dict[str, int]:
     """Pack sequences one after the other, and return their published bytes by field."""
     files = sum(len(sequence.frames(name)) for sequence in sequences.values() for name in sequence.fields())
-    step = counter(progress, files)
+    step = StepCounter(progress, files)
     published: Counter[str] = Counter()
     for path, sequence in sequences.items():
         finished = sink.finished(path)

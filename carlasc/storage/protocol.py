@@ -24,8 +24,7 @@ from carlasc.core.grids import Coordinates, Grid, GridSpec
 from carlasc.core.notebook import describe
 from carlasc.core.scans import Scan
 from carlasc.core.tables import table_from_json
-from carlasc.core.wording import first_names
-from carlasc.errors import FormatError, MissingDataError, MissingKeyError
+from carlasc.errors import FormatError, MissingDataError, MissingKeyError, first_names
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
 from carlasc.storage.metadata import Metadata, check_format

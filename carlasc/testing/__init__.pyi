@@ -3,9 +3,9 @@ from .contracts import SourceContract as SourceContract
 from .converters import ConverterContract as ConverterContract
 from .data import published_bytes as published_bytes
 from .data import write_dataset as write_dataset
+from .data import wrong_labels as wrong_labels
+from .data import wrong_poses as wrong_poses
 from .drives import KINDS as KINDS
 from .drives import DriveScan as DriveScan
 from .drives import SimulatedDrive as SimulatedDrive
 from .drives import Thing as Thing
-from .mistakes import wrong_labels as wrong_labels
-from .mistakes import wrong_poses as wrong_poses

@@ -17,8 +17,7 @@ from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.core.tables import TABLES, remaps_between, to_table
-from carlasc.core.wording import first_names
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, first_names
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.folder import FolderSequence
 
@@ -315,5 +314,5 @@ class RemappedSequence:
 
 def without_invalid_points(scan: Scan) -> Scan:
     """Return a scan without the points that have a coordinate that is NaN or infinite."""
-    finite = np.asarray(np.isfinite(scan.points).all(axis=1))
-    return scan if finite.all() else scan.select(finite)
+    finite = np.isfinite(scan.points)
+    return scan if finite.all() else scan.select(np.asarray(finite.all(axis=1)))

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import overload
 
 from carlasc.errors import ArgumentError
+from carlasc.running.spreading import StepCounter
 from carlasc.storage.files import write_output
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.page.page import PAGES, write_page
@@ -82,12 +83,11 @@ def _write(
     max_points: int | None,
     progress: Callable[[int, int], None] | None,
 ) -> None:
-    writer = _WRITERS[ending.lower()](path, reader)
+    writer, step = _WRITERS[ending.lower()](path, reader), StepCounter(progress, len(reader.frames))
     try:
-        for done, frame in enumerate(record_frames(reader, max_points), 1):
+        for frame in record_frames(reader, max_points):
             writer.write(frame)
-            if progress is not None:
-                progress(done, len(reader.frames))
+            step()
     except BaseException:
         with suppress(OSError):  # what went wrong first is reported
             writer.close()

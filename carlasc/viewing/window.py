@@ -19,8 +19,7 @@ from carlasc.errors import DependencyError
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc.viewing import colors as palette
 from carlasc.viewing.colors import Entry
-from carlasc.viewing.open3d_loading import PAGE_ADVICE, import_open3d
-from carlasc.viewing.open3d_shapes import Shapes
+from carlasc.viewing.open3d_shapes import PAGE_ADVICE, Shapes, import_open3d
 from carlasc.viewing.rendering.actor_boxes import box_lines
 from carlasc.viewing.rendering.drawings import ego_vehicle, grid_extent, motion_arrows, scan_extent
 from carlasc.viewing.rendering.meshes import arrows, grid_mesh

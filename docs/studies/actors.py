@@ -9,22 +9,18 @@ An actor that is reported is right if more than half of its points, over all sca
 reported actor holds more than half of its points. Precision is the share of reported actors that are right, recall that of movers
 that are found. Rows are added up over the drives. No criterion is a limit on height; the rows "no confidence" show what the
 criteria of the confidence change, because all actors are reported then.
-
-    --quick     one drive of each world, 32 channels
 """
 
 from __future__ import annotations
 
-import argparse
-import tempfile
+from argparse import Namespace
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from movers_drives import MOVES_M_S, Recorded, record
-from movers_rows import Changed, NoisyPoses
+import study
+from movers_drives import MOVES_M_S, SEEDS, Recorded, record
+from movers_rows import BARE, NoisyPoses, Only
 from numpy.typing import NDArray
 
 from carlasc.groundtruth import FromScans
@@ -34,23 +30,10 @@ from carlasc.motion import MotionOptions, movers
 from carlasc.motion.tracks import Track, is_doubtful
 from carlasc.storage import Sequence
 
-SEEDS = {"town": range(61, 66), "street": range(261, 266), "railed": range(361, 366)}
 MANY_CHANNELS = 2  # drives of each world, with 16 and 64 channels
 OBSERVE = FromScans(motion=MotionOptions("evidence"), own_path=False)
 POSES = {"exact": (0.0, 0.0), "2 cm, 0.1 degrees": (0.02, 0.1)}
 MANY_POINTS, SCANS = 50, 2
-
-
-class Bare(Changed):
-    """A sequence of which only points and poses are known."""
-
-    def fields(self) -> frozenset[str]:
-        """Return the only field."""
-        return frozenset({"points"})
-
-    def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames that have a field."""
-        return super().frames(field) if field in self.fields() else np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -130,32 +113,26 @@ class Truth:
 
 def find(drive: Recorded, errors: tuple[float, float]) -> list[Track]:
     """Return the moving actors that are found without labels, under poses with errors in metres and degrees."""
-    bare: Sequence = Bare(drive.sequence)
+    bare: Sequence = Only(drive.sequence, BARE)
     if any(errors):
         bare = bare.with_poses(NoisyPoses(*errors)(drive, 0).poses)
     return list(find_actors(ScanFeed(bare, OBSERVE)).tracks.values())
 
 
-def drives(work: Path, seeds: Mapping[str, Any], *, quick: bool) -> Iterator[tuple[str, int, Recorded]]:
+def drives(given: Namespace) -> Iterator[tuple[str, int, Recorded]]:
     """Yield the world, the channels and the drive of each recording."""
-    for world, own in seeds.items():
-        for number, seed in enumerate(own):
-            channels = [32] if quick or number >= MANY_CHANNELS else [32, 16, 64]
-            if not quick or number == 0:
-                for count, drive in zip(channels, record(world, seed, channels, work), strict=True):
-                    yield world, count, drive
+    for world, seed in study.drives(given, SEEDS):
+        channels = study.few([32, 16, 64] if seed in getattr(given, world)[:MANY_CHANNELS] else [32])
+        for count, drive in zip(channels, record(world, seed, channels, given.work), strict=True):
+            yield world, count, drive
 
 
 def main() -> None:
     """Find the actors of all drives, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("work", nargs="?", type=Path)
-    parser.add_argument("--quick", action="store_true")
-    arguments = parser.parse_args()
     least = movers._LEAST_CONFIDENCE
     rows: dict[tuple[str, int, str], Counts] = {}
-    with tempfile.TemporaryDirectory() as temporary:
-        for world, channels, drive in drives(arguments.work or Path(temporary), SEEDS, quick=arguments.quick):
+    with study.begin(study.options(__doc__, SEEDS)) as given:
+        for world, channels, drive in drives(given):
             truth = Truth.of(drive.sequence)
             for rule, confidence in (("", least), (", no confidence", 0.0)):
                 movers._LEAST_CONFIDENCE = confidence

@@ -6,11 +6,11 @@ of CarlaSC, with the memory of the process that holds the scheduler.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 
 import psutil
+import study
 
 from carlasc import Run
 from carlasc.running import Engine, open_cluster, run_all
@@ -26,8 +26,8 @@ def do_nothing(frame: int) -> int:
 
 def measure_overhead(workers: int, frames: int) -> tuple[str, str]:
     """Return the times per frame without work: in processes of our own, and on a cluster."""
-    with one_pool(max(workers, 2), None) as pool:
-        own = _time(pool, workers, frames)
+    with one_pool(Run(workers=max(workers, 2))) as pool:
+        own = _time(pool.executor, workers, frames)
     with open_cluster(f"local:{workers}") as cluster:
         return own, _time(cluster, workers, frames)
 
@@ -67,16 +67,14 @@ def measure_whole(workers: int, frames: int) -> None:
 
 def main() -> None:
     """Measure everything."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--frames", type=int, default=FRAMES_OF_CARLASC)
-    arguments = parser.parse_args()
-    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    for workers in (1, 2):
-        own, cluster = measure_overhead(workers, 1000)
-        print(f"{workers} workers: {own} in processes of our own, {cluster} on a cluster", flush=True)
-    if arguments.frames:
-        print(f"{arguments.frames} frames on 2 workers:")
-        measure_whole(2, arguments.frames)
+    with study.begin(study.options(__doc__)):
+        print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+        for workers in study.few((1, 2)):
+            own, cluster = measure_overhead(workers, 100 if study.is_tiny() else 1000)
+            print(f"{workers} workers: {own} in processes of our own, {cluster} on a cluster", flush=True)
+        frames = 80 if study.is_tiny() else FRAMES_OF_CARLASC
+        print(f"{frames} frames on 2 workers:")
+        measure_whole(2, frames)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How true is the flow that `carlasc convert kitti` estimates? `python docs/studies/flow.py [SEED ...]` prints the table.
+"""How true is the flow that `carlasc convert kitti` estimates? `python docs/studies/flow.py --town 4 5 6 7 8 9` prints the table.
 
 Simulated drives in heavy traffic are written as SemanticKITTI's files, which have no flow, and converted; the velocity that each sighting of a moving
 actor was given is compared with the simulator's.
@@ -7,15 +7,14 @@ actor was given is compared with the simulator's.
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
-from clock import Clock
+import study
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc.captures import TownDrive
+from carlasc.captures import Lidar, TownDrive
 from carlasc.converting import LayoutOptions, convert
 from carlasc.core.tables import CARLA
 from carlasc.running import Run
@@ -23,7 +22,7 @@ from carlasc.running import Run
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.datasets.kitti import write_kitti
 
-FRAMES = range(20, 100)
+SEEDS, FRAMES = {"town": range(4, 10)}, range(20, 100)
 MIRROR = np.array([1, -1, 1])
 VEHICLE, PEDESTRIAN = (float(CARLA.id_of(name)) for name in ("Vehicle", "Pedestrian"))
 ROWS = {  # name: class, speeds in m/s, numbers of points
@@ -34,36 +33,37 @@ ROWS = {  # name: class, speeds in m/s, numbers of points
 }
 
 
-def compare(seed: int) -> NDArray[np.float64]:
+def compare(seed: int, root: Path) -> NDArray[np.float64]:
     """Return (S, 4) of a drive's sightings of moving actors: class, true speed, number of points, end-point error."""
-    drive, found = TownDrive(seed, "heavy"), []
-    with tempfile.TemporaryDirectory() as place:
-        root = Path(place)
-        truth = write_kitti(root / "in", drive, FRAMES, voxels_every=0)
-        convert("kitti", root / "in", root / "out", layout=LayoutOptions("carla"), grids=None, run=Run(workers=2))
-        (sequence,) = carlasc.open(root / "out").sequences().values()
-        for number in truth.frames:
-            scan, flow = sequence.scan(number), truth.flow[number] * MIRROR
-            assert scan.flow is not None and scan.labels is not None and scan.instances is not None
-            for actor in np.unique(scan.instances[np.abs(flow).max(axis=1) > 0]).tolist():
-                own = np.flatnonzero(scan.instances == actor)
-                error = np.linalg.norm(scan.flow[own[0]] - flow[own[0]])
-                found.append((scan.labels[own[0]], np.linalg.norm(flow[own[0]]), len(own), error))
+    lidar = Lidar(points=8_000) if study.is_tiny() else Lidar()
+    drive, found = TownDrive(seed, "heavy", lidar), []
+    truth = write_kitti(root / "in", drive, study.few(FRAMES, 8), voxels_every=0)
+    convert("kitti", root / "in", root / "out", layout=LayoutOptions("carla"), grids=None, run=Run(workers=1))
+    (sequence,) = carlasc.open(root / "out").sequences().values()
+    for number in truth.frames:
+        scan, flow = sequence.scan(number), truth.flow[number] * MIRROR
+        assert scan.flow is not None and scan.labels is not None and scan.instances is not None
+        for actor in np.unique(scan.instances[np.abs(flow).max(axis=1) > 0]).tolist():
+            own = np.flatnonzero(scan.instances == actor)
+            error = np.linalg.norm(scan.flow[own[0]] - flow[own[0]])
+            found.append((scan.labels[own[0]], np.linalg.norm(flow[own[0]]), len(own), error))
     return np.array(found, np.float64)
 
 
-def main(seeds: list[int]) -> None:
+def main() -> None:
     """Compare the drives one after the other, and print the table."""
-    clock, drives = Clock(), []
-    for seed in seeds:
-        drives.append(compare(seed))
-        clock(f"drive {seed}")
+    clock, drives = study.Clock(), []
+    with study.begin(study.options(__doc__, SEEDS)) as given:
+        for seed in study.few(given.town):
+            drives.append(compare(seed, given.work / str(seed)))
+            clock(f"drive {seed}")
     label, speed, points, error = np.concatenate(drives).T
-    print("| | median | 3 of 4 below | sightings |", "|---|---:|---:|---:|", sep="\n")
+    print("| | median | 75th percentile | observations |", "|---|---:|---:|---:|", sep="\n")
     for name, (wanted, (slowest, fastest), (fewest, most)) in ROWS.items():
         own = error[(label == wanted) & (speed >= slowest) & (speed < fastest) & (points >= fewest) & (points <= most)]
-        print(f"| {name} | {np.median(own):.3f} | {np.quantile(own, 0.75):.3f} | {len(own)} |")
+        middle, high = np.quantile(own, (0.5, 0.75)) if len(own) else (np.nan, np.nan)
+        print(f"| {name} | {middle:.3f} | {high:.3f} | {len(own)} |")
 
 
 if __name__ == "__main__":
-    main([int(seed) for seed in sys.argv[1:]] or [1, 2])
+    main()

@@ -1,4 +1,4 @@
-"""Study: how well is the ground found without labels? `python docs/studies/ground.py [SEED ...]` prints the table of docs/studies/ground.md.
+"""Study: how well is the ground found without labels? `python docs/studies/ground.py` prints the table of docs/studies/ground.md.
 
 The scans are those of simulated towns with heavy traffic, whose labels are the truth: roads, pavements, markings and terrain are ground. If
 the package `pypatchworkpp` (BSD-2-Clause) is installed, the same scans are given to Patchwork++, with its defaults and the height of the sensor.
@@ -6,14 +6,13 @@ the package `pypatchworkpp` (BSD-2-Clause) is installed, the same scans are give
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 
 import numpy as np
-from clock import Clock
+import study
 from numpy.typing import NDArray
 
 from carlasc.captures import Lidar, TownDrive
@@ -22,7 +21,7 @@ from carlasc.core.geometry import Transform, invert, transform_points, translati
 from carlasc.core.tables import CARLA
 from carlasc.motion.ground import ground_height, ground_points
 
-SEEDS = (61, 62, 63, 64, 65)
+SEEDS = {"town": range(61, 66)}
 FRAMES = (0, 40, 80)
 RAYS = {16: 29_000, 32: 65_000, 64: 130_000}  # per scan, by channels
 HEIGHT_M = 1.8
@@ -80,9 +79,9 @@ class Found:
 
 def scans(case: Case, seed: int) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
     """Yield (N, 3) points in the frame of the first sensor, and (N,) which of them are ground."""
-    lidar = Lidar(case.channels, RAYS[case.channels])
+    lidar = Lidar(case.channels, RAYS[case.channels] // (4 if study.is_tiny() else 1))
     drive = TownDrive(seed, "heavy", lidar)
-    for frame in FRAMES:
+    for frame in study.few(FRAMES):
         rng = np.random.default_rng([seed, frame, case.channels])
         poses = [drive.ego_pose(frame) @ _mount(*mount) for mount in case.mounts]
         recordings = [scan_snapshot(drive.snapshot(frame), pose, lidar, rng) for pose in poses]
@@ -131,14 +130,20 @@ def rate(found: list[Found], truths: list[NDArray[np.bool_]], height_m: float) -
     return f"{both / ground.sum():.1%} | {both / truth.sum():.1%} | {error:.2f} m | {elapsed:.0f} ms"
 
 
-def main(seeds: tuple[int, ...]) -> None:
+def main() -> None:
     """Print the table."""
+    with study.begin(study.options(__doc__, SEEDS)) as given:
+        show(study.few(given.town))
+
+
+def show(seeds: list[int]) -> None:
+    """Print the table of some drives."""
     methods = {"ours": ours} | ({"Patchwork++": patchwork} if find_spec("pypatchworkpp") else {})
     columns = " | ".join(f"{name}: precision | recall | height | time" for name in methods)
     print(f"| scans | {columns} |\n|---|{'---:|' * 4 * len(methods)}", flush=True)
-    clock = Clock()
+    clock = study.Clock()
     ours(np.zeros((1, 3), np.float32), 0.0)  # compile
-    for case in CASES:
+    for case in study.few(CASES, 2):
         taken = [scan for seed in seeds for scan in scans(case, seed)]
         height = case.mounts[0][2]
         rows = (rate([m(p, height) for p, _ in taken], [truth for _, truth in taken], height) for m in methods.values())
@@ -157,4 +162,4 @@ def _mount(x: float, y: float, height: float, roll_deg: float, pitch_deg: float)
 
 
 if __name__ == "__main__":
-    main(tuple(int(seed) for seed in sys.argv[1:]) or SEEDS)
+    main()

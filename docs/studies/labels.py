@@ -2,19 +2,15 @@
 
 The labels of the drives of `movers.py` are made wrong in several ways, and their grids are compared with what 40 other sensors saw at the same instant.
 WORK keeps drives and references, as that of `movers.py` does.
-
-    --town, --street SEED ...   other drives (61 to 65 and 261 to 265)
-    --hint flow|evidence        what tells how things move (flow)
+`--hint evidence` takes nothing but free space for what moves, instead of the exact flow.
 """
 
 from __future__ import annotations
 
-import argparse
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
+import study
 from movers import SEEDS
 from movers_drives import GRIDS, Recorded, Reference, record, reference
 from movers_rows import EVIDENCE, FLOW, Changed
@@ -143,22 +139,15 @@ def judge(drive: Recorded, references: dict[int, Reference], case: str, observe:
 
 def main() -> None:
     """Print the rows of each drive, and the means."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("work", nargs="?", type=Path)
+    parser = study.options(__doc__, SEEDS)
     parser.add_argument("--hint", choices=("flow", "evidence"), default="flow")
-    for kind, seeds in SEEDS.items():
-        parser.add_argument(f"--{kind}", nargs="*", type=int, default=seeds)
-    given = parser.parse_args()
     found: dict[str, list[dict[str, float]]] = {case: [] for case in CASES}
-    with tempfile.TemporaryDirectory() as temporary:
-        work = given.work or Path(temporary)
-        for kind, seed in [(world, number) for world in SEEDS for number in getattr(given, world)]:
-            (drive,) = record(kind, seed, [32], work)
-            references = {
-                frame: seen for (grid, frame), seen in reference(kind, seed, work).items() if grid == "coarse"
-            }
+    with study.begin(parser) as given:
+        for kind, seed in study.drives(given, SEEDS):
+            (drive,) = record(kind, seed, [32], given.work)
+            seen = {frame: one for (grid, frame), one in reference(kind, seed, given.work).items() if grid == "coarse"}
             for case, rows in found.items():
-                rows.append(judge(drive, references, case, FLOW if given.hint == "flow" else EVIDENCE))
+                rows.append(judge(drive, seen, case, FLOW if given.hint == "flow" else EVIDENCE))
                 print(kind, seed, case, " ".join(f"{k} {v:.3f}" for k, v in rows[-1].items()), flush=True)
     names = list(found["right"][0])
     print(f"\n| labels | {' | '.join(names)} |\n|---|{'---:|' * len(names)}")

@@ -1,4 +1,4 @@
-"""Who makes ground truth how well, and does an audit by held-out rays alone say so? `python docs/studies/makers.py [SEED...]`.
+"""Who makes ground truth how well, and does an audit by held-out rays alone say so? `python docs/studies/makers.py`.
 
 Simulated drives of moving actors. Every 5th scan is left out of every maker, and the makers' grids at the frames of some of these scans are
 scored twice: by the held-out rays (the formula S of docs/studies/makers.md) and by a reference of 40 sensors (truth: the mean of the IoU of
@@ -12,16 +12,14 @@ completion by Poisson's method is left out; boxes are the tracks of the instance
 from __future__ import annotations
 
 import importlib
-import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
-from clock import Clock
+import study
 
 import carlasc
 from carlasc import FromScans, Grid, GridSpec, Run, Voting
@@ -39,14 +37,8 @@ from carlasc.metrics import score_truth
 from carlasc.motion import MotionOptions
 from carlasc.storage.views import SequenceView
 
-SEEDS, FRAMES, FIRST, EVERY, WINDOW, SENSORS = (
-    (61, 62, 63, 64, 65),
-    41,
-    30,
-    5,
-    (-10, 10),
-    40,
-)  # the formula was chosen on 51 to 54
+SEEDS = {"town": range(61, 66)}  # the formula was chosen on 51 to 54
+FRAMES, FIRST, EVERY, WINDOW, SENSORS = 41, 30, 5, (-10, 10), 40
 JUDGED = (12, 17, 22, 27)
 SPEC, LIDAR = GridSpec.published(), Lidar(channels=32, points=30_000)
 Maker = Callable[["Drive"], dict[int, Grid]]
@@ -60,13 +52,18 @@ class Drive:
     hidden: tuple[int, ...]
 
     @property
+    def frames(self) -> list[int]:
+        """The frames of the drive."""
+        return self.whole.frames("points").tolist()
+
+    @property
     def scans(self) -> WithoutScans:
         """The scans that makers may use."""
         return WithoutScans(self.whole, self.hidden)
 
     def window(self, frame: int) -> list[int]:
         """Return the frames whose scans a maker may merge into a frame."""
-        return [f for f in range(frame + WINDOW[0], frame + WINDOW[1] + 1) if 0 <= f < FRAMES and f not in self.hidden]
+        return [f for f in range(frame + WINDOW[0], frame + WINDOW[1] + 1) if f in self.frames and f not in self.hidden]
 
 
 class Cleaned(SequenceView):
@@ -93,12 +90,12 @@ def merge(scans: carlasc.storage.Sequence, observe: FromScans) -> dict[int, Grid
     feed = ScanFeed(scans, observe)
     plan = GridPlan(SPEC, "evaluation", observe, Voting(), FrameRange.of(None))
     actors = find_actors(feed)
-    return {f: merge_frame(plan, feed, actors, f, feed.reaching(f, SPEC)).grid for f in JUDGED}
+    return {f: merge_frame(plan, feed, actors, f, feed.reaching(f, SPEC)).grid for f in study.few(JUDGED)}
 
 
 def in_world(drive: Drive) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Return (N, 3) points and (4, 4) pose of each scan that is left, by frame."""
-    poses = {f: drive.whole.read_pose(f) for f in range(FRAMES) if f not in drive.hidden}
+    poses = {f: drive.whole.read_pose(f) for f in drive.frames if f not in drive.hidden}
     return {f: (transform_points(pose, drive.whole.scan(f, ()).points), pose) for f, pose in poses.items()}
 
 
@@ -128,7 +125,7 @@ def removal(drive: Drive) -> dict[int, Grid]:
 def octomap(drive: Drive) -> dict[int, Grid]:
     """Return the occupancy of OctoMap, with the most frequent class of the points in each voxel."""
     library, scans, grids = importlib.import_module("pyoctomap"), in_world(drive), {}
-    for frame in JUDGED:
+    for frame in study.few(JUDGED):
         tree, grid_T_world = library.OcTree(float(SPEC.voxel_size[0])), invert(drive.whole.read_pose(frame))
         for other in drive.window(frame):
             points, pose = scans[other]
@@ -147,7 +144,7 @@ def surroundocc(drive: Drive) -> dict[int, Grid]:
     """Return stacked points, those of objects in their boxes."""
     scans, grids = in_world(drive), {}
     tracks = find_actors(ScanFeed(drive.scans, FromScans(motion=MotionOptions("instances")))).tracks.values()
-    for frame in JUDGED:
+    for frame in study.few(JUDGED):
         placed = {}
         for other in drive.window(frame):
             points = scans[other][0].copy()
@@ -231,57 +228,60 @@ def kendall(one: list[float], other: list[float]) -> float:
     return float(sum(a * b for a, b in pairs) / norm)
 
 
-def main(seeds: tuple[int, ...]) -> None:
+def main() -> None:
     """Make, score and print."""
-    clock, usable, rows = Clock(), {}, {}
-    for name, (module, maker) in MAKERS.items():
-        try:
-            if module is not None:
-                importlib.import_module(module)
-            usable[name] = maker
-        except ImportError:
-            print(f"{name}: skipped, {module} is not installed")
-    for seed in seeds:
-        with tempfile.TemporaryDirectory() as folder:
-            place = Path(folder) / "town"
+    clock, rows = study.Clock(), {}
+    usable = {name: maker for name, (module, maker) in MAKERS.items() if module is None or find_spec(module)}
+    print("not installed:", ", ".join(name for name in MAKERS if name not in usable) or "nothing")
+    with study.begin(study.options(__doc__, SEEDS)) as given:
+        for seed in study.few(given.town):
+            place = given.work / f"town{seed}"
+            lidar = Lidar(channels=32, points=4_000) if study.is_tiny() else LIDAR
             capture = SimulatedCapture(
-                count=FRAMES, first_frame=FIRST, sensors=1, seed=seed, traffic="heavy", lidar=LIDAR, bev=False
+                count=18 if study.is_tiny() else FRAMES,
+                first_frame=FIRST,
+                sensors=1,
+                seed=seed,
+                traffic="heavy",
+                lidar=lidar,
+                bev=False,
             )
             carlasc.regrid(capture, SPEC, place, run=Run(workers=1))
-            town, whole = TownDrive(seed, "heavy", LIDAR), next(iter(carlasc.open(place).values()))
-            drive = Drive(whole, tuple(range(EVERY // 2, FRAMES, EVERY)))
+            whole = next(iter(carlasc.open(place).values()))
+            drive = Drive(whole, tuple(f for f in whole.frames("points").tolist() if f % EVERY == EVERY // 2))
             made, seconds = {}, {}
             for name, maker in usable.items():
                 start = time.process_time()
                 made[name] = maker(drive)
-                seconds[name] = (time.process_time() - start) / len(JUDGED)
+                seconds[name] = (time.process_time() - start) / len(made[name])
                 clock(f"seed {seed}: {name}")
+            references = see(TownDrive(seed, "heavy", lidar))
             scores = {name: held_out(drive, grids) for name, grids in made.items()}
-            references = {}
-            for frame in JUDGED:
-                grid_T_world = invert(town.sensor_poses(FIRST + frame, 1)[0])
-                seen = town.reference_observations(FIRST + frame, SENSORS)
-                observed = [Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in seen]
-                references[frame] = count_votes(observed, SPEC, CARLA).to_grid()
             truths = {name: truth_of(grids, references) for name, grids in made.items()}
             rows[seed] = (scores, truths, seconds)
-            tau = kendall(list(scores.values()), list(truths.values()))
-            print(f"seed {seed}: tau {tau:.2f}; " + ", ".join(f"{n} {scores[n]:.3f}/{truths[n]:.3f}" for n in usable))
             clock(f"seed {seed}")
     show(rows)
 
 
+def see(town: TownDrive) -> dict[int, Grid]:
+    """Return what other sensors see at the judged frames."""
+    references = {}
+    for frame in study.few(JUDGED):
+        grid_T_world = invert(town.sensor_poses(FIRST + frame, 1)[0])
+        seen = town.reference_observations(FIRST + frame, 3 if study.is_tiny() else SENSORS)
+        observed = [Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in seen]
+        references[frame] = count_votes(observed, SPEC, CARLA).to_grid()
+    return references
+
+
 def show(rows: dict[int, tuple[dict[str, float], dict[str, float], dict[str, float]]]) -> None:
     """Print S, truth and seconds of each maker over drives, and the agreement of the orders of S and truth."""
-    print(f"\n{'maker':30s} {'S':>6s} {'95 %':>15s} {'truth':>6s} {'95 %':>15s} {'CPU s per frame':>16s}")
+    print("\n| maker | S | truth | CPU s per frame |\n|---|---:|---:|---:|")
     for name in next(iter(rows.values()))[0]:
-        cells = []
-        for part in (0, 1):
-            values = np.array([row[part][name] for row in rows.values()])
-            draws = np.random.default_rng(0).choice(values, (1000, len(values))).mean(axis=1)
-            low, high = np.quantile(draws, (0.025, 0.975))
-            cells.append(f"{values.mean():6.3f} {f'{low:.3f} to {high:.3f}':>15s}")
-        print(f"{name:30s} {' '.join(cells)} {np.mean([row[2][name] for row in rows.values()]):16.2f}")
+        scores, truths, seconds = ([row[part][name] for row in rows.values()] for part in range(3))
+        print(
+            f"| {name} | {study.interval(scores, '.3f')} | {study.interval(truths, '.3f')} | {np.mean(seconds):.2f} |"
+        )
     taus = [kendall(list(scores.values()), list(truths.values())) for scores, truths, _ in rows.values()]
     print(
         f"\nKendall's tau: {np.mean(taus):.2f} in the mean of {len(taus)} drives ({min(taus):.2f} to {max(taus):.2f})"
@@ -289,4 +289,4 @@ def show(rows: dict[int, tuple[dict[str, float], dict[str, float], dict[str, flo
 
 
 if __name__ == "__main__":
-    main(tuple(map(int, sys.argv[1:])) or SEEDS)
+    main()

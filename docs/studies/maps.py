@@ -1,11 +1,10 @@
 """Are maps of drives clean? `python docs/studies/maps.py [WORK]` prints SA, DA and AA of maps by `carlasc map`, and of other programs.
 
+`--draw MAP.npz` draws such a map instead: docs/images/map.png and map_all.png are drives of the street with `--motion flow` and `none`.
+
 The measures are those of DynamicMap_Benchmark (Q. Zhang et al., ITSC 2023), by points: SA is the share of the static points within 5 cm of a point of
 the map, DA the share of the dynamic ones without such a point, AA the square root of their product. A point is dynamic if its actor
 moves faster than 1 m/s at any time of the drive. Drives are those of `movers.py`: WORK keeps them, and results; the default is a temporary folder.
-
-    --town, --street SEED ...   drives (61, 62 and 261, 262)
-    --rows NAME ...             only these rows
 
 The rows of other programs need `pip install dufomap dynamic-object-removal` (DUFOMap: Python 3.12 or older); rows without them are left out.
 The row of dynamic-object-removal takes five minutes of CPU time per drive, the others less than one.
@@ -13,9 +12,7 @@ The row of dynamic-object-removal takes five minutes of CPU time per drive, the 
 
 from __future__ import annotations
 
-import argparse
 import json
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,34 +21,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import study
 from movers_drives import MOVES_M_S, Recorded, record
-from movers_rows import Changed, find_static, noisy_boxes
+from movers_rows import BARE, Changed, Only, find_static, noisy_boxes
 from numpy.typing import NDArray
+from PIL import Image
 
 import carlasc
 from carlasc import Run
 from carlasc.core.geometry import transform_points
+from carlasc.core.tables import CARLA
 from carlasc.motion import MotionOptions, PoseOptions
 from carlasc.storage import Sequence
-from carlasc.storage.views import ChosenSequences, SequenceView
+from carlasc.storage.views import ChosenSequences
 
 CELL_M, NEAR_M = 0.05, 0.05
 CHANNELS = 32
-SEEDS = {"town": [61, 62], "street": [261, 262]}
+SEEDS = {"town": range(61, 63), "street": range(261, 263)}
 POSES = PoseOptions("file", "never")  # which are exact
+WIDTH, HEIGHT, PIXELS_PER_M = 1200, 560, 15.0
+AZIMUTH, ELEVATION = np.radians(-35), np.radians(38)
 Keep = dict[int, NDArray[np.bool_]]
-
-
-class WithoutLabels(SequenceView):
-    """A sequence without labels, as most recordings are."""
-
-    def fields(self) -> frozenset[str]:
-        """Return the fields, without labels."""
-        return self.whole.fields() - {"labels", "instances", "flow", "boxes"}
-
-    def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames of a field; none of the labels."""
-        return self.whole.frames(field) if field in self.fields() else np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -94,7 +84,7 @@ def by_dynamic_object_removal(points: NDArray[np.float32], drive: Recorded) -> N
 
 
 ROWS = (
-    MapRow("all points", MotionOptions("none"), lambda drive: WithoutLabels(drive.sequence)),
+    MapRow("all points", MotionOptions("none"), lambda drive: Only(drive.sequence, BARE)),
     MapRow(
         "exact labels", MotionOptions("none"), lambda d: without(d, {f: ~own for f, own in dynamic_points(d).items()})
     ),
@@ -102,12 +92,12 @@ ROWS = (
     MapRow("carlasc, exact boxes", MotionOptions("boxes")),
     MapRow("carlasc, boxes", MotionOptions("boxes"), lambda drive: noisy_boxes(drive, 0)),
     MapRow("carlasc, nothing", MotionOptions("evidence")),
-    MapRow("carlasc, nothing, no labels", MotionOptions("evidence"), lambda drive: WithoutLabels(drive.sequence)),
+    MapRow("carlasc, nothing, no labels", MotionOptions("evidence"), lambda drive: Only(drive.sequence, BARE)),
     MapRow("DUFOMap", MotionOptions("none"), lambda d: without(d, find_static(d)), "dufomap"),
     MapRow(
         "dynamic-object-removal",
         MotionOptions("none"),
-        lambda drive: WithoutLabels(drive.sequence),
+        lambda drive: Only(drive.sequence, BARE),
         "dynamic_object_removal",
         by_dynamic_object_removal,
     ),
@@ -136,39 +126,59 @@ def measure(row: MapRow, drive: Recorded, dynamic: Keep, folder: Path) -> dict[s
 
 
 def to_markdown(found: dict[str, list[dict[str, Any]]]) -> str:
-    """Return the table: mean and standard deviation over drives, in percent."""
+    """Return the table: means over drives with their intervals, in percent."""
     lines = ["| map | SA | DA | AA |", "|---|---:|---:|---:|"]
     for name, drives in found.items():
-        cells = []
-        for key in ("SA", "DA", "AA"):
-            values = 100 * np.array([drive[key] for drive in drives])
-            cells.append(f"{values.mean():.2f} ± {values.std(ddof=1) if len(values) > 1 else 0.0:.2f}")
+        cells = (study.interval((100 * drive[key] for drive in drives), ".2f") for key in ("SA", "DA", "AA"))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
+def draw(path: Path, out: Path) -> None:
+    """Draw the points near the middle of a map, the nearer ones over the others, with a little shade by height."""
+    with np.load(path) as made:
+        points, labels = made["points"].astype(np.float64), made["label"]
+    points = points - np.median(points, axis=0)
+    turn = np.array([[np.cos(AZIMUTH), -np.sin(AZIMUTH)], [np.sin(AZIMUTH), np.cos(AZIMUTH)]])
+    away, left = turn @ points[:, :2].T
+    up = points[:, 2] * np.cos(ELEVATION) + away * np.sin(ELEVATION)
+    depth = away * np.cos(ELEVATION) - points[:, 2] * np.sin(ELEVATION)
+    columns = np.rint(WIDTH / 2 - left * PIXELS_PER_M).astype(int)
+    rows = np.rint(HEIGHT / 2 - up * PIXELS_PER_M).astype(int)
+    order = np.argsort(-depth)
+    table = np.full((256, 3), 150.0)
+    for label, color in CARLA.colors.items():
+        table[label] = color
+    shade = np.clip(0.75 + 0.05 * points[:, 2], 0.6, 1.0)[:, None]
+    picture = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    for down in (0, 1):
+        for right in (0, 1):
+            row, column = rows[order] + down, columns[order] + right
+            seen = (row >= 0) & (row < HEIGHT) & (column >= 0) & (column < WIDTH)
+            picture[row[seen], column[seen]] = (table[labels] * shade)[order][seen]
+    Image.fromarray(picture).quantize(256).save(out)
+
+
 def main() -> None:
     """Measure all rows, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("work", nargs="?", type=Path)
-    for kind, seeds in SEEDS.items():
-        parser.add_argument(f"--{kind}", nargs="*", type=int, default=seeds)
-    parser.add_argument("--rows", nargs="+")
-    arguments = parser.parse_args()
-    rows = [row for row in ROWS if (not row.needs or find_spec(row.needs)) and row.name in (arguments.rows or row.name)]
-    found: dict[str, list[dict[str, Any]]] = {row.name: [] for row in rows}
-    with tempfile.TemporaryDirectory() as temporary:
-        work = arguments.work or Path(temporary)
-        for kind in SEEDS:
-            for seed in getattr(arguments, kind):
-                (drive,) = record(kind, seed, [CHANNELS], work)
-                dynamic = dynamic_points(drive)
-                for row in rows:
-                    kept = drive.folder / f"map {row.name}.json"
-                    if not kept.exists():
-                        kept.write_text(json.dumps(measure(row, drive, dynamic, Path(temporary))))
-                    found[row.name].append(json.loads(kept.read_text()))
-                    print(f"{drive.setting.drive}, {row.name}: {found[row.name][-1]}", flush=True)
+    parser = study.options(__doc__, SEEDS)
+    parser.add_argument("--rows", nargs="+", default=[row.name for row in ROWS], help="only these rows")
+    parser.add_argument("--draw", type=Path, help="a map")
+    with study.begin(parser) as given:
+        if given.draw:
+            draw(given.draw, given.draw.with_suffix(".png"))
+            return
+        rows = [row for row in ROWS if (not row.needs or find_spec(row.needs)) and row.name in given.rows]
+        found: dict[str, list[dict[str, Any]]] = {row.name: [] for row in rows}
+        for kind, seed in study.drives(given, SEEDS):
+            (drive,) = record(kind, seed, [CHANNELS], given.work)
+            dynamic = dynamic_points(drive)
+            for row in rows:
+                kept = drive.folder / f"map {row.name}.json"
+                if not kept.exists():
+                    kept.write_text(json.dumps(measure(row, drive, dynamic, given.work)))
+                found[row.name].append(json.loads(kept.read_text()))
+                print(f"{drive.setting.drive}, {row.name}: {found[row.name][-1]}", flush=True)
     print(to_markdown(found))
 
 

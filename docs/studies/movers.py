@@ -2,13 +2,7 @@
 
 Simulated drives in which everything moves, through a town and along a street, are recorded by one LiDAR each. Their ground truth is made in many ways and
 compared with what 40 other sensors saw at the same instant. WORK keeps drives, references and counts, and a run continues there; the counts of
-code that has changed must be removed (WORK/scores). The default is a temporary folder.
-
-    --quick       two drives, 32 channels, coarse grids, no ablations
-    --parked      the drives of seeds 1, 2 and 3 with parked cars instead, which are judged too
-    --tables      only write the tables of what WORK has
-    --town, --street SEED ...   other drives (61 to 65 and 261 to 265)
-    --workers N   processes (2)
+code that has changed must be removed (WORK/whole/scores). The default is a temporary folder.
 
 The rows with DUFOMap need the extra `study` (Python 3.12 or older). SA, DA and AA of maps, those of other programs too: `maps.py`.
 """
@@ -17,23 +11,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import tempfile
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from pathlib import Path
 from typing import Any
 
+import movers_drives
+import numpy as np
+import study
 from movers_drives import GRIDS, Recorded, Reference, Setting, record, reference
-from movers_rows import ABLATIONS, BASIC, MANY_CHANNELS, PARKED, ROWS, Row
+from movers_rows import ABLATIONS, BASIC, MANY_CHANNELS, PARKED, ROWS, UNLABELLED, Row
 from movers_scores import Counts, count, figures
 from movers_tables import Table, write_tables
 
-from carlasc import Run
+from carlasc import Grid, Run
 from carlasc.core.frames import FrameRange
+from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.frame import MergedFrame, merge_frame
@@ -43,7 +39,7 @@ from carlasc.inspection import holdout
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage.files import write_atomic
 
-SEEDS = {"town": [61, 62, 63, 64, 65], "street": [261, 262, 263, 264, 265]}
+SEEDS = {kind: movers_drives.SEEDS[kind] for kind in ("town", "street")}
 WINDOW = (-30, 30)  # scans that show the sides of actors
 ABLATED = 1  # drives of each kind
 UNCHANGED = ("align, flow", "align, instances", "align, evidence")  # beside the ablations
@@ -82,10 +78,10 @@ def tasks_of(arguments: argparse.Namespace, work: Path) -> list[Task]:
     )
     if arguments.parked:
         return [Task(Setting("parked", seed, 64), tuple(GRIDS), parked, work) for seed in (1, 2, 3)]
-    seeds = {"town": arguments.town, "street": arguments.street}
-    if arguments.quick:
-        return [Task(Setting(kind, own[0], 32), ("coarse",), every, work) for kind, own in seeds.items()]
-    by_kind = [[(kind, seed) for seed in own] for kind, own in seeds.items()]
+    if study.is_tiny():
+        some = ("tube", "align, flow", "align, evidence", UNLABELLED)
+        return [Task(Setting(*study.drives(arguments, SEEDS)[0], 32), ("coarse",), some, work)]
+    by_kind = [[(kind, seed) for seed in getattr(arguments, kind)] for kind in SEEDS]
     drives = [drive for pair in zip(*by_kind, strict=True) for drive in pair]
     some = drives[: len(by_kind) * ABLATED]
     tasks = [Task(Setting(*drive, 32), ("coarse",), every, work) for drive in drives]
@@ -161,8 +157,15 @@ def judge(drive: Recorded, row: Row, grid: str, references: dict[int, Reference]
     total = []
     for frame, merged, seconds in make(drive, row, grid, references, store):
         posterior = None if merged.evidence is None else merged.evidence.occupied
-        total.append(count(merged.grid, references[frame], drive.sides(frame, WINDOW), posterior, seconds))
+        grid_made = as_seen(merged.grid, references[frame]) if row.name == UNLABELLED else merged.grid
+        total.append(count(grid_made, references[frame], drive.sides(frame, WINDOW), posterior, seconds))
     return reduce(add, total)
+
+
+def as_seen(grid: Grid, seen: Reference) -> Grid:
+    """Return a grid without classes with those of the reference: only what is occupied is judged then."""
+    classes = np.where(seen.labels > 0, seen.labels, CARLA.geometry_only)
+    return Grid(grid.spec, np.where(grid.labels > 0, classes, 0), grid.counts)
 
 
 def make(
@@ -208,25 +211,15 @@ def held_out(tasks: Iterable[Task]) -> dict[str, list[dict[str, Any]]]:
 
 def main() -> None:
     """Do all tasks, and write the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("work", nargs="?", type=Path)
-    for option in ("quick", "parked", "tables"):
-        parser.add_argument(f"--{option}", action="store_true")
-    for kind, seeds in SEEDS.items():
-        parser.add_argument(f"--{kind}", nargs="+", type=int, default=seeds)
+    parser = study.options(__doc__, SEEDS)
+    parser.add_argument("--parked", action="store_true", help="seeds 1 to 3 with parked cars, which are judged too")
+    parser.add_argument("--tables", action="store_true", help="only write the tables of what WORK has")
     parser.add_argument("--workers", type=int, default=2)
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        work = arguments.work or Path(temporary)
-        tasks = tasks_of(arguments, work)
-        if not arguments.tables:
-            start = time.perf_counter()
-            with ProcessPoolExecutor(arguments.workers) as pool:
-                for done in as_completed([pool.submit(run, task) for task in tasks]):
-                    done.result()
-            print(f"{time.perf_counter() - start:.0f} s", flush=True)
-        text = write_tables(tables(tasks), held_out(tasks), work / ("parked" if arguments.parked else "movers"))
-        print(text)
+    with study.begin(parser) as given:
+        tasks = tasks_of(given, given.work)
+        if not given.tables:
+            study.do_all(run, tasks, given.workers)
+        print(write_tables(tables(tasks), held_out(tasks), given.work / ("parked" if given.parked else "movers")))
 
 
 if __name__ == "__main__":

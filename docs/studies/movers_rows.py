@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, get_args
 
@@ -18,6 +18,8 @@ from carlasc.motion import MotionOptions
 from carlasc.storage import Sequence
 
 SEED = 12  # of all noise that is added
+BARE = ("points",)
+UNLABELLED = "align, evidence, no labels"
 Keep = Callable[[int], NDArray[np.bool_]]
 
 
@@ -70,6 +72,27 @@ class Changed(Sequence):
     def read_document(self, name: str) -> bytes:
         """Return a document of the sequence."""
         return self._sequence.read_document(name)
+
+
+class Only(Changed):
+    """A sequence with some of its fields only: those of `BARE` are what most recordings have."""
+
+    def __init__(self, sequence: Sequence, names: Iterable[str]) -> None:
+        super().__init__(sequence)
+        self._names = frozenset(names)
+
+    def fields(self) -> frozenset[str]:
+        """Return the fields that are kept."""
+        return self._sequence.fields() & self._names
+
+    def frames(self, field: str) -> NDArray[np.int64]:
+        """Return the frames that have a field."""
+        return super().frames(field) if field in self.fields() else np.empty(0, np.int64)
+
+
+def without_labels(drive: Recorded, frame: int) -> Sequence:
+    """Keep nothing but the points."""
+    return Only(drive.sequence, BARE)
 
 
 def unchanged(drive: Recorded, frame: int) -> Sequence:
@@ -231,6 +254,7 @@ ROWS = (
     Row("align, boxes", _merging(motion=MotionOptions("boxes")), noisy_boxes),
     Row("align, exact boxes", _merging(motion=MotionOptions("boxes"))),
     Row("align, evidence", _merging(motion=MotionOptions("evidence"))),
+    Row(UNLABELLED, _merging(motion=MotionOptions("evidence")), without_labels),
 )
 """The rows of the tables."""
 

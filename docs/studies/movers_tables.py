@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from movers_rows import UNLABELLED
 from movers_scores import GROUPS, Counts, calibration_error, figures, groups, reliability
 
 COLUMNS = (  # heading, figure, number of decimals
@@ -27,6 +28,8 @@ COLUMNS = (  # heading, figure, number of decimals
     ("ECE", "ECE", 3),
     ("ECE, uncertain", "ECE, uncertain", 3),
 )
+_WITHOUT_CLASSES = ("Vehicle found", "Vehicle free", "wrongly occupied", "ECE", "ECE, uncertain")  # found is occupied
+FEWEST = 5  # drives of which a standard deviation is shown
 _RATIOS = ("wrongly Vehicle", "wrongly occupied")  # shown beside that of `tube`
 
 
@@ -68,8 +71,10 @@ class Table:
             cells = []
             for _, figure, decimals in COLUMNS:
                 mean, deviation = means[figure], deviations[figure]
-                cell = "" if np.isnan(mean) else f"{mean:.{decimals}f} ± {deviation:.{decimals}f}"
-                if figure in _RATIOS and row != "tube" and tube:
+                is_shown = not np.isnan(mean) and (row != UNLABELLED or figure in _WITHOUT_CLASSES)
+                spread = f" ± {deviation:.{decimals}f}" if len(self.drives) >= FEWEST else ""
+                cell = f"{mean:.{decimals}f}{spread}" if is_shown else ""
+                if is_shown and figure in _RATIOS and row != "tube" and tube:
                     cell = f"{mean:.0f} (1/{tube[figure] / mean:.0f})" if mean >= 1 else f"{mean:.0f}"
                 cells.append(cell)
             missing = len(self.drives) - len(self.rows[row])
@@ -126,7 +131,7 @@ class Table:
 
 
 CALIBRATED = ("align, flow", "align, evidence")
-MOVERS_OF = ("tube", "perfect removal, then tube", "align, flow", "align, boxes", "align, evidence")
+MOVERS_OF = ("tube", "perfect removal, then tube", "align, flow", "align, boxes", "align, evidence", UNLABELLED)
 
 
 def lidars_to_markdown(tables: list[Table], figure: str) -> str:

@@ -4,8 +4,6 @@ The simulated drives of `movers.py` are merged with the fields that a row names,
 the same instant is the truth: the class of each voxel, and the actor whose box it is in; how fast it moves there follows from the actor's
 exact poses. Voxels known to both count. WORK keeps the drives; the default is a temporary folder.
 
-    --size tiny     one short part of one drive
-
 - PQ: panoptic quality of vehicles and people that move faster than 1 m/s, the mean of both classes; "of the truth" counts what the grid does
   not know as free.
 - one number: of the movers that half of all scans or more see with 50 points or more, the share that has one number in all of these scans.
@@ -14,16 +12,14 @@ exact poses. Voxels known to both count. WORK keeps the drives; the default is a
 
 from __future__ import annotations
 
-import argparse
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
-from actors import Bare
+import study
+from movers import SEEDS
 from movers_drives import GRIDS, KINDS, MOVES_M_S, Recorded, Reference, record, reference
-from movers_rows import Changed, noisy_boxes
+from movers_rows import BARE, Only, noisy_boxes
 from numpy.typing import NDArray
 
 from carlasc import GridSpec
@@ -43,21 +39,8 @@ from carlasc.motion import MotionOptions
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import Sequence
 
-SEEDS = {"town": range(61, 66), "street": range(261, 266)}
 MANY_POINTS, SEEN = 50, 0.5
 THINGS = frozenset({CARLA.id_of("Vehicle"), CARLA.id_of("Pedestrian")})
-
-
-class Only(Changed):
-    """A sequence with some of its fields only."""
-
-    def __init__(self, sequence: Sequence, names: set[str]) -> None:
-        super().__init__(sequence)
-        self._names = frozenset(names)
-
-    def fields(self) -> frozenset[str]:
-        """Return the fields that are kept."""
-        return self._sequence.fields() & (self._names | {"points", "labels"})
 
 
 ROWS = ("instances", "flow", "exact boxes", "boxes", "evidence", "evidence, no labels")
@@ -68,8 +51,8 @@ def merged_from(drive: Recorded, row: str) -> tuple[Sequence, FromScans]:
     source = "boxes" if "boxes" in row else row.partition(",")[0]
     observe = FromScans(own_path=False, motion=MotionOptions(source))  # type: ignore[arg-type]
     if row == "evidence, no labels":
-        return Bare(drive.sequence), observe
-    return Only(noisy_boxes(drive, 0) if row == "boxes" else drive.sequence, {source}), observe
+        return Only(drive.sequence, BARE), observe
+    return Only(noisy_boxes(drive, 0) if row == "boxes" else drive.sequence, {source, "points", "labels"}), observe
 
 
 @dataclass
@@ -176,22 +159,14 @@ def numbers_seen(drive: Recorded, actors: MovingActors) -> list[bool]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("work", nargs="?", type=Path)
-    parser.add_argument("--size", choices=("tiny", "whole"), default="whole")
+    parser = study.options(__doc__, SEEDS)
     parser.add_argument("--rows", nargs="*", default=ROWS)
-    for kind, seeds in SEEDS.items():
-        parser.add_argument(f"--{kind}", nargs="*", type=int, default=seeds)
-    given = parser.parse_args()
-    tiny = given.size == "tiny"
-    drives = [(kind, seed) for kind in SEEDS for seed in getattr(given, kind)][: 1 if tiny else None]
-    scores = {row: Scores() for row in given.rows}
-    with tempfile.TemporaryDirectory() as temporary:
-        work = given.work or Path(temporary)
-        for kind, seed in drives:
-            (drive,) = record(kind, seed, [32], work)
-            seen = {frame: one for (grid, frame), one in reference(kind, seed, work).items() if grid == "coarse"}
-            truths = {frame: Truth.of(drive, frame) for frame in list(seen)[: 1 if tiny else None]}
+    with study.begin(parser) as given:
+        scores = {row: Scores() for row in given.rows}
+        for kind, seed in study.drives(given, SEEDS):
+            (drive,) = record(kind, seed, [32], given.work)
+            seen = {frame: one for (grid, frame), one in reference(kind, seed, given.work).items() if grid == "coarse"}
+            truths = {frame: Truth.of(drive, frame) for frame in seen}
             for row, score in scores.items():
                 sequence, observe = merged_from(drive, row)
                 feed = ScanFeed(sequence, observe)

@@ -3,28 +3,20 @@
 Simulated drives are recorded by one LiDAR, and their poses are made wrong in several ways. Grids are made from 61 scans with the drive's exact flow, under
 the wrong poses and under the refined ones, and compared with what 40 other sensors saw at the same instant. WORK keeps drives, references and results, and a run
 continues there. The default is a temporary folder.
-
-    --town SEED ..., --street SEED ...     drives (61 to 65 and 261 to 265)
-    --channels N ...                       LiDARs (32)
-    --every N                              use every N-th scan: 5 for a LiDAR of 2 Hz
-    --fine                                 voxels of 0.2 m too
-    --rows NAME ...                        some rows only
-    --workers N                            processes (2)
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import study
+from movers import SEEDS
 from movers_drives import GRIDS, Reference, Setting, record, reference
 from numpy.typing import NDArray
 
@@ -153,25 +145,18 @@ def table(tasks: Sequence[Task], grid: str) -> str:
 
 def main() -> None:
     """Do all tasks, and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("work", nargs="?", type=Path)
-    parser.add_argument("--town", nargs="*", type=int, default=[61, 62, 63, 64, 65])
-    parser.add_argument("--street", nargs="*", type=int, default=[261, 262, 263, 264, 265])
-    parser.add_argument("--channels", nargs="+", type=int, default=[32])
-    parser.add_argument("--every", type=int, default=1)
-    parser.add_argument("--fine", action="store_true")
-    parser.add_argument("--rows", nargs="+", default=list(ROWS))
+    parser = study.options(__doc__, SEEDS)
+    parser.add_argument("--channels", nargs="+", type=int, default=[32], help="LiDARs")
+    parser.add_argument("--every", type=int, default=1, help="use every N-th scan: 5 for a LiDAR of 2 Hz")
+    parser.add_argument("--fine", action="store_true", help="voxels of 0.2 m too")
+    parser.add_argument("--rows", nargs="+", default=list(ROWS), help="some rows only")
     parser.add_argument("--workers", type=int, default=2)
-    given = parser.parse_args()
-    drives = [("town", seed) for seed in given.town] + [("street", seed) for seed in given.street]
-    grids = tuple(GRIDS) if given.fine else ("coarse",)
-    with tempfile.TemporaryDirectory() as temporary:
-        work = given.work or Path(temporary)
-        make = partial(Task, grids=grids, every=given.every, work=work)
-        tasks = [make(Setting(*d, n), row) for row in given.rows for n in given.channels for d in drives]
-        with ProcessPoolExecutor(given.workers) as pool:
-            for done in as_completed([pool.submit(run, task) for task in tasks]):
-                done.result()
+    with study.begin(parser) as given:
+        drives, grids = study.drives(given, SEEDS), tuple(GRIDS) if given.fine else ("coarse",)
+        make = partial(Task, grids=grids, every=given.every, work=given.work)
+        rows = study.few(given.rows, 2)
+        tasks = [make(Setting(*d, n), row) for row in rows for n in given.channels for d in drives]
+        study.do_all(run, tasks, given.workers)
         for channels in given.channels:
             for grid in grids:
                 own = [task for task in tasks if task.setting.channels == channels]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from carlasc import Grid
 from carlasc.core import Transform, invert, rotation_z, transform_points
 from carlasc.motion import tracks_from_boxes
-from carlasc.motion.smoothing import smooth
+from carlasc.motion.solving import smooth
 from carlasc.storage import Sequence as Drive
 
 SHRINK_M, FLOOR_M = 0.2, 0.4  # a body's volume: smaller than its box on all sides, and this high above its floor

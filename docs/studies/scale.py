@@ -13,19 +13,29 @@ It leaves out the time until machines start, and the time that people wait in a 
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
+
+import study
 
 PASS_WORKERS = 8
 WORKERS = (2, 16, 100, 1000)
+RAYS, FIGURE_RAYS = 120_000, 57_600  # of a scan, here and in the figures
+
+
+def _figure(name: str) -> float:
+    figures = json.loads((Path(__file__).parents[1] / "figures.json").read_text())["figures"]
+    return float(figures[name]["value"])
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What one core does, from docs/performance.md and the sections before the model.
+    """What one core does: from docs/figures.json, in proportion to the rays, and from the sections before the model.
 
     Attributes:
-        frame_s: processor time of a frame: scans of 120,000 points, merged over 60 scans into voxels of 0.2 m.
+        frame_s: processor time of a frame: scans of 120,000 points, merged with 30 scans before and 30 after it into voxels of 0.2 m.
         pass_s: processor time of a frame in the pass that finds the actors.
         engine_s: time of the scheduler for a task.
         start_s: loading the compiled code in a worker.
@@ -34,8 +44,8 @@ class Measured:
         transfer_bytes_s: bytes per second between the object store and a worker.
     """
 
-    frame_s: float = 0.56
-    pass_s: float = 0.12
+    frame_s: float = 0.001 * _figure("merging.fine.grid") * 61 / 31 * RAYS / FIGURE_RAYS
+    pass_s: float = 0.001 * _figure("merging.pass") * RAYS / FIGURE_RAYS
     engine_s: float = 0.003
     start_s: float = 10.0
     read_bytes: int = 990_000
@@ -68,7 +78,7 @@ class Job:
         frames: number of frames.
         frames_per_sequence: length of a sequence.
         block: frames that one object of each column holds.
-        window: scans before and after a frame that are merged.
+        window: scans around a frame that are merged with it.
         columns_read: objects of a block that are read: xyz, labels, index and palette of flow, and the counts of each field.
         columns_written: objects of a block that are written: labels and counts of the grid, each with its counts.
         requests_s: requests that the object store answers per second.
@@ -145,5 +155,11 @@ def table() -> str:
     return "\n".join(rows)
 
 
+def main() -> None:
+    """Print the table."""
+    with study.begin(study.options(__doc__)):
+        print(table())
+
+
 if __name__ == "__main__":
-    print(table())
+    main()

@@ -1,4 +1,4 @@
-"""Study: does ground truth improve with more sensors? `python docs/studies/sensors.py [FOLDER]` prints the table and draws the plot.
+"""Study: does ground truth improve with more sensors? `python docs/studies/sensors.py` prints the table and draws docs/images/sensors.png.
 
 The reference is the grid of 60 additional sensors at the same instant. Accuracy is computed over the voxels that are known in both the
 reference and the grid of one sensor, so that all rows concern the same voxels. Coverage is the share of the reference's known voxels that
@@ -7,24 +7,28 @@ are known in a grid.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from clock import Clock
+import study
 from matplotlib.figure import Figure
 
 from carlasc import Grid, GridSpec
-from carlasc.captures import SensorRecording, TownDrive
+from carlasc.captures import Lidar, SensorRecording, TownDrive
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes
 from carlasc.metrics import TruthScore, score_truth
 
 SENSORS = (1, 5, 10, 20, 40)
-SCENES = [(seed, 60) for seed in range(101, 106)]
+SEEDS, FRAME = {"town": range(101, 106)}, 60
 SPECS = {"0.4 m": GridSpec.published().with_resolution(0.4), "0.2 m": GridSpec.published().with_resolution(0.2)}
+
+
+def sensors() -> tuple[int, ...]:
+    """Return the numbers of sensors that are compared."""
+    return SENSORS[: 2 if study.is_tiny() else None]
 
 
 def vote(recordings: Iterable[SensorRecording], grid_T_world: np.ndarray, spec: GridSpec) -> Grid:
@@ -35,15 +39,15 @@ def vote(recordings: Iterable[SensorRecording], grid_T_world: np.ndarray, spec: 
 
 def score_scene(seed: int, frame: int) -> dict[tuple[str, int], TruthScore]:
     """Return the score per resolution and number of sensors in one scene."""
-    drive = TownDrive(seed, "heavy")
-    reference = drive.reference_observations(frame, 60)
-    recordings = [drive.record(frame, sensor) for sensor in range(max(SENSORS))]
+    drive = TownDrive(seed, "heavy", Lidar(points=8_000) if study.is_tiny() else Lidar())
+    reference = drive.reference_observations(frame, 3 if study.is_tiny() else 60)
+    recordings = [drive.record(frame, sensor) for sensor in range(max(sensors()))]
     grid_T_world = invert(recordings[0].world_T_sensor)
     scores = {}
     for name, spec in SPECS.items():
         truth = vote(reference, grid_T_world, spec)
         alone = vote(recordings[:1], grid_T_world, spec).known
-        for count in SENSORS:
+        for count in sensors():
             grid = vote(recordings[:count], grid_T_world, spec)
             same = score_truth(grid, truth, CARLA.num_channels, mask=alone)
             whole = score_truth(grid, truth, CARLA.num_channels)
@@ -51,24 +55,29 @@ def score_scene(seed: int, frame: int) -> dict[tuple[str, int], TruthScore]:
     return scores
 
 
-def main(folder: Path) -> None:
+def main() -> None:
     """Score all scenes, and print and plot the means."""
-    clock, scenes = Clock(), []
-    for seed, frame in SCENES:
-        scenes.append(score_scene(seed, frame))
-        clock(f"scene {seed}")
+    clock, scenes = study.Clock(), []
+    with study.begin(study.options(__doc__, SEEDS)) as given:
+        for seed in study.few(given.town):
+            scenes.append(score_scene(seed, FRAME))
+            clock(f"scene {seed}")
+        show(scenes, (given.work if study.is_tiny() else Path(__file__).parents[1] / "images") / "sensors.png")
+
+
+def show(scenes: list[dict[tuple[str, int], TruthScore]], picture: Path) -> None:
+    """Print the table, and draw its means."""
     lines = ["| voxels | sensors | accuracy | coverage |", "|---|---:|---:|---:|"]
     curves: dict[str, list[tuple[float, float]]] = {}
     for name in SPECS:
-        for count in SENSORS:
-            accuracy = float(np.mean([scene[name, count].accuracy for scene in scenes]))
-            coverage = float(np.mean([scene[name, count].coverage for scene in scenes]))
-            curves.setdefault(name, []).append((accuracy, coverage))
-            lines.append(f"| {name} | {count} | {accuracy:.2%} | {coverage:.2%} |")
+        for count in sensors():
+            accuracy = [scene[name, count].accuracy for scene in scenes]
+            coverage = [scene[name, count].coverage for scene in scenes]
+            curves.setdefault(name, []).append((float(np.mean(accuracy)), float(np.mean(coverage))))
+            cells = " | ".join(study.interval(values, ".2%") for values in (accuracy, coverage))
+            lines.append(f"| {name} | {count} | {cells} |")
     print("\n".join(lines))
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "sensors.md").write_text("\n".join(lines) + "\n")
-    draw(curves, folder / "sensors.png")
+    draw(curves, picture)
 
 
 def draw(curves: dict[str, list[tuple[float, float]]], path: Path) -> None:
@@ -77,9 +86,9 @@ def draw(curves: dict[str, list[tuple[float, float]]], path: Path) -> None:
     axes = figure.subplots(1, 2)
     for axis, column, title in ((axes[0], 0, "accuracy"), (axes[1], 1, "coverage")):
         for name, values in curves.items():
-            axis.plot(SENSORS, [100 * value[column] for value in values], marker="o", label=name)
+            axis.plot(sensors(), [100 * value[column] for value in values], marker="o", label=name)
         axis.set(title=title, xlabel="sensors", ylabel="%", xscale="log")
-        axis.set_xticks(SENSORS, [str(count) for count in SENSORS])
+        axis.set_xticks(sensors(), [str(count) for count in sensors()])
         axis.minorticks_off()
         axis.grid(alpha=0.3)
         axis.legend(title="voxels")
@@ -87,4 +96,4 @@ def draw(curves: dict[str, list[tuple[float, float]]], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "docs/images"))
+    main()

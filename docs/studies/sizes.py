@@ -1,4 +1,4 @@
-"""How much each set of extras installs: `python docs/studies/sizes.py [EXTRA ...]` prints a row as soon as it is measured.
+"""How much each set of extras installs: `python docs/studies/sizes.py` prints a row as soon as it is measured.
 
 Each set is installed from this checkout into an environment of its own, with `-c constraints.txt`, and deleted. torch is the build that pip finds.
 """
@@ -6,11 +6,11 @@ Each set is installed from this checkout into an environment of its own, with `-
 from __future__ import annotations
 
 import subprocess
-import sys
-import tempfile
 import time
 import venv
 from pathlib import Path
+
+import study
 
 ROOT = Path(__file__).parents[2]
 SETS = ("", "demo", "convert", "train", "demo,convert", "demo,train", "zarr,remote", "view", "rerun", "all")
@@ -24,7 +24,8 @@ def install(extras: str, folder: Path) -> tuple[float, int, float]:
     start = time.perf_counter()
     wanted = f"{ROOT}[{extras}]" if extras else str(ROOT)
     command: list[str | Path] = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-compile"]
-    subprocess.run([*command, "--constraint", ROOT / "constraints.txt", wanted], check=True)
+    command += ["--no-deps"] if study.is_tiny() else ["--constraint", ROOT / "constraints.txt"]
+    subprocess.run([*command, wanted], check=True)
     return measure(packages) - before, len([*packages.glob("*.dist-info")]) - 1, time.perf_counter() - start
 
 
@@ -35,11 +36,13 @@ def measure(folder: Path) -> float:
 
 def main() -> None:
     """Print the table."""
+    parser = study.options(__doc__)
+    parser.add_argument("--extras", nargs="*", default=SETS)
     print("| extras | MB | packages | seconds |\n|---|---:|---:|---:|")
-    for extras in sys.argv[1:] or SETS:
-        with tempfile.TemporaryDirectory() as folder:
-            size, packages, elapsed_s = install(extras, Path(folder))
-        print(f"| `{extras or '(none)'}` | {size:,.0f} | {packages} | {elapsed_s:.0f} |", flush=True)
+    with study.begin(parser) as given:
+        for extras in study.few(given.extras):
+            size, packages, elapsed_s = install(extras, given.work / (extras or "none"))
+            print(f"| `{extras or '(none)'}` | {size:,.0f} | {packages} | {elapsed_s:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

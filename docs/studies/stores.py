@@ -1,14 +1,20 @@
-"""How small packed stores are: `python docs/studies/stores.py [--size tiny]` prints the table of docs/storage.md.
+"""How small packed stores are: `python docs/studies/stores.py` prints the tables of docs/storage.md and docs/studies/stores.md.
 
 A simulated drive of full scans (64 channels, ground truth from 20 sensors, medium traffic, seed 0) is packed into each store. Shares are of the
-fields that the published download has: `instances` is not among them, and the bird's-eye pictures are.
+fields that the published download has: `instances` is not among them, and the bird's-eye pictures are. Codecs are compared on the points of one scan, in one
+thread: the least processor time of ten turns.
 """
 
 from __future__ import annotations
 
-import argparse
-import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
+import study
+from numcodecs import Blosc, blosc
+from numcodecs.pcodec import PCodec
 
 import carlasc
 from carlasc import GridSpec
@@ -32,18 +38,30 @@ FIELDS = {  # of the store's fields, the row of the table
     "index": "text files, index",
 }
 ALL_FRAMES = 43_200
-SIZES = {"tiny": (2, 2, Lidar(channels=8, points=2_000)), "full": (24, 20, Lidar())}
+CODECS = {
+    "Blosc Zstandard 5, bytes shuffled, 512 KiB blocks": Blosc("zstd", 5, Blosc.SHUFFLE, 512 << 10),
+    "**Blosc Zstandard 5, bytes shuffled, a scan in one block** (default)": Blosc("zstd", 5, Blosc.SHUFFLE, 1 << 24),
+    "Blosc Zstandard 7, bytes shuffled, a scan in one block": Blosc("zstd", 7, Blosc.SHUFFLE, 1 << 24),
+    "Blosc Zstandard 3, bits shuffled": Blosc("zstd", 3, Blosc.BITSHUFFLE),
+    "Blosc Zstandard 7, bits shuffled": Blosc("zstd", 7, Blosc.BITSHUFFLE),
+    "PCodec 8": PCodec(8),
+    "**PCodec 8, chunks of 8,192 points** (`--small`)": PCodec(8),
+    "PCodec 10, chunks of 16,384 points": PCodec(10),
+}
+CHUNKS = {"**PCodec 8, chunks of 8,192 points** (`--small`)": 8_192, "PCodec 10, chunks of 16,384 points": 16_384}
+SIZES = {"tiny": (2, 2, Lidar(channels=8, points=2_000)), "whole": (24, 20, Lidar())}
 
 
 def measure(folder: Path, size: str) -> tuple[int, dict[str, dict[str, int]]]:
     """Return the number of frames, and the bytes per field of the files ("published") and of each store."""
     frames, sensors, lidar = SIZES[size]
     drive = folder / "data" / "Train" / "Town"
-    carlasc.simulate(drive, count=frames, sensors=sensors, lidar=lidar)
-    carlasc.regrid(drive, GridSpec.published())
+    run = carlasc.Run(workers=1)
+    carlasc.simulate(drive, count=frames, sensors=sensors, lidar=lidar, run=run)
+    carlasc.regrid(drive, GridSpec.published(), run=run)
     found: dict[str, dict[str, int]] = {}
     for name, (store, small) in STORES.items():
-        result = carlasc.pack(folder / "data", folder / store, small=small)
+        result = carlasc.pack(folder / "data", folder / store, small=small, run=run)
         found |= {"published": result.published_bytes, name: result.stored_bytes}
     return frames, found
 
@@ -70,12 +88,37 @@ def rows(frames: int, found: dict[str, dict[str, int]]) -> list[str]:
     return lines
 
 
+def codecs(points: np.ndarray) -> list[str]:
+    """Return the lines of the table of codecs: share of the published bytes, and milliseconds to encode and decode a scan."""
+    blosc.set_nthreads(1)
+    planes = np.ascontiguousarray(points[:, :3].T)
+    lines = ["| points as planes x, y, z | share | encode | decode |", "|---|---:|---:|---:|"]
+    for name, codec in CODECS.items():
+        length = CHUNKS.get(name, len(points))
+        parts = [np.ascontiguousarray(planes[:, i : i + length]) for i in range(0, len(points), length)]
+        encoded = [codec.encode(part) for part in parts]
+        share = sum(map(len, encoded)) / points.nbytes
+        times = [_least_ms(codec.encode, parts), _least_ms(codec.decode, encoded)]
+        lines.append(f"| {name} | {share:.1%} | {times[0]:.0f} ms | {times[1]:.1f} ms |")
+    return lines
+
+
+def _least_ms(function: Callable[[object], object], parts: list[object]) -> float:
+    turns = []
+    for _ in range(1 if study.is_tiny() else 10):
+        start = time.process_time()
+        for part in parts:
+            function(part)
+        turns.append(time.process_time() - start)
+    return 1000 * min(turns)
+
+
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", choices=SIZES, default="full")
-    with tempfile.TemporaryDirectory() as folder:
-        print("\n".join(rows(*measure(Path(folder), parser.parse_args().size))))
+    with study.begin(study.options(__doc__)) as given:
+        print("\n".join(rows(*measure(given.work, given.size))))
+        (sequence,) = carlasc.open(given.work / "data").values()
+        print("", *codecs(sequence.read("points", 0)), sep="\n")
 
 
 if __name__ == "__main__":

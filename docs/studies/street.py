@@ -15,7 +15,7 @@ import numpy as np
 from carlasc.captures import Lidar, TownActor, TownDrive
 from carlasc.captures.town import furniture
 from carlasc.captures.town.actors import EGO_ID, STRIDE_M
-from carlasc.captures.town.buildings import add_building
+from carlasc.captures.town.furniture import add_building
 from carlasc.captures.town.meshes import Mesh
 from carlasc.captures.town.plan import KERB_M, PlantCatalogue, Rectangle, TownPlan
 from carlasc.captures.town.shapes import (

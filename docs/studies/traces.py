@@ -6,10 +6,9 @@ instant. WORK is the folder of `movers.py`.
 
 from __future__ import annotations
 
-import sys
-import tempfile
 from pathlib import Path
 
+import study
 from movers import ActorStore, make
 from movers_drives import GRIDS, record, reference
 from movers_rows import ROWS
@@ -23,20 +22,21 @@ KIND, SEED, CHANNELS, GRID = "street", 261, 64, "0.2 m"
 SHOWN = {"tube": "SemanticKITTI's rule (tube)", "align, evidence": "carlasc, which is not told what moves"}
 
 
-def main(work: Path, out: Path) -> None:
+def main() -> None:
     """Make the grids and draw them side by side."""
-    (drive,) = record(KIND, SEED, [CHANNELS], work)
-    frame, seen = next((f, seen) for (grid, f), seen in reference(KIND, SEED, work).items() if grid == GRID)
-    store, grids = ActorStore(work / "scores" / str(drive.setting) / "actors"), {}
-    for row in (row for row in ROWS if row.name in SHOWN):
-        ((_, merged, _),) = make(drive, row, GRID, [frame], store)
-        grids[SHOWN[row.name]] = merged.grid
-    grids["reference: 40 sensors at that instant"] = Grid(GRIDS[GRID], seen.labels, seen.judged.astype("uint32"))
-    panels = [Panel(grid_drawing(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
-    Image.fromarray(draw_panels(panels, size=(1800, 430))).quantize(128).save(out, optimize=True)
+    with study.begin(study.options(__doc__)) as given:
+        (drive,) = record(KIND, SEED, [CHANNELS], given.work)
+        frame, seen = next((f, seen) for (grid, f), seen in reference(KIND, SEED, given.work).items() if grid == GRID)
+        store, grids = ActorStore(given.work / "scores" / str(drive.setting) / "actors"), {}
+        for row in (row for row in ROWS if row.name in SHOWN):
+            ((_, merged, _),) = make(drive, row, GRID, [frame], store)
+            grids[SHOWN[row.name]] = merged.grid
+        grids["reference: 40 sensors at that instant"] = Grid(GRIDS[GRID], seen.labels, seen.judged.astype("uint32"))
+        panels = [Panel(grid_drawing(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
+        out = (given.work if study.is_tiny() else Path(__file__).parents[1] / "images") / "traces.png"
+        Image.fromarray(draw_panels(panels, size=(1800, 430))).quantize(128).save(out, optimize=True)
+        print(out)
 
 
 if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as temporary:
-        given = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(temporary)
-        main(given, Path(__file__).parents[1] / "images/traces.png")
+    main()

@@ -16,7 +16,7 @@ from carlasc import Run
 from carlasc.captures.town.simulation import simulate
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
-from carlasc.storage.durability import VARIABLE
+from carlasc.storage.files import VARIABLE
 
 pytestmark = [pytest.mark.slow, pytest.mark.needs("trimesh", "embreex")]
 

@@ -9,11 +9,20 @@ import pytest
 from helpers.references.plain_metrics import panoptic_quality, rayiou
 
 from carlasc import GridSpec
-from carlasc.metrics import ConfusionMatrix, PanopticQuality, RayIoU, known, rayiou_directions
+from carlasc.metrics import (
+    ConfusionMatrix,
+    PanopticQuality,
+    RayIoU,
+    evaluate_by_all_conventions,
+    known,
+    rayiou_directions,
+)
+from carlasc.storage.files import to_json
+from carlasc.storage.folder import FolderSink
 
 pytestmark = pytest.mark.slow
 
-K, THINGS = 11, frozenset({4, 10})
+K, THINGS, FRAMES = 11, frozenset({4, 10}), 20
 
 
 @pytest.fixture(scope="module")
@@ -99,3 +108,16 @@ def test_bench_panoptic_quality_in_numpy(benchmark, street):
     _, pred, truth, _ = street
     found = benchmark(panoptic_quality, pred, truth, K, THINGS)
     assert found == pytest.approx(PanopticQuality(K, THINGS).update(pred, truth).compute().mean())
+
+
+@pytest.mark.benchmark(group="conventions", timer=time.process_time)
+def test_bench_all_conventions(benchmark, frame, tmp_path):
+    pred, target, counts = frame
+    for name, labels in (("predicted", pred), ("true", target)):
+        with FolderSink(tmp_path / name) as sink, sink.sequence("Val/Town01_Light/cartesian") as writer:
+            writer.write_document("evaluation/params.json", to_json(GridSpec.published().to_params()))
+            for number in range(FRAMES):
+                writer.write("evaluation/labels", number, labels.astype(np.uint32))
+                writer.write("evaluation/counts", number, counts)
+    found = benchmark(evaluate_by_all_conventions, tmp_path / "predicted", tmp_path / "true")
+    assert found["carlasc"].matrix.total == FRAMES * (counts > 0).sum()

@@ -115,7 +115,7 @@ def test_ids_over_255_are_counted_apart(vote: str) -> None:
 @pytest.mark.parametrize("spec", [GridSpec.published("fine"), GridSpec.published("cylindrical")], ids=str)
 def test_published_grids_are_those_of_the_plain_version(spec: GridSpec) -> None:
     rng = np.random.default_rng(2)
-    assert_as_plain([random_observation(rng, spec, count=20_000) for _ in range(2)], spec)
+    assert_as_plain([random_observation(rng, spec, count=8_000) for _ in range(2)], spec)
 
 
 def test_a_step_of_centimetres_is_counted_as_any_other() -> None:

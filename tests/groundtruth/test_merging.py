@@ -9,7 +9,7 @@ from carlasc.core.geometry import invert, rotation_z, transform_points, translat
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.groundtruth import FromScans
-from carlasc.groundtruth.from_scans.body_regions import BodyRegions
+from carlasc.groundtruth.from_scans.actor_voxels import BodyRegions
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger, PreparedScan
 from carlasc.groundtruth.voting.ballot import NOWHERE

@@ -12,7 +12,7 @@ from carlasc.core.tables import CARLA
 
 VEHICLE, PEDESTRIAN, ROAD = (CARLA.id_of(name) for name in ("Vehicle", "Pedestrian", "Road"))
 SPEC = GridSpec("cartesian", (4, 4, 2), (0.0, 0.0, 0.0), (4.0, 4.0, 2.0))
-MODULES = ("street", "movers", "movers_drives", "movers_rows", "movers_scores", "movers_tables")
+MODULES = ("study", "railed", "street", "movers", "movers_drives", "movers_rows", "movers_scores", "movers_tables")
 
 
 @pytest.fixture(autouse=True)
@@ -219,13 +219,12 @@ def test_the_tasks_cover_the_report(tmp_path):
     from movers import SEEDS, tasks_of
     from movers_rows import ABLATIONS, ROWS
 
-    options = argparse.Namespace(parked=False, quick=False, **SEEDS)
+    options = argparse.Namespace(parked=False, **SEEDS)
     tasks = tasks_of(options, tmp_path)
     made = {(task.setting.channels, grid, row) for task in tasks for grid in task.grids for row in task.rows}
     assert {(32, "coarse", row.name) for row in (*ROWS, *ABLATIONS)} <= made
     assert {(c, grid, "align, evidence") for c in (16, 32, 64) for grid in ("coarse", "0.2 m")} <= made
     assert (128, "coarse", "align, flow") in made
     assert len({task.setting.drive for task in tasks}) == 10
-    assert len(tasks_of(argparse.Namespace(parked=False, quick=True, **SEEDS), tmp_path)) == 2
-    parked = tasks_of(argparse.Namespace(parked=True, quick=False, **SEEDS), tmp_path)
+    parked = tasks_of(argparse.Namespace(parked=True, **SEEDS), tmp_path)
     assert {task.setting.seed for task in parked} == {1, 2, 3}

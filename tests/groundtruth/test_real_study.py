@@ -23,7 +23,7 @@ ROAD_Z = -1.73
 def studies(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "docs/studies"))
     yield
-    for name in ("real_drive", "real_measures"):
+    for name in ("study", "real_drive", "real_measures"):
         sys.modules.pop(name, None)
 
 

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from carlasc import Grid, GridSpec
 from carlasc.core.tables import CARLA
-from carlasc.groundtruth.maps.surfaces import SurfaceMesh, write_distances
+from carlasc.groundtruth.maps.map_files import SurfaceMesh, write_distances
 
 BOX = np.argwhere(np.ones((3, 4, 5)))
 

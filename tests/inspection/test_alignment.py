@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from carlasc.core.geometry import invert
+from carlasc.core.tables import CARLA
 from carlasc.inspection.alignment import diagnose_poses, known_corrections
-from carlasc.inspection.structure import upright
+from carlasc.inspection.structure import structure_of
 from carlasc.testing.drives import SimulatedDrive
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -53,7 +54,7 @@ def structures(drive, *, deskewed=True):
     for frame in range(drive.frames):
         scan = drive.scan(frame)
         points = (scan.deskewed if deskewed else scan.points)[:, :3].astype(np.float64)
-        found.append(upright(points))
+        found.append(structure_of(points, None, None, CARLA))
     return found
 
 
@@ -131,7 +132,7 @@ def test_mistakes_are_named_on_a_real_drive(real):
         }
     scans = [read[name] for name in sorted(read)]
     poses = estimate_poses(scans, min_range_m=2.5, max_range_m=50.0)
-    structure = [upright(scan) for scan in scans]
+    structure = [structure_of(scan, None, None, CARLA) for scan in scans]
     assert diagnose_poses(structure.__getitem__, poses).correction is None
     for mistake, make in MISTAKES.items():
         correction = diagnose_poses(structure.__getitem__, make(poses)).correction

@@ -12,7 +12,7 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.grids import GridSpec
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
-from carlasc.inspection.trajectory import check_poses, check_times
+from carlasc.inspection.pose_quality import check_poses, check_times
 from carlasc.storage import FolderSink, FolderSource, layout
 
 SPEC = GridSpec("cartesian", (4, 4, 2), (-2.0, -2.0, -1.0), (2.0, 2.0, 1.0))

@@ -11,9 +11,9 @@ from carlasc.motion.paths import (
     estimate_path,
     follow,
     headings_by_turns,
-    headings_of,
     is_standing,
 )
+from carlasc.motion.solving import headings_of
 
 FRAMES = range(25)
 SECONDS = np.array(FRAMES) * PERIOD_S

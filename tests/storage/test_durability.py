@@ -10,7 +10,7 @@ import pytest
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, StorageError
-from carlasc.storage import durability, field_files, layout
+from carlasc.storage import field_files, files, layout
 from carlasc.storage.files import to_json, write_atomic, write_many
 from carlasc.storage.folder import FolderWriter
 
@@ -21,13 +21,13 @@ SPEC = GridSpec.published("cartesian")
 def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The names of what is synced, in order; of a file, with whether it has its final name yet."""
     found: list[str] = []
-    sync = durability._sync
+    sync = files._sync
 
     def note(descriptor: int) -> None:
         found.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
         sync(descriptor)
 
-    monkeypatch.setattr(durability, "_sync", note)
+    monkeypatch.setattr(files, "_sync", note)
     return found
 
 
@@ -56,7 +56,7 @@ def test_the_temporary_name_of_a_new_file_is_gone_before_its_folder_is_synced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names: list[str] = []
-    monkeypatch.setattr(durability, "_sync", lambda _: names.append(",".join(path.name for path in tmp_path.iterdir())))
+    monkeypatch.setattr(files, "_sync", lambda _: names.append(",".join(path.name for path in tmp_path.iterdir())))
     assert write_atomic(tmp_path / "a", b"1", create=True)
     assert names[-1] == "a"
 
@@ -64,8 +64,8 @@ def test_the_temporary_name_of_a_new_file_is_gone_before_its_folder_is_synced(
 @needs_proc
 def test_a_file_that_is_removed_stays_removed(tmp_path: Path, synced: list[str]) -> None:
     (tmp_path / "mark.json").write_bytes(b"{}")
-    durability.remove_file(tmp_path / "mark.json")
-    durability.remove_file(tmp_path / "never.json")
+    files.remove_file(tmp_path / "mark.json")
+    files.remove_file(tmp_path / "never.json")
     assert not list(tmp_path.iterdir())
     assert synced == [tmp_path.name]
 
@@ -73,23 +73,23 @@ def test_a_file_that_is_removed_stays_removed(tmp_path: Path, synced: list[str])
 def test_nothing_is_synced_where_it_is_turned_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synced: list[str]
 ) -> None:
-    monkeypatch.setenv(durability.VARIABLE, "no")
+    monkeypatch.setenv(files.DURABLE, "no")
     write_atomic(tmp_path / "a", b"1")
     write_many({tmp_path / "b": b"1", tmp_path / "c": b"1"})
     assert synced == []
 
 
 def test_another_value_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(durability.VARIABLE, "perhaps")
+    monkeypatch.setenv(files.DURABLE, "perhaps")
     with pytest.raises(ArgumentError, match="CARLASC_DURABLE: expected yes or no, found 'perhaps'"):
-        durability.is_durable()
+        files.is_durable()
 
 
 def test_the_option_reaches_worker_processes_through_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(durability.VARIABLE, "yes")
+    monkeypatch.setenv(files.DURABLE, "yes")
     with pytest.raises(SystemExit):
         app(["--no-durable", "stats", "nowhere"])
-    assert os.environ[durability.VARIABLE] == "no"
+    assert os.environ[files.DURABLE] == "no"
 
 
 def test_a_disk_that_fails_while_files_are_synced_is_an_error_that_names_the_file(
@@ -98,21 +98,21 @@ def test_a_disk_that_fails_while_files_are_synced_is_an_error_that_names_the_fil
     def fail(descriptor: int) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(durability, "_sync", fail)
+    monkeypatch.setattr(files, "_sync", fail)
     with pytest.raises(StorageError, match=r"[ab]\.bin: cannot be written: Input/output error"):
         write_many({tmp_path / "a.bin": b"1", tmp_path / "b.bin": b"2"})
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_system_that_cannot_sync_folders_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sync = durability._sync
+    sync = files._sync
 
     def refuse_folders(descriptor: int) -> None:
         if os.path.isdir(f"/proc/self/fd/{descriptor}"):  # noqa: PTH112
             raise OSError(errno.EINVAL, "Invalid argument")
         sync(descriptor)
 
-    monkeypatch.setattr(durability, "_sync", refuse_folders)
+    monkeypatch.setattr(files, "_sync", refuse_folders)
     write_atomic(tmp_path / "a", b"1")
     assert (tmp_path / "a").read_bytes() == b"1"
 

@@ -20,10 +20,10 @@ import carlasc
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import FromGrid
 from carlasc.storage import FolderSink, Sink, Source
+from carlasc.storage.copying import unpack
 from carlasc.storage.folder import FolderWriter
 from carlasc.storage.opening import open_sink
 from carlasc.storage.packing import pack
-from carlasc.storage.unpacking import unpack
 from carlasc.testing.data import published_bytes
 from carlasc.testing.machines import GRID, StoreMachine
 

@@ -23,9 +23,9 @@ from storage.test_block_tables import FRAMES, PATH, arrays_of, start_sink, write
 import carlasc
 from carlasc import Run
 from carlasc.errors import ConflictError
+from carlasc.storage.copying import unpack
 from carlasc.storage.packing import pack
 from carlasc.storage.transport.targets import LocalTarget, RemoteTarget, Target, target_of
-from carlasc.storage.unpacking import unpack
 from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.zarr.zarr_sink import ZarrSink
 

@@ -19,7 +19,7 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, DependencyError
 from carlasc.storage import FolderSink
 from carlasc.viewing import Scene, Window
-from carlasc.viewing.open3d_loading import advice, import_open3d, missing_library
+from carlasc.viewing.open3d_shapes import advice, import_open3d, missing_library
 from carlasc.viewing.window import KEYS, help_lines
 
 STEPS = """

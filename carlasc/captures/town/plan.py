@@ -5,6 +5,7 @@ Leaves of plants are separate triangles, so some rays of a LiDAR enter a crown a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -178,10 +179,14 @@ class Rectangle:
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
         return self.centre + (signs * self.size) @ self.axes
 
+    @cached_property
+    def _circle(self) -> tuple[float, float, float]:
+        return float(self.centre[0]), float(self.centre[1]), float(np.hypot(*self.size)) / 2
+
     def overlaps(self, other: Rectangle, margin_m: float = 0.0) -> bool:
         """Whether two rectangles are closer to each other than a margin: no axis of either separates them."""
-        reach = (float(np.hypot(*self.size)) + float(np.hypot(*other.size))) / 2 + margin_m
-        if float(np.hypot(*(self.centre - other.centre))) > reach:
+        (x, y, radius), (other_x, other_y, other_radius) = self._circle, other._circle
+        if math.hypot(x - other_x, y - other_y) > radius + other_radius + margin_m:
             return False
         axes = np.concatenate([self.axes, other.axes])
         a, b = self.corners @ axes.T, other.corners @ axes.T
@@ -203,17 +208,17 @@ class Land:
 
     def inside(self, points: Points, margin_m: float = 0.0) -> bool:
         """Whether all points (N, 2) are inside the boundary, and at least a margin away from it."""
-        start, along = self.boundary, np.roll(self.boundary, -1, axis=0) - self.boundary
-        offsets = points[:, None, :] - start
-        share = (offsets * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-12)
-        nearest = start + np.clip(share, 0, 1)[..., None] * along
-        far_enough = np.linalg.norm(points[:, None, :] - nearest, axis=-1).min(axis=1) >= margin_m
+        (start_x, start_y), (end_x, end_y) = self.boundary.T, np.roll(self.boundary, -1, axis=0).T
+        along_x, along_y, x, y = end_x - start_x, end_y - start_y, points[:, :1], points[:, 1:]
+        share = ((x - start_x) * along_x + (y - start_y) * along_y) / np.maximum(along_x**2 + along_y**2, 1e-12)
+        share = np.clip(share, 0, 1)
+        beside_x, beside_y = x - (start_x + share * along_x), y - (start_y + share * along_y)
+        far_enough = np.sqrt(beside_x**2 + beside_y**2).min(axis=1) >= margin_m
         # From a point inside, a ray along +x crosses the boundary an odd number of times.
-        above = self.boundary[:, 1] > points[:, 1:]
-        crossed = above != np.roll(above, -1, axis=1)
+        crossed = (start_y > y) != (end_y > y)
         with np.errstate(divide="ignore", invalid="ignore"):
-            x = start[:, 0] + offsets[..., 1] / along[:, 1] * along[:, 0]
-        odd = (crossed & (x > points[:, :1])).sum(axis=1) % 2 == 1
+            crossing = start_x + (y - start_y) / along_y * along_x
+        odd = (crossed & (crossing > x)).sum(axis=1) % 2 == 1
         return bool((odd & far_enough).all())
 
     def reserve(self, rectangle: Rectangle, margin_m: float = 0.3, edge_m: float = 0.0) -> bool:
@@ -227,13 +232,10 @@ class Land:
         Returns:
             Whether the rectangle was free.
         """
-        corners = rectangle.corners
-        if not self.inside(np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2]), edge_m):
-            return False
-        if any(rectangle.overlaps(other, margin_m) for other in self.occupied):
-            return False
-        self.occupied.append(rectangle)
-        return True
+        around = np.concatenate([rectangle.corners, (rectangle.corners + rectangle.corners[[3, 0, 1, 2]]) / 2])
+        free = self.inside(around, edge_m) and not any(rectangle.overlaps(other, margin_m) for other in self.occupied)
+        self.occupied += [rectangle] if free else []
+        return free
 
 
 KERB_M = 0.15  # height of the sidewalks above the road

@@ -32,7 +32,7 @@ from carlasc.core.geometry import Transform, rotate_vectors
 from carlasc.core.tables import CARLA
 from carlasc.errors import MissingDataError, check_choice, import_extra
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.layout import CAMERAS, FRAME_PERIOD_S
 from carlasc.storage.transport.targets import check_shared
@@ -298,8 +298,8 @@ def simulate(
     wanted = run.part.take(range(first_frame, first_frame + count))
     missing = [frame for frame in wanted if not writer.has_frame(frame, sensors, bev, images)]
     complete = set(wanted) - set(missing)
-    progress = run.progress or (lambda done, total: None)
-    progress(len(complete), len(wanted))
+    step = StepCounter(run.progress, len(wanted), len(complete))
+    step(0)
     points: Counter[str] = Counter()
     recorded = run_all(partial(_record_frame, writer, drive), missing, run)
     with TimesLog(writer) as log:
@@ -310,10 +310,10 @@ def simulate(
 
         for frame in sorted(complete - writer.timed_frames(sensors)):  # a run was killed before it wrote their times
             note(frame)
-        for done, (frame, points_of_frame) in enumerate(zip(missing, recorded, strict=True), len(complete) + 1):
+        for frame, points_of_frame in zip(missing, recorded, strict=True):
             points.update(points_of_frame)
             note(frame)
-            progress(done, len(wanted))
+            step()
     if run.part.count > 1:
         writer.target.tree.refresh()
         frames = range(first_frame, first_frame + count)

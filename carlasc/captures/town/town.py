@@ -13,8 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.captures.town import furniture
-from carlasc.captures.town.buildings import add_building
-from carlasc.captures.town.furniture import add_footbridge, add_street_furniture, add_traffic_signals, mark_parking_bay
+from carlasc.captures.town.furniture import (
+    add_building,
+    add_footbridge,
+    add_street_furniture,
+    add_traffic_signals,
+    mark_parking_bay,
+)
 from carlasc.captures.town.meshes import Mesh, at_height, close_loop
 from carlasc.captures.town.plan import INNER_M, KERB_M, PAINT_M, Land, PlantCatalogue, Rectangle, TownPlan, hedge
 from carlasc.captures.town.streets import BAY_M, HALF_ROAD_M, CityBlock, Side, Streets, draw_streets

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from carlasc.core.cells import count_points
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
-from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
-from carlasc.groundtruth.from_scans.body_regions import BodyRegions
+from carlasc.groundtruth.from_scans.actor_voxels import BodyRegions, find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
 from carlasc.groundtruth.inputs import GridPlan

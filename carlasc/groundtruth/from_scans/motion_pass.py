@@ -34,8 +34,8 @@ from carlasc.motion import (
     tracks_from_boxes,
 )
 from carlasc.motion.bodies import surface_of
+from carlasc.motion.boxes import register_boxes
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
-from carlasc.motion.registered_boxes import register_boxes
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors, with_surfaces
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.plain import from_plain
-from carlasc.core.versions import carlasc_version
-from carlasc.errors import FormatError, reading
+from carlasc.errors import FormatError, carlasc_version, reading
 from carlasc.groundtruth.reporting.facts import ActorTrack, FrameFacts, PoseFacts, actors_of, digest_of_bytes
 from carlasc.storage.files import parse_json, to_json
 

@@ -21,18 +21,16 @@ from carlasc.errors import ArgumentError, CarlascError, reading
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.inputs import RunProgress
 from carlasc.inspection.auditing.counting import OCCUPIED, FrameCounter
 from carlasc.inspection.auditing.geometry import judge_geometry
 from carlasc.inspection.auditing.judging import judge_contents
 from carlasc.inspection.auditing.matching import MatchedGrids, match_grids
-from carlasc.inspection.auditing.sums import Stretches, Sums, add
-from carlasc.inspection.auditing.verdicts import AuditFailure, AuditResult, Verdict
+from carlasc.inspection.auditing.verdicts import AuditFailure, AuditResult, Stretches, Sums, Verdict, add
 from carlasc.metrics.pairs import Place
 from carlasc.motion.options import MotionOptions
 from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import FolderSink, layout
 from carlasc.storage.protocol import Source
 from carlasc.storage.resuming import derived_key, read_derived, scans_digest
@@ -221,7 +219,8 @@ def _count_all(
 ) -> tuple[dict[str, list[Sums]], list[_Row], list[AuditFailure], bool]:
     """Count the stretches of this part, and read those of others: sums by sequence, frames, failures, and whether all are there."""
     own = run.part.take(range(len(stretches)))
-    steps = RunProgress(run.progress, 0, sum(len(stretch.frames) for stretch in stretches))
+    steps = StepCounter(run.progress, sum(len(stretch.frames) for stretch in stretches))
+    steps(0)
     lengths = Counter(stretch.counter.matched.path for stretch in stretches)
     sums = {path: [Sums() for _ in range(min(length, _DRAWN))] for path, length in lengths.items()}
     worst, failures, is_whole, rows = list[_Row](), list[AuditFailure](), True, Counter[str]()

@@ -13,10 +13,10 @@ from carlasc.core.cells import first_of_cells
 from carlasc.core.geometry import invert, thin, transform_points
 from carlasc.core.scans import Scan
 from carlasc.errors import CarlascError
-from carlasc.inspection.auditing.hypotheses import Family, families
+from carlasc.inspection.auditing.geometry import Family, families
 from carlasc.inspection.auditing.loops import count_occupied_under, crossings, grown, voxels_at
 from carlasc.inspection.auditing.matching import MatchedGrids
-from carlasc.inspection.auditing.sums import Sums, add
+from carlasc.inspection.auditing.verdicts import Sums, add
 from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
 from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
 

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.wording import count, first_names
+from carlasc.errors import count, first_names
 from carlasc.inspection.auditing.counting import HEIGHTS
 from carlasc.inspection.auditing.matching import MatchedGrids
-from carlasc.inspection.auditing.sums import Share, Stretches, share_of
-from carlasc.inspection.auditing.verdicts import State, Verdict
+from carlasc.inspection.auditing.verdicts import Share, State, Stretches, Verdict, share_of
 from carlasc.inspection.heldout_scores import BANDS_M
 
 # A share is a fault from the first value on; that of one class of at least so many counts from the second on.

@@ -24,10 +24,8 @@ from carlasc.core.frames import FrameRange, Frames
 from carlasc.core.geometry import Transform, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import remaps_between
-from carlasc.core.wording import count, first_names
-from carlasc.errors import ArgumentError, FormatError, MissingDataError, reading
-from carlasc.metrics.carlaocc import CarlaOccGrids
-from carlasc.metrics.grids import GridFrames, SequenceGrid
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, count, first_names, reading
+from carlasc.metrics.grids import CarlaOccGrids, GridFrames, SequenceGrid
 from carlasc.metrics.pairs import Place, TokenFrames, open_grids
 from carlasc.storage import as_source, layout
 from carlasc.storage.files import parse_json

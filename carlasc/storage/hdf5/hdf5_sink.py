@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.durability import sync_tree, unfinished
+from carlasc.storage.files import sync_tree, unfinished
 from carlasc.storage.hdf5.hdf5_source import CRC
 from carlasc.storage.packed.array_layout import (
     DOCUMENT,

@@ -130,7 +130,7 @@ class PointsPacking(Packing):
         """Return (N, 4) float32 rows, as the published file has them."""
         xyz, fourth = columns["xyz"], columns["fourth"]
         points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
-        points[:, :3] = self.to_metres(xyz).T
+        points[:, 0], points[:, 1], points[:, 2] = self.to_metres(xyz)  # all three at once take five times as long
         points[:, 3] = fourth if fourth.size else 0
         return points
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
-from carlasc.storage.durability import make_folder, remove_file, rename, replaced, sync_all
-from carlasc.storage.files import storage_error
+from carlasc.storage.files import make_folder, remove_file, rename, replaced, storage_error, sync_all, write_at
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
 UNFINISHED_MARK = "unfinished.json"  # in its place until the store is whole
@@ -80,17 +79,18 @@ def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
 
 
 class PatientFile(io.RawIOBase):
-    """A new file for a library that cannot go on after a failed write: h5py then crashes, pyarrow complains about its own destructor.
+    """A new file for a library that cannot go on after a failed write.
 
-    It keeps the first error, drops all that is written after it, and `check` raises it.
+    h5py then crashes, pyarrow complains about its own destructor, and Foxglove says nothing. The file keeps the first error, drops all that is
+    written after it, and `check` raises it.
     """
 
-    def __init__(self, path: Path, place: Path) -> None:
+    def __init__(self, path: Path, place: Path | None) -> None:
         """Create the file.
 
         Args:
             path: the file.
-            place: what it becomes when it is whole, for errors.
+            place: what it becomes when it is whole, for errors; None if who writes it says so: `check` then raises the error as it is.
 
         Raises:
             StorageError: it cannot be created.
@@ -105,7 +105,7 @@ class PatientFile(io.RawIOBase):
             path.unlink(missing_ok=True)  # what an abandoned writer of this process still writes goes into its own file
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
-            raise storage_error(place, error) from error
+            raise storage_error(place or path, error) from error
 
     def check(self) -> None:
         """Raise the error of the first write that failed.
@@ -113,7 +113,9 @@ class PatientFile(io.RawIOBase):
         Raises:
             StorageError: one did.
         """
-        if self._error is not None:
+        if self._error is not None and self._place is None:
+            raise self._error
+        if self._error is not None and self._place is not None:
             raise storage_error(self._place, self._error) from self._error
 
     def readable(self) -> bool:
@@ -140,14 +142,11 @@ class PatientFile(io.RawIOBase):
     def write(self, data: Any) -> int:
         """Write all bytes at the position."""
         view = memoryview(data).cast("B")
-        left, place = view, self._position
-        while left and self._error is None:
+        if self._error is None:
             try:
-                written = os.pwrite(self._descriptor, left, place)
+                write_at(self._descriptor, view, self._position)
             except OSError as error:
                 self._error = error
-            else:
-                left, place = left[written:], place + written
         self._position += len(view)
         self._size = max(self._size, self._position)
         return len(view)

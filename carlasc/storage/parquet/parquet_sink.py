@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.durability import remove_file, sync_tree, unfinished
-from carlasc.storage.files import parse_json, remove_stale, to_json, write_atomic
+from carlasc.storage.files import parse_json, remove_file, remove_stale, sync_tree, to_json, unfinished, write_atomic
 from carlasc.storage.packed.output import (
     TABLES_MARK,
     UNFINISHED_MARK,

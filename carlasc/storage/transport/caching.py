@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, MissingDataError, StorageError
-from carlasc.storage.durability import sync_file
+from carlasc.storage.files import sync_file, write_at
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree
 
@@ -266,7 +266,7 @@ class CachedTree(Tree):
         for first in range(0, len(starts), _AT_ONCE):
             pieces = [(path, start, min(start + _PIECE, size)) for start in starts[first : first + _AT_ONCE]]
             for (_, start, _), data in zip(pieces, self.remote.read_ranges(pieces), strict=True):
-                _write(descriptor, data, start)
+                write_at(descriptor, data, start)
 
     def _key(self, path: str) -> str:
         options = self.remote.requests.options
@@ -357,13 +357,6 @@ def _remove(path: Path) -> bool:
             return False
         path.unlink(missing_ok=True)
         return True
-
-
-def _write(descriptor: int, data: bytes | memoryview, start: int) -> None:
-    view = memoryview(data)
-    while view:
-        written = os.pwrite(descriptor, view, start)
-        view, start = view[written:], start + written
 
 
 def _digest(text: str) -> str:

@@ -17,8 +17,16 @@ from pathlib import Path
 from typing import TypeVar
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError, postponed_interrupts, without_credentials
-from carlasc.storage.durability import remove_file, rename, sync_file
-from carlasc.storage.files import parse_json, storage_error, write_json, writing
+from carlasc.storage.files import (
+    parse_json,
+    remove_file,
+    rename,
+    storage_error,
+    sync_file,
+    write_at,
+    write_json,
+    writing,
+)
 from carlasc.storage.transport.failures import WrongAnswerError, describe_failure, fail, is_temporary
 from carlasc.storage.transport.requests import HttpAnswer, Requests
 
@@ -150,7 +158,7 @@ class FileFetch:
             def one_try() -> None:
                 start = index * arrived.block + arrived.got.get(index, 0)
                 for data in self._range(start, end):
-                    _write_at(descriptor, data, start)
+                    write_at(descriptor, data, start)
                     start += len(data)
                     with lock:
                         arrived.got[index] = arrived.got.get(index, 0) + len(data)
@@ -330,10 +338,3 @@ def _total(answer: HttpAnswer) -> int:
     if match is None:
         raise WrongAnswerError(f"expected a Content-Range, found {text!r}")
     return int(match[1])
-
-
-def _write_at(descriptor: int, data: bytes, offset: int) -> None:
-    view = memoryview(data)
-    while view:
-        written = os.pwrite(descriptor, view, offset)
-        view, offset = view[written:], offset + written

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from carlasc.errors import ArgumentError, FormatError
+from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage.files import leads_outside, write_atomic, write_many
 from carlasc.storage.transport.failures import exists_error, fail
@@ -45,6 +45,13 @@ class Target(ABC):
         Raises:
             FormatError: the path leads out of the folder.
         """
+
+    def read(self, path: str) -> bytes | None:
+        """Return a file's bytes; None if it does not exist."""
+        try:
+            return bytes(self.tree.read(path))
+        except MissingDataError:
+            return None
 
     @abstractmethod
     def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:

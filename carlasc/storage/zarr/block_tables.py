@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError
 from carlasc.storage.files import parse_json, to_json
 from carlasc.storage.packed.array_fields import ArrayField
 from carlasc.storage.packed.array_layout import FieldLayout, FrameTable
@@ -79,11 +79,10 @@ class StoredField:
         """Return where its frames are; None if the field does not exist."""
         if self._layout is None:
             path = f"{self.node}/{METADATA}"
-            try:
-                metadata = parse_json(bytes(self.target.tree.read(path)), self.target.tree.where(path))
-            except MissingDataError:
+            if (data := self.target.read(path)) is None:
                 return None
-            self._layout = FieldLayout.read(self.where, self.field, metadata.get("attributes"))
+            attributes = parse_json(data, self.target.tree.where(path)).get("attributes")
+            self._layout = FieldLayout.read(self.where, self.field, attributes)
         return self._layout
 
     def create(self, typical: Callable[[], tuple[int, ...]]) -> FieldLayout:
@@ -148,10 +147,8 @@ class StoredField:
     def table(self, block: int) -> FrameTable | None:
         """Return what the table of a block says now; None if the block does not exist."""
         path = table_path(self.node, block)
-        try:
-            return self._parse(self.target.tree.read(path), path)
-        except MissingDataError:
-            return None
+        data = self.target.read(path)
+        return None if data is None else self._parse(data, path)
 
     def _parse(self, data: bytes | memoryview, path: str) -> FrameTable | None:
         """Return a table; None for an empty file, which a power failure can leave: the block is then made again."""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from carlasc.errors import ArgumentError, ConflictError, MissingDataError, StorageError
-from carlasc.storage.durability import rename, replaced
-from carlasc.storage.files import parse_json, to_json
+from carlasc.errors import ArgumentError, ConflictError, StorageError
+from carlasc.storage.files import parse_json, rename, replaced, to_json
 from carlasc.storage.packed.output import remove
 from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
 from carlasc.storage.transport.targets import LocalTarget, Target
@@ -110,11 +109,9 @@ def existing_options(target: Target) -> PackOptions | None:
 
 def read_root(target: Target) -> dict[str, Any] | None:
     """Return the attributes of a zarr store's root, None if there is none."""
-    try:
-        metadata = parse_json(bytes(target.tree.read(METADATA)), target.tree.where(METADATA))
-    except MissingDataError:
+    if (data := target.read(METADATA)) is None:
         return None
-    found = metadata.get("attributes")
+    found = parse_json(data, target.tree.where(METADATA)).get("attributes")
     return found if isinstance(found, dict) else {}
 
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from numpy.typing import NDArray
 
 from carlasc.core.grids import Coordinates
-from carlasc.errors import FormatError, MissingDataError, import_extra
+from carlasc.errors import FormatError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import to_json
 from carlasc.storage.layout import identity_of
@@ -118,7 +118,7 @@ class ZarrWriter(SequenceWriter):
         """Record what a run is going to write: the store cannot be finished without it by accident."""
         self._rows.update(rows or {})
         path = f"{self.group}/{EXPECTED}"
-        there = self._read(path)
+        there = self.target.read(path)
         known = {} if there is None else parse_expected(there, self.target.tree.where(path))
         merged = known | {name: known.get(name, set()) | set(map(int, numbers)) for name, numbers in frames.items()}
         if merged != known:
@@ -172,7 +172,7 @@ class ZarrWriter(SequenceWriter):
     def read_document(self, name: str) -> bytes | None:
         """Return the bytes of a text file, None if it does not exist."""
         check_names([name], self.location)
-        return self._read(f"{self.group}/{document_node(name)}")
+        return self.target.read(f"{self.group}/{document_node(name)}")
 
     def remove_grid(self, grid: str) -> None:
         """Remove the report and the frames of a grid, then its params.json."""
@@ -249,12 +249,6 @@ class ZarrWriter(SequenceWriter):
         held, self._held = self._held, {}
         if held:
             self._put(next(iter(next(iter(held.values())))) // self.block, held)
-
-    def _read(self, path: str) -> bytes | None:
-        try:
-            return bytes(self.target.tree.read(path))
-        except MissingDataError:
-            return None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_held": {}, "_fields": {}, "_keeps": False}

@@ -83,17 +83,16 @@ def encode_scan(scan: Scan, cell_m: float) -> Arrays:
         `box` (6,) int32: first cell and number of cells along each axis. `index`: differences of the rising C-order indices of the cells
         in the box. `offset` (3 N,): position within the cell in steps, axis by axis. `label` of each point, if the scan has labels.
     """
-    cells = np.floor(scan.points.astype(np.float64) / cell_m).astype(np.int64)
-    lower = cells.min(0) if len(cells) else np.zeros(3, np.int64)
-    size = cells.max(0) - lower + 1 if len(cells) else np.ones(3, np.int64)
-    flat = np.ravel_multi_index(tuple((cells - lower).T), tuple(size))
-    index, first = np.unique(flat, return_index=True)
-    inside = scan.points[first] / cell_m - cells[first]
+    cells = np.floor(scan.points.T.astype(np.float64, order="C") / cell_m).astype(np.int64)  # fast axis by axis
+    lower = cells.min(1) if len(scan) else np.zeros(3, np.int64)
+    size = cells.max(1) - lower + 1 if len(scan) else np.ones(3, np.int64)
+    index, first = np.unique(np.ravel_multi_index(tuple(cells - lower[:, None]), tuple(size)), return_index=True)
+    inside = scan.points[first].T / cell_m - cells[:, first]
     offset = np.clip(np.floor(inside * OFFSET_STEPS), 0, OFFSET_STEPS - 1).astype(np.uint8)
     arrays: Arrays = {
         "box": np.concatenate([lower, size]).astype(np.int32),
         "index": _gaps(index),
-        "offset": offset.T.reshape(-1),
+        "offset": offset.reshape(-1),
     }
     if scan.labels is not None:
         arrays["label"] = _narrow(scan.labels[first])
@@ -134,7 +133,7 @@ def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     for array in arrays.values():
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         parts.append(little.view(np.uint8).reshape(-1, array.dtype.itemsize).T.tobytes())
-    return zlib.compress(b"".join(parts), 6)  # level 9 takes twice as long for 1.5 % fewer bytes
+    return zlib.compress(b"".join(parts), 5)  # level 6 takes twice as long for 4 % fewer bytes
 
 
 def _gaps(rising: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError
-from carlasc.storage.durability import make_folder, sync_all
-from carlasc.storage.files import write_output, writing
+from carlasc.running.spreading import StepCounter
+from carlasc.storage.files import make_folder, sync_all, write_output, writing
 from carlasc.storage.packed.output import remove
 from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content, pack_arrays
@@ -216,13 +216,12 @@ class _Writer:
 
     def blocks(self) -> Iterator[bytes]:
         """Yield the frames, each as one block of arrays (see `contents`)."""
-        trails = Trails()
-        for done, frame in enumerate(self.content.frames, 1):
+        trails, step = Trails(), StepCounter(self.progress, len(self.content.frames))
+        for frame in self.content.frames:
             arrays, scores = self.content.read(frame, trails)
             self.scores.append(scores)
             yield pack_arrays(arrays)
-            if self.progress is not None:
-                self.progress(done, len(self.content.frames))
+            step()
 
     def describe(self) -> dict[str, object]:
         """Return the description of the scene, with the scores of the frames that were written."""

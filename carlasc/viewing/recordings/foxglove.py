@@ -15,7 +15,6 @@ Topics, all in right-handed axes with z up; times are seconds since the first fr
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from carlasc.core.geometry import Transform, quaternions_of
 from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
 from carlasc.errors import import_extra
+from carlasc.storage.packed.output import PatientFile
 from carlasc.viewing import colors as palette
 from carlasc.viewing.recordings.content import RecordedFrame, class_surfaces, point_colors
 from carlasc.viewing.scene import GridPanel, SceneReader
@@ -54,7 +54,7 @@ class FoxgloveWriter:
         self._types: Any = import_extra("foxglove.channels", "foxglove")
         self._reader, self._channels = reader, dict[str, Any]()
         self._context = foxglove.Context()
-        self._output = _Output(path)
+        self._output = PatientFile(path, None)
         self._writer = foxglove.open_mcap(self._output, context=self._context)
         self._writer.write_metadata("carlasc", {"sequence": reader.name, "classes": reader.table.name})
         tables = {panel.colors.table.name: panel.colors for panel in reader.panels if panel.colors is not reader.colors}
@@ -128,6 +128,7 @@ class FoxgloveWriter:
         """
         self._writer.close()
         self._output.close()
+        self._output.check()
 
     def _voxels(self, panel: GridPanel, grid: Grid) -> dict[str, Any]:
         """Return a grid as the content of a VoxelGrid: colours, transparent where free, and class ids, in the order z, y, x."""
@@ -270,47 +271,3 @@ def _calibration(camera: CameraModel) -> dict[str, Any]:
         "R": np.eye(3).reshape(-1).tolist(),
         "P": np.column_stack([camera.matrix, np.zeros(3)]).reshape(-1).tolist(),
     }
-
-
-class _Output:
-    """The file, for the SDK, which does not say when one cannot be written: the first error is kept, and what follows is dropped."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("wb", buffering=0)
-        self._error: OSError | None = None
-        self._position = self._end = 0
-
-    def write(self, data: bytes | bytearray) -> int:
-        if self._error is None:
-            self._try(lambda: self._write_all(memoryview(data)))
-        self._position += len(data)
-        self._end = max(self._end, self._position)
-        return len(data)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._end}[whence]
-        if self._error is None:
-            self._try(lambda: self._file.seek(self._position))
-        return self._position
-
-    def flush(self) -> None:
-        """Do nothing: every write goes to the operating system at once."""
-
-    def check(self) -> None:
-        """Raise the error that was kept."""
-        if self._error is not None:
-            raise self._error
-
-    def close(self) -> None:
-        self._try(self._file.close)
-        self.check()
-
-    def _write_all(self, data: memoryview) -> None:
-        while data:
-            data = data[self._file.write(data) :]
-
-    def _try(self, action: Callable[[], object]) -> None:
-        try:
-            action()
-        except OSError as error:
-            self._error = self._error or error

@@ -159,9 +159,10 @@ class Camera:
 
         Directions have length 1 along the camera's forward axis, so that the distance along a ray is the depth.
         """
-        return _rays(
-            self.position, self.axes, self.footprint(height), self.orthographic, width, height, rows.start, rows.stop
-        )
+        origins, directions = np.empty((2, (rows.stop - rows.start) * width, 3), np.float32)
+        step = self.footprint(height)
+        _write_rays(self.position, self.axes, step, self.orthographic, width, height, rows.start, origins, directions)
+        return origins, directions
 
     def project(self, points: ArrayLike, width: int, height: int) -> tuple[Floats, Floats, Floats]:
         """Return pixel column, row and depth of (N, 3) points; a pinhole camera sees only points with a depth above 0."""
@@ -261,10 +262,8 @@ def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[floa
 
 
 @cached(error_model="python")
-def _rays(position, axes, step, flat, width, height, first, last):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    origins = np.empty(((last - first) * width, 3), np.float32)
-    directions = np.empty(((last - first) * width, 3), np.float32)
-    for row in range(first, last):
+def _write_rays(position, axes, step, flat, width, height, first, origins, directions):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    for row in range(first, first + len(origins) // width):
         y = (height / 2 - row - 0.5) * step
         for column in range(width):
             x = (column + 0.5 - width / 2) * step
@@ -273,4 +272,3 @@ def _rays(position, axes, step, flat, width, height, first, last):  # type: igno
                 offset = x * axes[0, a] + y * axes[1, a]
                 origins[i, a] = position[a] + offset if flat else position[a]
                 directions[i, a] = axes[2, a] if flat else offset + axes[2, a]
-    return origins, directions

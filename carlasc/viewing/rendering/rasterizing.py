@@ -14,6 +14,7 @@ from carlasc.core.compiling import cached, jit
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
 
+_Floats = NDArray[np.float32]
 _NEAR_M = 1e-3  # a pinhole camera sees nothing nearer
 
 
@@ -121,27 +122,31 @@ def _cross(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@cached
-def hits(corners, triangle, origins, directions):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    """Return where rays hit given triangles: the weights u and v of the second and third corner, and the depth; float32.
+def hits(corners: _Floats, triangle: NDArray[np.int32], origins: _Floats, directions: _Floats) -> _Floats:
+    """Return where rays hit given triangles, (3, n): the weights u and v of the second and third corner, and the depth.
 
     These are the steps that Embree takes in single precision: Pluecker coordinates with fused products. What depends on the triangle
     and the origin alone is kept for the next ray.
 
     Args:
-        corners: (Q, 4, 3) float32, metres.
-        triangle: (n,) int32, the triangle of each ray, or -1.
-        origins: (n, 3) float32, metres.
-        directions: (n, 3) float32.
+        corners: (Q, 4, 3), metres.
+        triangle: (n,) the triangle of each ray, or -1.
+        origins: (n, 3), metres.
+        directions: (n, 3).
     """
-    u, v = np.zeros(len(triangle), np.float32), np.zeros(len(triangle), np.float32)
-    depth = np.empty(len(triangle), np.float32)
+    found = np.zeros((3, len(triangle)), np.float32)
+    _write_hits(corners, triangle, origins, directions, found)
+    return found
+
+
+@cached
+def _write_hits(corners, triangle, origins, directions, found):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     one, zero = np.float32(1), np.float32(0)
     origin = edge_a = edge_b = edge_c = normal = (zero, zero, zero)
     height, last = zero, -1
     for i in range(len(triangle)):
         if triangle[i] < 0:
-            depth[i] = np.inf
+            found[2, i] = np.inf
             continue
         start, ray = _point(origins[i]), _point(directions[i])
         if triangle[i] != last or start != origin:
@@ -160,9 +165,8 @@ def hits(corners, triangle, origins, directions):  # type: ignore[no-untyped-def
             height = _dot(a, normal)
         beside_b, beside_c = _dot(edge_b, ray), _dot(edge_c, ray)
         inverse = one / (beside_b + beside_c + _dot(edge_a, ray))
-        u[i], v[i] = min(beside_b * inverse, one), min(beside_c * inverse, one)
-        depth[i] = height * (one / _dot(normal, ray))
-    return u, v, depth
+        found[0, i], found[1, i] = min(beside_b * inverse, one), min(beside_c * inverse, one)
+        found[2, i] = height * (one / _dot(normal, ray))
 
 
 @jit

@@ -91,10 +91,11 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
         # Each sample of a pixel uses another point of the sun's disc, which gives soft shadows without further rays.
         columns = np.arange(width) % SAMPLES
         which = (columns[None, :] * SAMPLES + (np.arange(rows.start, rows.stop) % SAMPLES)[:, None]).reshape(-1)
-        starts, towards, facing = _shadow_rays(mesh.normals, triangle, origins, directions, depth, suns, which)
+        facing = np.empty(len(triangle), np.int64)
+        count = _aim_at_sun(mesh.normals, triangle, origins, directions, depth, suns, which, facing)
         shadowed = np.zeros(len(triangle), np.bool_)
-        if len(facing):
-            shadowed[facing] = scene.run(starts, towards, query="OCCLUDED") >= 0
+        if count:
+            shadowed[facing[:count]] = scene.run(origins[:count], directions[:count], query="OCCLUDED") >= 0
         _shade(
             extents,
             mesh.normals,
@@ -144,26 +145,21 @@ def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
 
 
 @cached(error_model="python")
-def _shadow_rays(normals, triangle, origins, directions, depth, suns, which):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    """Return starts and directions of the rays towards the sun from the points that face it, and the samples that they belong to."""
+def _aim_at_sun(normals, triangle, origins, directions, depth, suns, which, facing):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    """Replace the first rays by rays towards the sun from the points that face it, write the samples that they belong to, and return their number."""
     count = 0
-    facing = np.empty(len(triangle), np.int64)
     for i in range(len(triangle)):
-        if triangle[i] >= 0:
-            n, s = normals[triangle[i] >> 1], suns[which[i]]
-            if n[0] * s[0] + n[1] * s[1] + n[2] * s[2] > 0:
-                facing[count] = i
-                count += 1
-    starts = np.empty((count, 3), np.float32)
-    towards = np.empty((count, 3), np.float32)
-    for k in range(count):
-        i = facing[k]
-        n = normals[triangle[i] >> 1]
-        lift = np.float32(2e-3) + np.float32(2e-5) * depth[i]
-        for a in range(3):
-            starts[k, a] = origins[i, a] + depth[i] * directions[i, a] + lift * n[a]
-            towards[k, a] = suns[which[i], a]
-    return starts, towards, facing[:count]
+        if triangle[i] < 0:
+            continue
+        q, s = triangle[i] >> 1, which[i]
+        if normals[q, 0] * suns[s, 0] + normals[q, 1] * suns[s, 1] + normals[q, 2] * suns[s, 2] > 0:
+            lift = np.float32(2e-3) + np.float32(2e-5) * depth[i]
+            for a in range(3):
+                origins[count, a] = origins[i, a] + depth[i] * directions[i, a] + lift * normals[q, a]
+                directions[count, a] = suns[s, a]
+            facing[count] = i
+            count += 1
+    return count
 
 
 @cached(fastmath=True, error_model="python")
@@ -196,13 +192,14 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
             s, t = u[i] + v[i], v[i]
         else:
             s, t = u[i], u[i] + v[i]
-        n, sun = normals[q], suns[which[i]]
+        sun = which[i]
         low = openness[q, 0] * (1 - s) + openness[q, 1] * s
         high = openness[q, 3] * (1 - s) + openness[q, 2] * s
-        ambient = sky[q] * (low * (1 - t) + high * t) * (0.86 + 0.14 * n[2])
+        ambient = sky[q] * (low * (1 - t) + high * t) * (0.86 + 0.14 * normals[q, 2])
         direct = np.float32(0.0)
         if not shadowed[i]:
-            direct = max(np.float32(0.0), n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2])
+            facing = normals[q, 0] * suns[sun, 0] + normals[q, 1] * suns[sun, 1] + normals[q, 2] * suns[sun, 2]
+            direct = max(np.float32(0.0), facing)
         light = _AMBIENT * (0.3 + 0.7 * ambient) + _SUN * direct
 
         pixel = footprint if flat else footprint * depth[i]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError
 from carlasc.running.processes import run_all
-from carlasc.running.spreading import Run
+from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
 from carlasc.viewing.colors import merge_legends
@@ -225,10 +225,10 @@ def _plan_shots(drawer: PictureRenderer, pictures: list[list[Cell]], camera: Cam
 def _reported(
     pictures: Iterator[NDArray[np.uint8]], total: int, progress: Callable[[int, int], None] | None
 ) -> Iterator[NDArray[np.uint8]]:
-    for done, picture in enumerate(pictures, 1):
+    step = StepCounter(progress, total)
+    for picture in pictures:
         yield picture
-        if progress is not None:
-            progress(done, total)
+        step()
 
 
 def _name_after(reader: SceneReader, film: bool) -> Path:

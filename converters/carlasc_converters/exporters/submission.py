@@ -9,10 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from carlasc.core.wording import first_names
-from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.storage.durability import make_folder, rename, sync_tree, unfinished
-from carlasc.storage.files import writing
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, first_names
+from carlasc.storage.files import make_folder, rename, sync_tree, unfinished, writing
 
 Task = Literal["completion", "segmentation"]
 SEQUENCES = range(11, 22)

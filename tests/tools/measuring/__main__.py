@@ -65,20 +65,13 @@ def main() -> int:
     )
     parser.add_argument("--out", type=Path, help="write the figures here, and leave the pages as they are")
     parser.add_argument("--fill", action="store_true", help="measure nothing; fill the pages in from the figures")
-    parser.add_argument(
-        "--accept",
-        action="store_true",
-        help="measure nothing; keep the numbers that the pages hold outside of their places as others",
-    )
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
         _measure_here(given.only[0], SIZES[given.size], given.child)
         return 0
     file = given.out or FILE
-    if given.accept:
-        Figures.read(file).accepting().write(file)
-    is_measured = not (given.fill or given.accept)
+    is_measured = not given.fill
     if is_measured and given.size == "tiny" and not given.out:
         parser.error("tiny figures are no figures: say with --out where they go")
     failed = [] if not is_measured else measure_all(given.only or list(GROUPS), given.size, file)

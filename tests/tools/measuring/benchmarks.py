@@ -114,6 +114,9 @@ FILES: dict[str, dict[str, Row]] = {
         "test_bench_per_class_loop": Row("metrics.confusion.plain", "ms", "the same in plain NumPy"),
         "test_bench_rayiou": Row("metrics.rayiou.carlasc", "ms", "RayIoU, 8 origins x 14,040 rays"),
         "test_bench_rayiou_in_numpy": Row("metrics.rayiou.plain", "ms", "the same in plain NumPy"),
+        "test_bench_all_conventions": Row(
+            "metrics.conventions", "ms", "evaluate --all-conventions, 128 x 128 x 8, per frame", 20
+        ),
         "test_bench_panoptic_quality": Row("metrics.panoptic.carlasc", "ms", "panoptic quality, 39 objects"),
         "test_bench_panoptic_quality_in_numpy": Row("metrics.panoptic.plain", "ms", "the same in plain NumPy"),
     },

@@ -12,16 +12,12 @@ from typing import Any
 
 from faults import figures as faults
 
-from measuring.places import fill, keys, typed_by_hand
+from measuring.facts import CONSTANTS, EXCEPTIONS, FACTS
+from measuring.places import fill, keys, sections, typed_by_hand
 
 ROOT = Path(__file__).parents[3]
 FILE = ROOT / "docs" / "figures.json"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-STRICT = (ROOT / "README.md", ROOT / "docs" / "performance.md")
-"""Pages whose every figure comes from a run, or from the history."""
-
-HISTORY = "history"
-"""The run of figures that cannot be measured again, because what they compare with is gone. They have a date and a machine of their own."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +30,6 @@ class Figure:
         how: what was measured, and how, in a line.
         high: the upper end of a range; None for a single value.
         run: the run that measured it.
-        date: of a figure of the history: when it was measured.
-        machine: of a figure of the history: where.
     """
 
     value: float
@@ -43,8 +37,6 @@ class Figure:
     how: str
     high: float | None = None
     run: str = ""
-    date: str | None = None
-    machine: str | None = None
 
     def __str__(self) -> str:
         if self.high is None or _number(self.value) == _number(self.high):
@@ -81,38 +73,28 @@ class Figures:
     Attributes:
         runs: the processor, its cores, the load, versions, the size and the date of each run, by its name.
         figures: each figure by its key.
-        others: for each page, the numbers with units in its text that no run measures: limits and settings of the code, facts of data sets,
-            results of the studies in docs/studies, and times that were measured once by hand.
     """
 
     runs: dict[str, dict[str, Any]]
     figures: dict[str, Figure]
-    others: dict[str, list[str]]
 
     @classmethod
     def read(cls, file: Path = FILE) -> Figures:
         """Read the file; there are none if it does not exist."""
         if not file.exists():
-            return cls({}, {}, {})
+            return cls({}, {})
         held = json.loads(file.read_text())
         figures = {key: Figure(**figure) for key, figure in held["figures"].items()}
-        return cls(held["runs"], figures, held["others"])
+        return cls(held["runs"], figures)
 
     def updated(self, run: Mapping[str, Any], measured: Mapping[str, Figure]) -> Figures:
         """Return them with what a run measured in place of older figures, without runs of which nothing is left."""
         name = f"{run['date']} {run['size']}"
         new = {key: dataclasses.replace(figure, run=name) for key, figure in measured.items()}
         figures = dict(sorted((self.figures | new).items()))
-        used = {figure.run for figure in figures.values()} - {HISTORY}
+        used = {figure.run for figure in figures.values()}
         runs = {key: held for key, held in (self.runs | {name: dict(run)}).items() if key in used}
-        return Figures(runs, figures, self.others)
-
-    def accepting(self) -> Figures:
-        """Return them with the numbers that the pages hold now outside of their places."""
-        found = {path: sorted(set(typed(path))) for path in PAGES}
-        return dataclasses.replace(
-            self, others={path.relative_to(ROOT).as_posix(): texts for path, texts in found.items() if texts}
-        )
+        return Figures(runs, figures)
 
     def write(self, file: Path = FILE) -> None:
         """Write the file."""
@@ -125,7 +107,7 @@ class Figures:
             | {"unit": figure.unit}
             for key, figure in self.figures.items()
         }
-        file.write_text(json.dumps({"runs": self.runs, "figures": rows, "others": self.others}, indent=1) + "\n")
+        file.write_text(json.dumps({"runs": self.runs, "figures": rows}, indent=1) + "\n")
 
     def texts(self) -> dict[str, str]:
         """Return what a page shows for each key: the figures, where they were measured, and what the faults say of theirs."""
@@ -149,9 +131,14 @@ class Figures:
         return "; ".join(sentences)
 
 
-def typed(path: Path) -> list[str]:
-    """Return the numbers with units that a page holds outside of its places; on the pages of `STRICT`, percentages too."""
-    return typed_by_hand(path.read_text(), shares=path in STRICT)
+def unwritten(path: Path) -> list[str]:
+    """Return the numbers of a page that no figure, study, constant or definition of a file gives, apart from the exceptions."""
+    page = path.relative_to(ROOT).as_posix()
+    if page in FACTS:
+        return []
+    kept = [text for text in sections(path.read_text()) if (page, text.partition("\n")[0]) not in EXCEPTIONS]
+    known = {*CONSTANTS.get(page, ()), *(number for at, number in EXCEPTIONS if at == page)}
+    return [text for text in typed_by_hand("".join(kept)) if text not in known]
 
 
 def _rounded(value: Any) -> Any:

@@ -12,12 +12,17 @@ from collections.abc import Mapping
 
 _PLACE = re.compile(r"<!-- figures(\s.*?)-->(.*?)<!-- figures end -->", re.DOTALL)
 _KEY = re.compile(r"\{([\w.-]+)\}")
-_CODE = re.compile(r"^```.*?^```$|^    .*$|`[^`\n]*`", re.DOTALL | re.MULTILINE)
-_NUMBER = r"(?<![\w.,-])\d[\d,.]*(?: (?:to|and|or) \d[\d.,]*)?"
-_TYPED = re.compile(
-    rf"{_NUMBER}(?: ?(?:ms|us|s|MB|MiB|GB|kB|KiB|MB/s|GB/s)(?![\w/])| (?:seconds?|minutes?|hours?|times)\b| ?x(?! ?\d)\b)"
+_CODE = re.compile(r"^```.*?^```$|^    .*$|`[^`\n]*`|<!--.*?-->|\]\([^)\s]*\)", re.DOTALL | re.MULTILINE)
+_COMMAND = re.compile(r"(?:docs/studies|examples|tests/benchmarks)/\w+\.py")
+_NUMBER = r"(?<![\w.,/-])\d[\d,.]*(?: (?:to|and|or|of) \d[\d.,]*)?"
+_MEASURED = re.compile(
+    rf"{_NUMBER}(?: ?(?:ms|us|s|MB|MiB|GB|GiB|kB|KiB|MB/s|GB/s|%)(?![\w/])| (?:seconds?|minutes?|hours?|times|(?:frames|scans)(?:/s| per second))\b"
+    r"| ?x(?! ?\d)\b)"  # with the unit of a time, a size, a rate, a share or a ratio
+    r"|(?<![\w.,/-])[01]\.\d\d+(?![\d.,]*\d| (?:to|and|or) |,? ?(?:m|cm|mm|degrees?|rad|m/s|Hz)\b)"  # a score
 )
-_SHARE = re.compile(rf"{_NUMBER} ?%")
+_CELL = re.compile(
+    r"[*±~$]*\d[\d,]*(?:\.\d+| ?%| (?:ms|s|MB|GB))(?! ?(?:m|cm|mm|degrees)\b)\**(?: ?(?:±|to |\(|/ ?|/s).*)?"
+)
 
 
 def keys(page: str) -> set[str]:
@@ -44,13 +49,28 @@ def fill(page: str, figures: Mapping[str, str]) -> str:
     return _PLACE.sub(made, page)
 
 
-def typed_by_hand(page: str, *, shares: bool = False) -> list[str]:
-    """Return what looks like a measured time, size or ratio and is not in a place: numbers with such a unit, outside of code.
+def sections(page: str) -> list[str]:
+    """Return what stands before the first heading of the second level of a page, and under each of them; code is left out of nothing."""
+    return re.split(r"^(?=## )", page, flags=re.MULTILINE)
 
-    Args:
-        page: the text of the page.
-        shares: whether percentages count, which on most pages are scores.
+
+def commands(section: str) -> set[str]:
+    """Return the studies and examples that a section names: they make its numbers."""
+    return set(_COMMAND.findall(section))
+
+
+def typed_by_hand(page: str) -> list[str]:
+    """Return the numbers of a page that nothing writes.
+
+    These are times, sizes, rates, shares, ratios and scores in its text, and the cells of its tables with a fraction, a share or such a unit. Numbers
+    in places of figures, in code and in links do not count, and neither do those of a section that names the study or the example that makes them.
+    Lengths, angles, speeds and numbers of things are what is measured with, and count in tables only.
     """
-    parts = _CODE.split(_PLACE.sub("", page))
-    patterns = [_TYPED, _SHARE] if shares else [_TYPED]
-    return [found[0] for part in parts for pattern in patterns for found in pattern.finditer(part)]
+    found: list[str] = []
+    for section in sections(_PLACE.sub("", page)):
+        if not commands(section):
+            for line in _CODE.sub("`", section).splitlines():
+                for cell in map(str.strip, line.split("|")):
+                    is_number = line.startswith("|") and _CELL.fullmatch(cell)
+                    found += [cell] if is_number else [match[0].strip(" .,") for match in _MEASURED.finditer(cell)]
+    return found

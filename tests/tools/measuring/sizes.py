@@ -28,7 +28,7 @@ class Size:
 
 SIZES = {
     "tiny": Size(1, 1, 1, (1,), ("sscnet_full:1",)),
-    "quick": Size(10, 3, 2, (1, 2), ("motionsc:1", "lmscnet_ss:1", "sscnet_full:1")),
+    "quick": Size(10, 3, 2, (1, 2), ("motionsc:1", "lmscnet_ss:1", "sscnet_full:1", "motionsc:5", "baseline:5")),
     "full": Size(40, 10, 5, (1, 2), ("motionsc:1", "lmscnet_ss:1", "sscnet_full:1", "motionsc:5", "baseline:5")),
 }
 

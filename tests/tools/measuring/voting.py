@@ -18,7 +18,7 @@ from carlasc import Run
 from carlasc.captures.town.simulation import simulate
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
-from carlasc.storage.durability import VARIABLE
+from carlasc.storage.files import DURABLE
 from measuring.figures import Figure, ratio, within
 from measuring.sizes import Size, by_turns
 
@@ -93,7 +93,7 @@ def measure_regrid(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
     def run(kind: str, durable: str, workers: int) -> None:
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
-        os.environ[VARIABLE] = durable
+        os.environ[DURABLE] = durable
         assert not regrid(folder / "capture", spec, out / f"a{kind}", run=Run(workers=workers)).failures
 
     cases = {
