@@ -111,7 +111,8 @@ def play(page, folder, programs):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    printed = re.sub(r"^.+: \d+ of \d+ \w+, \d+ s\n", "", ran.stdout, flags=re.MULTILINE)  # progress, on slow machines
+    progress = rf"(?:^|(?<={END}))[^{END}\n]+: \d+ of \d+ \w+, \d+ s\n"  # on slow machines
+    printed = re.sub(progress, "", ran.stdout, flags=re.MULTILINE)
     outputs = [re.fullmatch(r"(.*?)(\d+)", output, re.DOTALL).groups() for output in printed.split(END)[:-1]]
     assert len(outputs) == len(steps), ran.stdout
     return [(*step, found, int(code)) for step, (found, code) in zip(steps, outputs, strict=True)]
