@@ -1,7 +1,7 @@
 """Which voxels of a grid each camera sees: the field `seen`, one bit per camera.
 
 A voxel is seen if a ray from the camera's centre to its own centre is not stopped by an occupied voxel before. This is the rule of Occ3D, with one
-deviation: where the points in a voxel are known, only the box around them stops rays (`carlasc.groundtruth.voting.boxes`), because a pole or a
+deviation: where the points in a voxel are known, only the box around them stops rays (`carlasc.groundtruth.voting.filled`), because a pole or a
 kerb fills a small part of its voxels. An occupied voxel is also seen if a ray reaches the middle of its box. Unknown voxels stop nothing.
 """
 
@@ -18,7 +18,7 @@ from carlasc.core.compiling import cached, jit
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
-from carlasc.groundtruth.voting.boxes import STEPS
+from carlasc.groundtruth.voting.filled import STEPS
 
 MOST_CAMERAS = 8
 """The number of cameras that the bits of a voxel have room for."""

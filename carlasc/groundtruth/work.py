@@ -148,7 +148,9 @@ def run_batch(batch: Batch) -> list[FrameResult]:
         ConflictError: a scan exists already, and differs from that of this run.
         StorageError: nothing can be written, so every other batch would fail in the same way.
     """
-    done = [task.run() for task in batch.tasks]
+    done: list[FrameResult] = []
+    for task in batch.tasks:
+        done.append(task.run())  # noqa: PERF401 (in Python 3.11, a comprehension is a level of calls)
     if not batch.writer.concurrent:
         return done
     try:

@@ -159,7 +159,7 @@ class Ballot:
         keep_boxes: bool = False,
     ) -> None:
         from carlasc.core.cells import Cells
-        from carlasc.groundtruth.voting import boxes, kernel
+        from carlasc.groundtruth.voting import filled, kernel
 
         check_rule(rule, free_step_m)
         if regions is not None and regions.shape != (spec.num_voxels,):
@@ -169,7 +169,7 @@ class Ballot:
         once = rule == "sensor"
         viewed = spec.num_voxels + 1 if count_views else 0
         self._cells, self._outside = Cells.of(spec), dict[int, NDArray[np.int64]]()
-        self._boxes = boxes.no_boxes(spec.num_voxels) if keep_boxes else None
+        self._boxes = filled.no_boxes(spec.num_voxels) if keep_boxes else None
         self._tally = kernel.Tally(
             once,
             free=np.zeros(spec.num_voxels + 1, np.uint32),
@@ -189,7 +189,7 @@ class Ballot:
             FormatError: a label is not below the class table's number of channels; no vote was added.
             ArgumentError: it votes in a region, and the ballot has none.
         """
-        from carlasc.groundtruth.voting import boxes, kernel
+        from carlasc.groundtruth.voting import filled, kernel
 
         self.classes.check(observation.labels, "observation labels")
         hit_region = kernel.ANYWHERE if observation.hit_region is None else observation.hit_region
@@ -220,7 +220,7 @@ class Ballot:
             self._tally,
         )
         if self._boxes is not None:
-            boxes.widen_boxes(cast, self._cells, hit_region, self._tally.regions, self._boxes)
+            filled.widen_boxes(cast, self._cells, hit_region, self._tally.regions, self._boxes)
         self.num_observations += len(ends)
 
     def _apart(self, region: int) -> NDArray[np.int64]:
@@ -287,7 +287,7 @@ class Votes:
         free: (X, Y, Z) unsigned integer, votes for free space.
         occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0) and `voters`
             (int32), the number of observations that they are of, and `sure` (float32), the sum of their probabilities; one row per voxel and class, sorted by voxel, then by label.
-        boxes: (V, 6) uint8, the box around the points of each voxel: see `carlasc.groundtruth.voting.boxes`; None unless they are kept.
+        boxes: (V, 6) uint8, the box around the points of each voxel: see `carlasc.groundtruth.voting.filled`; None unless they are kept.
     """
 
     spec: GridSpec
