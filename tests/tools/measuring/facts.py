@@ -49,7 +49,6 @@ CONSTANTS: dict[str, dict[str, str]] = {  # page -> number as it stands there ->
         "0.15": "carlasc.groundtruth.voting.certainty:SOLID_PER_M",
         "0.02": "carlasc.groundtruth.from_scans.frame:_OUTLIER_PER_M",
     },
-    "docs/howto/cameras.md": {"0.05 s": "carlasc.inspection.image_alignment:_WRONG_S"},
     "docs/howto/converter.md": {"0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S"},
     "docs/howto/many-machines.md": {
         "10 s": "carlasc.running.clusters:_CONNECT_S",
@@ -90,8 +89,6 @@ EXCEPTIONS: dict[tuple[str, str], str] = {  # (page, number or heading of a sect
     ("docs/performance.md", "20 minutes"): "what a run of `make figures` is allowed to take",
     ("docs/commands/audit.md", "0.25"): "the step of a list of turns, which the code writes as a range",
     ("docs/commands/audit.md", "95%"): "the kind of an interval",
-    ("docs/howto/cameras.md", "0.03 s"): "which answers the table counts as right",
-    ("docs/howto/cameras.md", "0.1 s"): "the mistake that a row of the table makes",
     ("docs/sets/argoverse2.md", "15 s"): "how long a drive of the data set is, by its authors",
     ("docs/sets/argoverse2.md", "200 MB"): "the size of a download",
     ("docs/sets/carlaocc.md", "0.10"): "a version of CARLA",
@@ -100,7 +97,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {  # (page, number or heading of a sect
     ("docs/sets/nuscenes.md", "20 s"): "how long a drive of the data set is, by its authors",
     ("docs/storage.md", "100 MiB"): "from where on s3fs sends parts",
     ("docs/studies/networks.md", "## Published results"): "the numbers of the paper",
-    ("docs/studies/networks.md", "## What an earlier version measured"): "the page says which version measured them",
+    ("docs/studies/networks.md", "## What an earlier version measured {#earlier}"): "the page says which version measured them",
 }
 
 _UNITS = {
