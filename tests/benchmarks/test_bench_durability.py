@@ -16,7 +16,7 @@ from carlasc import Run
 from carlasc.captures.town.simulation import simulate
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
-from carlasc.storage.files import VARIABLE
+from carlasc.storage.files import DURABLE
 
 pytestmark = [pytest.mark.slow, pytest.mark.needs("trimesh", "embreex")]
 
@@ -43,7 +43,7 @@ def test_regrid(
     durable: str,
     kind: str,
 ) -> None:
-    monkeypatch.setenv(VARIABLE, durable)
+    monkeypatch.setenv(DURABLE, durable)
     spec, numbers = GridSpec.published("cartesian"), itertools.count()
 
     def run() -> None:
