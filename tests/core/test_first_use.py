@@ -40,7 +40,7 @@ def test_loops_compile_without_the_messages_of_numpy(tmp_path):
         [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True, timeout=120
     )
     compiled = [line.split() for line in ran.stdout.splitlines()]
-    assert {"_count_pairs", "_fill", "hits", "_rays"} <= {name for _, name in compiled}
+    assert {"_count_pairs", "_fill", "_write_hits", "_write_rays"} <= {name for _, name in compiled}
     assert not [name for module, name in compiled if "unicode" in module]
 
 
