@@ -46,7 +46,7 @@ class _Solid(NamedTuple):
     beyond: NDArray[np.float64]
 
     @classmethod
-    def of(cls, occupied: NDArray[np.bool_], spec: GridSpec, boxes: NDArray[np.uint8] | None) -> _Solid:
+    def of(cls, occupied: NDArray[np.bool_], spec: GridSpec, boxes: NDArray[np.uint8] | None = None) -> _Solid:
         """Return what stops rays in a grid: its occupied voxels, or, where points in them are known, the boxes around these."""
         blocks = np.ascontiguousarray(occupied, np.bool_).reshape(-1)
         filled = np.empty((0, 6), np.uint8) if boxes is None else boxes
@@ -119,11 +119,7 @@ def _mark_seen(voxels, eye, solid, bit, seen):  # type: ignore[no-untyped-def]
 
 
 def see_points(
-    points: NDArray[np.floating],
-    occupied: NDArray[np.bool_],
-    spec: GridSpec,
-    eye: NDArray[np.float64],
-    boxes: NDArray[np.uint8] | None = None,
+    points: NDArray[np.floating], occupied: NDArray[np.bool_], spec: GridSpec, eye: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Return (N,) which points no voxel of a grid hides from a place. What is outside of the grid hides nothing.
 
@@ -135,12 +131,11 @@ def see_points(
         occupied: (X, Y, Z) voxels that stop rays.
         spec: the grid, which is Cartesian.
         eye: (3,) metres, the place.
-        boxes: (V, 6) the boxes around the points in each voxel; None: voxels stop rays as a whole.
     """
     lower, edge = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64)
     reached = np.empty(len(points), np.bool_)
     cells = (np.asarray(points, np.float64) - lower) / edge
-    _reach_points(cells, (eye - lower) / edge, _Solid.of(occupied, spec, boxes), reached)
+    _reach_points(cells, (eye - lower) / edge, _Solid.of(occupied, spec), reached)
     return reached
 
 
