@@ -12,8 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -41,7 +41,8 @@ from carlasc.storage.files import write_atomic
 
 SEEDS = {kind: movers_drives.SEEDS[kind] for kind in ("town", "street")}
 WINDOW = (-30, 30)  # scans that show the sides of actors
-ABLATED = 1  # drives of each kind
+CHANGED = 3  # drives of each kind whose data get errors, and whose rays are held out
+PARTS = ("rules", "lidars", "errors", "held out", "128 channels")  # of the page
 UNCHANGED = ("align, flow", "align, instances", "align, evidence")  # beside the ablations
 HELD_OUT = ("tube", "current", "align, flow", "align, exact boxes", "align, evidence")
 BY_NAME = {row.name: row for row in (*ROWS, *ABLATIONS)}
@@ -71,27 +72,34 @@ class Task:
         return self.work / "scores" / str(self.setting) / plain(part) / f"{plain(row)}.json"
 
 
-def tasks_of(arguments: argparse.Namespace, work: Path) -> list[Task]:
-    """Return what is to be done, the most important first."""
+def tasks_of(given: argparse.Namespace) -> list[Task]:
+    """Return what is to be done."""
+    work: Path = given.work
     every, basic, ablations, many, parked = (
         tuple(row.name for row in rows) for rows in (ROWS, BASIC, ABLATIONS, MANY_CHANNELS, PARKED)
     )
-    if arguments.parked:
+    if given.parked:
         return [Task(Setting("parked", seed, 64), tuple(GRIDS), parked, work) for seed in (1, 2, 3)]
     if study.is_tiny():
         some = ("tube", "align, flow", "align, evidence", UNLABELLED)
-        return [Task(Setting(*study.drives(arguments, SEEDS)[0], 32), ("coarse",), some, work)]
-    by_kind = [[(kind, seed) for seed in getattr(arguments, kind)] for kind in SEEDS]
+        return [Task(Setting(*study.drives(given, SEEDS)[0], 32), ("coarse",), some, work)]
+    by_kind = [[(kind, seed) for seed in getattr(given, kind)] for kind in SEEDS]
     drives = [drive for pair in zip(*by_kind, strict=True) for drive in pair]
-    some = drives[: len(by_kind) * ABLATED]
-    tasks = [Task(Setting(*drive, 32), ("coarse",), every, work) for drive in drives]
-    tasks += [Task(Setting(*drive, channels), ("coarse",), basic, work) for channels in (16, 64) for drive in drives]
-    tasks += [Task(Setting(*drive, 32), ("0.2 m",), basic, work) for drive in drives]
-    tasks += [Task(Setting(*drive, 128), ("coarse",), many, work) for drive in some]
-    tasks += [Task(Setting(*drive, 32), ("coarse",), (*UNCHANGED, *ablations), work) for drive in some]
-    tasks += [Task(Setting(*drive, 32), ("coarse",), HELD_OUT, work, held_out=True) for drive in some]
-    tasks += [Task(Setting(*drive, channels), ("0.2 m",), basic, work) for channels in (16, 64) for drive in drives]
-    return tasks
+    some_drives = drives[: len(by_kind) * CHANGED]
+
+    def each(
+        drives: Sequence[tuple[str, int]], lidars: tuple[int, ...], grid: str, rows: tuple[str, ...]
+    ) -> list[Task]:
+        return [Task(Setting(*drive, channels), (grid,), rows, work) for channels in lidars for drive in drives]
+
+    parts = {
+        "rules": each(drives, (32,), "coarse", every),
+        "lidars": [*each(drives, (16, 64), "coarse", basic), *each(drives, (32, 16, 64), "0.2 m", basic)],
+        "errors": each(some_drives, (32,), "coarse", (*UNCHANGED, *ablations)),
+        "held out": [replace(task, held_out=True) for task in each(some_drives, (32,), "coarse", HELD_OUT)],
+        "128 channels": each(some_drives, (128,), "coarse", many),
+    }
+    return [task for part in given.part or PARTS for task in parts[part]]
 
 
 @dataclass(frozen=True)
@@ -213,10 +221,11 @@ def main() -> None:
     """Do all tasks, and write the tables."""
     parser = study.options(__doc__, SEEDS)
     parser.add_argument("--parked", action="store_true", help="seeds 1 to 3 with parked cars, which are judged too")
+    parser.add_argument("--part", choices=PARTS, action="append", help="only this part of the page; may be repeated")
     parser.add_argument("--tables", action="store_true", help="only write the tables of what WORK has")
     parser.add_argument("--workers", type=int, default=2)
     with study.begin(parser) as given:
-        tasks = tasks_of(given, given.work)
+        tasks = tasks_of(given)
         if not given.tables:
             study.do_all(run, tasks, given.workers)
         print(write_tables(tables(tasks), held_out(tasks), given.work / ("parked" if given.parked else "movers")))
