@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -41,8 +41,7 @@ from carlasc.storage.files import write_atomic
 
 SEEDS = {kind: movers_drives.SEEDS[kind] for kind in ("town", "street")}
 WINDOW = (-30, 30)  # scans that show the sides of actors
-CHANGED = 3  # drives of each kind whose data get errors, and whose rays are held out
-PARTS = ("rules", "lidars", "errors", "held out", "128 channels")  # of the page
+PARTS = ("rules", "lidars", "errors", "held out")  # of the page
 UNCHANGED = ("align, flow", "align, instances", "align, evidence")  # beside the ablations
 HELD_OUT = ("tube", "current", "align, flow", "align, exact boxes", "align, evidence")
 BY_NAME = {row.name: row for row in (*ROWS, *ABLATIONS)}
@@ -85,19 +84,17 @@ def tasks_of(given: argparse.Namespace) -> list[Task]:
         return [Task(Setting(*study.drives(given, SEEDS)[0], 32), ("coarse",), some, work)]
     by_kind = [[(kind, seed) for seed in getattr(given, kind)] for kind in SEEDS]
     drives = [drive for pair in zip(*by_kind, strict=True) for drive in pair]
-    some_drives = drives[: len(by_kind) * CHANGED]
 
-    def each(
-        drives: Sequence[tuple[str, int]], lidars: tuple[int, ...], grid: str, rows: tuple[str, ...]
-    ) -> list[Task]:
-        return [Task(Setting(*drive, channels), (grid,), rows, work) for channels in lidars for drive in drives]
+    def each(channels: int, grid: str, rows: tuple[str, ...]) -> list[Task]:
+        return [Task(Setting(*drive, channels), (grid,), rows, work) for drive in drives]
 
+    coarse = [*each(16, "coarse", basic), *each(64, "coarse", basic), *each(128, "coarse", many)]
+    fine = [*each(16, "0.2 m", basic), *each(32, "0.2 m", basic), *each(64, "0.2 m", basic)]
     parts = {
-        "rules": each(drives, (32,), "coarse", every),
-        "lidars": [*each(drives, (16, 64), "coarse", basic), *each(drives, (32, 16, 64), "0.2 m", basic)],
-        "errors": each(some_drives, (32,), "coarse", (*UNCHANGED, *ablations)),
-        "held out": [replace(task, held_out=True) for task in each(some_drives, (32,), "coarse", HELD_OUT)],
-        "128 channels": each(some_drives, (128,), "coarse", many),
+        "rules": each(32, "coarse", every),
+        "lidars": coarse + fine,
+        "errors": each(32, "coarse", (*UNCHANGED, *ablations)),
+        "held out": [replace(task, held_out=True) for task in each(32, "coarse", HELD_OUT)],
     }
     return [task for part in given.part or PARTS for task in parts[part]]
 
