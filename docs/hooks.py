@@ -1,6 +1,7 @@
 """What the documentation takes from the code as it is built: options, the layout, classes, and the pages of the navigation.
 
-A page says `<!-- generated: layout -->` where a table goes. The page of a command ends with its options.
+A page says `<!-- generated: layout -->` where a table goes, and the page of a command ends with `<!-- generated: options -->`. Whoever reads the
+Markdown sees the tables too: `python docs/hooks.py` writes them into the pages, up to `<!-- generated end -->`, and a test compares.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ import tutorials
 
 LOG = logging.getLogger("mkdocs.hooks.carlasc")  # below "mkdocs", so that a strict build counts its warnings
 PAGE_OF = {"unpack": "pack", "finish": "pack", "scores": "evaluate"}  # commands on the page of another one
-_MARKER = re.compile(r"<!-- generated: ([a-z-]+) -->")
+_PLACE = re.compile(r"(<!-- generated: ([a-z-]+) -->\n).*?(<!-- generated end -->)", re.DOTALL)
 
 
 def on_config(config: Any) -> Any:
@@ -56,11 +57,15 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Fill in generated tables."""
-    folder, _, name = page.file.src_uri.removesuffix(".md").rpartition("/")
-    text = _MARKER.sub(lambda match: _generate(match[1], page.file.src_uri), markdown)
-    commands = [command for command in command_names() if PAGE_OF.get(command, command) == name]
-    return "\n\n".join([text, *map(options_of, commands)]) if folder == "commands" else text
+    """Fill in generated tables, whatever the page has in their places."""
+    return _PLACE.sub(
+        lambda match: match[0].removeprefix(match[1]).removesuffix(match[3]), fill(markdown, page.file.src_uri)
+    )
+
+
+def fill(markdown: str, page: str) -> str:
+    """Return the text of a page with its generated tables as the code has them now."""
+    return _PLACE.sub(lambda match: f"{match[1]}\n{_generate(match[2], page)}\n\n{match[3]}", markdown)
 
 
 def command_names() -> list[str]:
@@ -74,11 +79,11 @@ def options_of(command: str) -> str:
     panels: dict[str, list[str]] = {}
     for row, panel in _parameters(function):
         panels.setdefault(panel, []).append(row)
-    parts = [f"## Options of carlasc {command}", "", f"As `carlasc {command} --help` lists them.", ""]
-    for panel, rows in panels.items():
+    parts = [f"## Options of carlasc {command}", ""]
+    for panel, rows in sorted(panels.items(), key=lambda item: item[0] != ""):  # those of the command alone come first
         parts += [f"**{panel}**", ""] if panel else []
         parts += ["| option | default | |", "|---|---|---|", *rows, ""]
-    return "\n".join(parts)
+    return "\n".join(parts).rstrip()
 
 
 def _parameters(function: Callable[..., None]) -> Iterator[tuple[str, str]]:
@@ -221,7 +226,7 @@ def _exported_classes(table: ClassTable) -> str:
 
 def _swatch(table: ClassTable, index: int) -> str:
     color = "#{:02x}{:02x}{:02x}".format(*table.colors[index])
-    return f'<span style="background:{color};border:1px solid #888;padding:0 .9em"></span>'
+    return f'<span style="background:{color};border:1px solid #888;padding:0 .9em"></span> `{color}`'
 
 
 _TABLES: dict[str, Callable[[], str]] = {
@@ -236,9 +241,12 @@ _TABLES: dict[str, Callable[[], str]] = {
 
 
 def _generate(name: str, page: str) -> str:
+    if name == "options":
+        title = page.removeprefix("commands/").removesuffix(".md")
+        return "\n\n".join(options_of(command) for command in command_names() if PAGE_OF.get(command, command) == title)
     if name in _TABLES:
         return _TABLES[name]()
-    LOG.warning("%s: expected one of %s to generate, found %s", page, ", ".join(_TABLES), name)
+    LOG.warning("%s: expected options or one of %s to generate, found %s", page, ", ".join(_TABLES), name)
     return ""
 
 
@@ -274,3 +282,11 @@ def _expand(nav: list[Any], docs: Path, named: set[str]) -> list[Any]:
         else:
             expanded.append(item)
     return expanded
+
+
+if __name__ == "__main__":
+    docs = Path(__file__).parent
+    for path in docs.rglob("*.md"):
+        if (text := path.read_text()) != (filled := fill(text, path.relative_to(docs).as_posix())):
+            path.write_text(filled)
+            print(path)

@@ -1,4 +1,4 @@
-"""What carlasc.json says of a sequence, and the version of the files that carlasc adds. See `docs/format.md#carlasc-json`."""
+"""What carlasc.json says of a sequence, and the version of the files that carlasc adds. See `docs/format.md#carlascjson`."""
 
 from __future__ import annotations
 

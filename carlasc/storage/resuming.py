@@ -2,7 +2,7 @@
 
 A grid's params.json holds the five published keys and, under `carlasc`, a record of how the grid was made. A run continues a grid only
 if both are equal to its own. A grid without a record is published data and is never written to. See the format page,
-`docs/format.md#params-json`.
+`docs/format.md#the-record-in-paramsjson`.
 """
 
 from __future__ import annotations

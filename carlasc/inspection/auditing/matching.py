@@ -80,7 +80,7 @@ class MatchedGrids:
             FormatError: it is not known.
         """
         if self.grids.spec is None:
-            expected, advice = "grids of known geometry", "add params.json: docs/format.md#params-json"
+            expected, advice = "grids of known geometry", "add params.json: docs/format.md#the-record-in-paramsjson"
             found = "a folder without params.json"
             raise FormatError(self.grids.location, expected=expected, found=found, advice=advice)
         return self.grids.spec
