@@ -52,7 +52,7 @@ unit: $(VENV)/ready ## the quick tests
 benchmark: $(VENV)/ready ## time the hot paths (docs/performance.md)
 	$(RUN)/pytest tests/benchmarks --benchmark-enable --benchmark-only -p no:xdist -m slow
 
-faults: $(VENV)/ready ## kill, damage and deceive every command, and publish the figures, minutes (SIZE=long: hours; COUNT=N cases of each kind)
+faults: $(VENV)/ready ## kill, damage and deceive every command, and publish the figures, half an hour (SIZE=long: hours; COUNT=N cases of each kind)
 	@$(RUN)/python -c "import atheris" 2>/dev/null || $(RUN)/pip install --quiet --constraint constraints.txt "atheris>=3.0" \
 		|| echo "atheris cannot be installed here: mutations that are guided by coverage are left out"
 	PYTHONPATH=tests:tests/tools:examples $(RUN)/python -m faults --size $(or $(SIZE),quick) $(if $(COUNT),--count $(COUNT))

@@ -1,4 +1,4 @@
-"""`carlasc`: the SDK for CarlaSC, the data set of complete, trace-free semantic scenes.
+"""`carlasc`: the SDK for CarlaSC, the data set of complete semantic scenes without ghost trails.
 
 Importing it loads nothing heavy: a public name, or a room such as `carlasc.metrics`, is loaded on first use.
 """

@@ -30,7 +30,7 @@ class FromScans:
         stride: use every N-th scan of the window, counted from the frame itself.
         dynamic: what happens to moving points. "align": each moving actor is completed from all scans, at its position in the
             frame; "current": only the frame's own moving points are used; "drop": none; "tube": all points stay where they
-            were seen, as in SemanticKITTI, and moving actors leave traces.
+            were seen, as in SemanticKITTI, and moving actors leave ghost trails.
         complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown; "mirror": a vehicle's side that was
             not seen is taken from its other side; "body": and what is still missing from vehicles of the same drive that were seen well, or
             from the usual shape of vehicles. These voxels are marked as inferred.

@@ -1,4 +1,4 @@
-"""Merging the scans of one sensor over time, without traces of moving actors.
+"""Merging the scans of one sensor over time, without ghost trails of moving actors.
 
 Plain voting would remove moving actors: the free space that other scans saw in their voxels has more votes. So the static scene and each
 actor are voted on separately. In the box of an actor, the points and rays of every scan vote after the actor's motion has moved them to the
