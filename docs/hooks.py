@@ -65,6 +65,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def fill(markdown: str, page: str) -> str:
     """Return the text of a page with its generated tables as the code has them now."""
+    markdown = re.sub(r"\(\.\./examples/notebooks/(\w+)\.ipynb\)", r"(tutorials/\1.md)", markdown)  # pages of the site
     return _PLACE.sub(lambda match: f"{match[1]}\n{_generate(match[2], page)}\n\n{match[3]}", markdown)
 
 

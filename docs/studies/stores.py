@@ -1,13 +1,16 @@
 """How small packed stores are: `python docs/studies/stores.py` prints the tables of docs/storage.md and docs/studies/stores.md.
 
 A simulated drive of full scans (64 channels, ground truth from 20 sensors, medium traffic, seed 0) is packed into each store. Shares are of the
-fields that the published download has: `instances` is not among them, and the bird's-eye pictures are. Codecs are compared on the points of one scan, in one
+fields that the published download has: `instances` is not among them, and the bird's-eye pictures are. "zip" are the same files as a zip
+has them. Codecs are compared on the points of one scan, in one
 thread: the least processor time of ten turns.
 """
 
 from __future__ import annotations
 
 import time
+import zlib
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,6 +40,15 @@ FIELDS = {  # of the store's fields, the row of the table
     "documents": "text files, index",
     "index": "text files, index",
 }
+FILES = {  # folder and suffix of the files of a field
+    "velodyne.bin": "points",
+    "labels.label": "labels",
+    "predictions.bin": "flow",
+    "instances.label": "instances",
+    "evaluation.label": "evaluation/labels",
+    "evaluation.bin": "evaluation/counts",
+    "bev.jpg": "bev",
+}
 ALL_FRAMES = 43_200
 CODECS = {
     "Blosc Zstandard 5, bytes shuffled, 512 KiB blocks": Blosc("zstd", 5, Blosc.SHUFFLE, 512 << 10),
@@ -62,8 +74,17 @@ def measure(folder: Path, size: str) -> tuple[int, dict[str, dict[str, int]]]:
     found: dict[str, dict[str, int]] = {}
     for name, (store, small) in STORES.items():
         result = carlasc.pack(folder / "data", folder / store, small=small, run=run)
-        found |= {"published": result.published_bytes, name: result.stored_bytes}
+        found |= {"published": result.published_bytes, "zip": zipped(drive / "cartesian"), name: result.stored_bytes}
     return frames, found
+
+
+def zipped(sequence: Path) -> dict[str, int]:
+    """Return the bytes per field of the files of a sequence in a zip, each compressed by itself."""
+    sizes: Counter[str] = Counter()
+    for file in filter(Path.is_file, sequence.rglob("*")):
+        field = FILES.get(file.parent.name + file.suffix, "documents")
+        sizes[field] += len(zlib.compress(file.read_bytes()))
+    return dict(sizes)
 
 
 def rows(frames: int, found: dict[str, dict[str, int]]) -> list[str]:
