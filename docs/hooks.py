@@ -57,15 +57,17 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Fill in generated tables, whatever the page has in their places."""
+    """Fill in generated tables, whatever the page has in their places, and link the pages of the notebooks."""
+    text = re.sub(
+        r"\(\.\./examples/notebooks/(\w+)\.ipynb\)", r"(tutorials/\1.md)", markdown
+    )  # they are pages of the site
     return _PLACE.sub(
-        lambda match: match[0].removeprefix(match[1]).removesuffix(match[3]), fill(markdown, page.file.src_uri)
+        lambda match: match[0].removeprefix(match[1]).removesuffix(match[3]), fill(text, page.file.src_uri)
     )
 
 
 def fill(markdown: str, page: str) -> str:
     """Return the text of a page with its generated tables as the code has them now."""
-    markdown = re.sub(r"\(\.\./examples/notebooks/(\w+)\.ipynb\)", r"(tutorials/\1.md)", markdown)  # pages of the site
     return _PLACE.sub(lambda match: f"{match[1]}\n{_generate(match[2], page)}\n\n{match[3]}", markdown)
 
 

@@ -87,6 +87,7 @@ CONSTANTS: dict[str, dict[str, str]] = {  # page -> number as it stands there ->
 
 EXCEPTIONS: dict[tuple[str, str], str] = {  # (page, number or heading of a section) -> why it is right; at most 20
     ("docs/performance.md", "20 minutes"): "what a run of `make figures` is allowed to take",
+    ("docs/index.md", "0.7 GB"): "the size of a download of torch",
     ("docs/commands/audit.md", "0.25"): "the step of a list of turns, which the code writes as a range",
     ("docs/commands/audit.md", "95%"): "the kind of an interval",
     ("docs/sets/argoverse2.md", "15 s"): "how long a drive of the data set is, by its authors",

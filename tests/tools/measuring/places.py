@@ -12,7 +12,10 @@ from collections.abc import Mapping
 
 _PLACE = re.compile(r"<!-- figures(\s.*?)-->(.*?)<!-- figures end -->", re.DOTALL)
 _KEY = re.compile(r"\{([\w.-]+)\}")
-_CODE = re.compile(r"^```.*?^```$|^    .*$|`[^`\n]*`|<!--.*?-->|\]\([^)\s]*\)", re.DOTALL | re.MULTILINE)
+_GENERATED = r"<!-- generated: .*?<!-- generated end -->"  # tables of the code, which another test compares
+_CODE = re.compile(
+    rf"{_GENERATED}|^```.*?^```$|^    .*$|`[^`\n]*`|<!--.*?-->|\]\([^)\s]*\)", re.DOTALL | re.MULTILINE
+)
 _COMMAND = re.compile(r"(?:docs/studies|examples|tests/benchmarks)/\w+\.py")
 _NUMBER = r"(?<![\w.,/-])\d[\d,.]*(?: (?:to|and|or|of) \d[\d.,]*)?"
 _MEASURED = re.compile(
