@@ -12,10 +12,8 @@ from collections.abc import Mapping
 
 _PLACE = re.compile(r"<!-- figures(\s.*?)-->(.*?)<!-- figures end -->", re.DOTALL)
 _KEY = re.compile(r"\{([\w.-]+)\}")
-_GENERATED = r"<!-- generated: .*?<!-- generated end -->"  # tables of the code, which another test compares
-_CODE = re.compile(
-    rf"{_GENERATED}|^```.*?^```$|^    .*$|`[^`\n]*`|<!--.*?-->|\]\([^)\s]*\)", re.DOTALL | re.MULTILINE
-)
+_CODE = re.compile(r"^```.*?^```$|^    .*$|`[^`\n]*`|<!--.*?-->|\]\([^)\s]*\)", re.DOTALL | re.MULTILINE)
+_GENERATED = re.compile(r"<!-- generated: .*?<!-- generated end -->", re.DOTALL)
 _COMMAND = re.compile(r"(?:docs/studies|examples|tests/benchmarks)/\w+\.py")
 _NUMBER = r"(?<![\w.,/-])\d[\d,.]*(?: (?:to|and|or|of) \d[\d.,]*)?"
 _MEASURED = re.compile(
@@ -53,8 +51,8 @@ def fill(page: str, figures: Mapping[str, str]) -> str:
 
 
 def sections(page: str) -> list[str]:
-    """Return what stands before the first heading of the second level of a page, and under each of them; code is left out of nothing."""
-    return re.split(r"^(?=## )", page, flags=re.MULTILINE)
+    """Return what stands before the first heading of the second level of a page, and under each of them; code is left out of nothing, tables that the code writes are."""
+    return re.split(r"^(?=## )", _GENERATED.sub("", page), flags=re.MULTILINE)
 
 
 def commands(section: str) -> set[str]:
