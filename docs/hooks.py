@@ -38,6 +38,8 @@ import tutorials
 
 LOG = logging.getLogger("mkdocs.hooks.carlasc")  # below "mkdocs", so that a strict build counts its warnings
 PAGE_OF = {"unpack": "pack", "finish": "pack", "scores": "evaluate"}  # commands on the page of another one
+_MEMBER = re.compile(r'<h3 id="(carlasc[\w.]*)\.(\w+)" class="doc doc-heading">\s*<code[^>]*>')  # of a module
+_MODULE = re.compile(r"^::: (carlasc[\w.]*)$(?!\n    options:)", re.MULTILINE)  # without a list of members
 _PLACE = re.compile(r"(<!-- generated: ([a-z-]+) -->\n).*?(<!-- generated end -->)", re.DOTALL)
 
 
@@ -58,12 +60,37 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Fill in generated tables, whatever the page has in their places, and link the pages of the notebooks."""
+    markdown = _MODULE.sub(lambda match: match[0] + _members(match[1]), markdown)
     text = re.sub(
         r"\(\.\./examples/notebooks/(\w+)\.ipynb\)", r"(tutorials/\1.md)", markdown
     )  # they are pages of the site
     return _PLACE.sub(
         lambda match: match[0].removeprefix(match[1]).removesuffix(match[3]), fill(text, page.file.src_uri)
     )
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Give classes and functions the name by which they are imported, not that of the module that holds them."""
+    return _MEMBER.sub(lambda match: match[0] + _import_prefix(match[1], match[2]), html)
+
+
+def _import_prefix(module: str, name: str) -> str:
+    """Return "carlasc." or "carlasc.<room>.", whichever exports a name of a module; nothing if none does."""
+    member = getattr(importlib.import_module(module), name, None)
+    room = ".".join(module.split(".")[:2])
+    homes = ((home, importlib.import_module(home)) for home in ("carlasc", room))
+    return next((f"{home}." for home, package in homes if member is getattr(package, name, home)), "")
+
+
+def _members(module: str) -> str:
+    """Return which members of a module are documented if its page names none: its classes, and what else of it is exported."""
+    if importlib.util.find_spec(module) is None:  # it is a function
+        return ""
+    found = importlib.import_module(module)
+    own = re.findall(r"^(?:class |def )?([A-Za-z]\w*)\b", inspect.getsource(found), re.MULTILINE)
+    members = {name: vars(found)[name] for name in own if name in vars(found)}
+    names = [name for name, value in members.items() if inspect.isclass(value) or _import_prefix(module, name)]
+    return f"\n    options: {{ members: {names} }}"
 
 
 def fill(markdown: str, page: str) -> str:

@@ -100,6 +100,8 @@ def test_the_site_builds_without_a_warning(site):
     assert "--free-step-m" in (site / "commands" / "regrid.html").read_text()
     pack = (site / "commands" / "pack.html").read_text()
     assert "--lossy-mm" in pack and "--incomplete" in pack  # the options of all commands of the page
+    api = re.sub(r"<[^>]*>", "", (site / "api" / "groundtruth.html").read_text())
+    assert "carlasc.regrid(source" in api and "carlasc.groundtruth.RegridResult" in api  # public names
     assert not list(site.rglob("*.py"))
     # Opened from the disk, the menu leads to files and the search has its index; nothing is fetched from another host.
     assert (site / "search" / "search_index.js").is_file()
