@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import carlasc
 from carlasc import cli
 from carlasc.converting import converter_names, exporter_names
 
@@ -320,6 +321,11 @@ def test_pages_hold_the_tables_that_the_code_has_now(hooks):
     assert all(
         "<!-- generated: options -->" in PAGES[page].read_text() for page in PAGES if page.startswith("commands/")
     )
+
+
+def test_the_api_lists_every_public_name():
+    listed = re.findall(r"`(?:carlasc\.)?(\w+)`", PAGES["api/index.md"].read_text())
+    assert set(carlasc.__all__) <= set(listed)
 
 
 def test_no_page_is_only_api():
