@@ -160,7 +160,7 @@ def _default(default: Any, info: ParameterInfo) -> str:
         return "required"
     if isinstance(info.show_default, str):
         return info.show_default
-    if default is None or default is False:
+    if default is None or default is False or default == "":
         return ""
     return f"`{default.value if isinstance(default, Enum) else default}`"
 
