@@ -1,4 +1,4 @@
-"""Ground truth of a converted SemanticKITTI drive, with and without traces: `python docs/studies/kitti.py`.
+"""Ground truth of a converted SemanticKITTI drive, with and without ghost trails: `python docs/studies/kitti.py`.
 
 A simulated drive in heavy traffic is written as SemanticKITTI's files (right-handed, camera poses, moving classes, instances, no flow) and converted, and
 each rule's grids are scored against what 60 other sensors see at the same instant. `tube` is the rule by which SemanticKITTI's own voxels
