@@ -26,6 +26,7 @@ CONSTANTS: dict[str, dict[str, str]] = {  # page -> number as it stands there ->
         "30%": "carlasc.inspection.auditing.judging:_OWN",
     },
     "docs/commands/capture.md": {"0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S"},
+    "docs/commands/convert.md": {"5%": "carlasc.groundtruth.heights:_BELOW"},
     "docs/commands/demo.md": {"240 MB": "carlasc.demo:_EXTRA_MB"},
     "docs/commands/evaluate.md": {
         "0.05 s": "carlasc.metrics.forecasts:_TOLERANCE_S",
