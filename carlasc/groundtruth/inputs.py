@@ -153,7 +153,7 @@ class FrameInput(ABC):
         return None
 
     def residuals(self) -> Mapping[int, Residual]:
-        """Return how well the sightings of the moving actors in the frame overlay with the next ones, by number of the actor."""
+        """Return how well the observations of the moving actors in the frame overlay with the next ones, by number of the actor."""
         return {}
 
 

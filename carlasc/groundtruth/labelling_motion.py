@@ -183,10 +183,10 @@ def points_of_actors(
         if scan.labels is not None:  # wheels are near the ground, and are none
             ground &= ~np.isin(scan.labels, sorted(classes.movable))
     if "boxes" in feed.sequence.fields() and (boxes := feed.sequence.boxes(frame)) is not None:
-        standing = boxes.select(~np.isin(boxes.tracks, list(moving)))
-        row = standing.owners(scan.points)
+        static = boxes.select(~np.isin(boxes.tracks, list(moving)))
+        row = static.owners(scan.points)
         boxed = (row >= 0) & (numbers == 0) & ~ground
-        numbers[boxed] = standing.tracks[row[boxed]]
+        numbers[boxed] = static.tracks[row[boxed]]
     rows = _Rows(scan.points)
     tracks = [(n, t) for n, t in actors.tracks.items() if t.pose(frame) is not None]
     for number, track in sorted(tracks, key=lambda item: -float(np.prod(item[1].size))):

@@ -16,7 +16,7 @@ from carlasc.captures.raw import SensorRecording
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.motion.segments import MIN_SPEED_M_S
-from carlasc.motion.tracks import FIRST_MOVER, Track
+from carlasc.motion.tracks import FIRST_FOUND, Track
 from carlasc.storage.field_files import VELOCITY_DTYPE
 
 _POINTS_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("actor", np.uint32), ("points", np.int64)])
@@ -151,7 +151,7 @@ def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, in
     """
     order = sorted(tracks, key=lambda number: (tracks[number].first, number))
     group = {number: number for number in order}
-    numbers = {n: t.instance for n, t in tracks.items() if 0 < t.instance < FIRST_MOVER}
+    numbers = {n: t.instance for n, t in tracks.items() if 0 < t.instance < FIRST_FOUND}
 
     def root(number: int) -> int:
         while group[number] != number:

@@ -1,6 +1,6 @@
 """Bodies: how large an actor is, although no scan saw all of it.
 
-A scan sees only the faces of an actor that are turned to the sensor. Pooled over its whole track, the sightings show some of its faces; a
+A scan sees only the faces of an actor that are turned to the sensor. Pooled over its whole track, the observations show some of its faces; a
 car that drives ahead shows its rear alone. Length and width are known if they can be read off the faces that were seen. Otherwise they are
 those of similar actors of the same data, or of a table, and the body extends from the face that was seen away from the sensor.
 """
@@ -42,7 +42,7 @@ _LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M, _LORRY_TOP_M, _VAN_HIGH_M = 2.25, 2
 
 @dataclass(frozen=True)
 class Extent:
-    """What the sightings of an actor show of its size.
+    """What the observations of an actor show of its size.
 
     Attributes:
         lower: (3,) metres, lower corner of the box around its points, actor frame (x forward, y to the side).
@@ -82,16 +82,16 @@ class Extent:
         return rear and front and (low or high) and all(self.plausible)
 
 
-def measure(sightings: Sequence[NDArray[np.float64]], sensors: NDArray[np.float64]) -> Extent:
-    """Return what sightings show of an actor's size.
+def measure(observations: Sequence[NDArray[np.float64]], sensors: NDArray[np.float64]) -> Extent:
+    """Return what observations show of an actor's size.
 
     Args:
-        sightings: (M, 3) points of the actor in each scan, metres, actor frame.
+        observations: (M, 3) points of the actor in each scan, metres, actor frame.
         sensors: (F, 3) position of the sensor in each scan, metres, actor frame.
     """
-    points = np.concatenate(list(sightings))
+    points = np.concatenate(list(observations))
     lower, upper = np.quantile(points, _TRIM, axis=0), np.quantile(points, 1 - _TRIM, axis=0)
-    return seen_from(lower, upper, np.array([len(sighting) for sighting in sightings]), sensors)
+    return seen_from(lower, upper, np.array([len(observation) for observation in observations]), sensors)
 
 
 def seen_from(

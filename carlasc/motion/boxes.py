@@ -1,7 +1,7 @@
 """Tracks from annotated boxes: the boxes of one object over time, smoothed, and the points of a scan that are in them.
 
 A person draws each box some centimetres and a degree off, which blurs what is merged. Boxes therefore follow the points that are in them: the
-sightings of a moving object are laid on each other, as those of actors without boxes are, but each stays near the smoothed box of its
+observations of a moving object are laid on each other, as those of actors without boxes are, but each stays near the smoothed box of its
 scan. So objects that few rays hit stay where they were drawn.
 """
 
@@ -17,14 +17,14 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
 from carlasc.core.scans import Scan, finite
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent
-from carlasc.motion.paths import MIN_POINTS, best_sighting, corrections
+from carlasc.motion.paths import MIN_POINTS, best_observation, corrections
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.solving import nearest_rotation, resample, smooth
 from carlasc.motion.tracks import Track
 
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
 _FILLED_IN = 0.3  # weight of a box that was not annotated in its frame
-_STANDING_M = 1.0  # annotated boxes of an object that stands may move this far, but not steadily
+_STATIC_M = 1.0  # annotated boxes of an object that stands may move this far, but not steadily
 _STEADY_M, _STEADY = 0.3, 5.0  # a shorter way counts if it is so many times as long as its deviation from a line
 _HOLD_S = 1.0  # an object that stands for this long stands in all frames
 _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last box
@@ -89,7 +89,7 @@ def tracks_from_boxes(
     return [
         _make_track(track, part, known, seconds, deformable)
         for track in sorted(found)
-        for part in _split_at_jumps(_sightings([(frame, world[frame], row) for frame, row in found[track]], times))
+        for part in _split_at_jumps(_boxes_of([(frame, world[frame], row) for frame, row in found[track]], times))
     ]
 
 
@@ -165,7 +165,7 @@ def _inside(
     return near[inside & above]
 
 
-def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
+def _boxes_of(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
     """Return the boxes of one object, given as (frame, boxes of the frame in the world frame, row)."""
     chosen = [boxes.select(np.array([row])) for _, boxes, row in found]
     frames = np.array([frame for frame, _, _ in found], np.int64)
@@ -179,37 +179,37 @@ def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) 
     )
 
 
-def _split_at_jumps(sightings: _ObjectBoxes) -> list[_ObjectBoxes]:
+def _split_at_jumps(boxes: _ObjectBoxes) -> list[_ObjectBoxes]:
     """Split the boxes of a number where no object can get from one to the next."""
-    steps = np.linalg.norm(np.diff(sightings.poses[:, :3, 3], axis=0), axis=1)
-    jumps = np.flatnonzero(steps > _JUMP_M + _MAX_SPEED_M_S * np.diff(sightings.seconds)) + 1
-    return [sightings.part(rows) for rows in np.split(np.arange(len(sightings.frames)), jumps)]
+    steps = np.linalg.norm(np.diff(boxes.poses[:, :3, 3], axis=0), axis=1)
+    jumps = np.flatnonzero(steps > _JUMP_M + _MAX_SPEED_M_S * np.diff(boxes.seconds)) + 1
+    return [boxes.part(rows) for rows in np.split(np.arange(len(boxes.frames)), jumps)]
 
 
 def _make_track(
     instance: int,
-    sightings: _ObjectBoxes,
+    boxes: _ObjectBoxes,
     known: NDArray[np.int64],
     known_seconds: NDArray[np.float64],
     deformable: Collection[int],
 ) -> Track:
     """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence, increasing, and their times."""
-    seconds, centers = sightings.seconds, sightings.poses[:, :3, 3]
-    headings, tilt = _headings_and_tilt(sightings.poses[:, :3, :3])
+    seconds, centers = boxes.seconds, boxes.poses[:, :3, 3]
+    headings, tilt = _headings_and_tilt(boxes.poses[:, :3, :3])
     frames, at = known, known_seconds
-    path, speed = smooth(centers, seconds, sightings.weights, _SMOOTH_S)
-    stands = _stands(path, centers, seconds)
-    if stands:
+    path, speed = smooth(centers, seconds, boxes.weights, _SMOOTH_S)
+    static = _is_static(path, centers, seconds)
+    if static:
         path, speed = np.tile(np.median(centers, axis=0), (len(seconds), 1)), np.zeros_like(speed)
         turns = np.full(len(seconds), np.median(headings))
     else:
-        turns = smooth(headings[:, None], seconds, sightings.weights, _SMOOTH_S)[0][:, 0]
-    if not stands or seconds[-1] - seconds[0] < _HOLD_S:
+        turns = smooth(headings[:, None], seconds, boxes.weights, _SMOOTH_S)[0][:, 0]
+    if not static or seconds[-1] - seconds[0] < _HOLD_S:
         inside = (at > seconds[0] - _EXTRAPOLATE_S) & (at < seconds[-1] + _EXTRAPOLATE_S)
         frames = frames[inside]
     every = np.arange(frames[0], frames[-1] + 1)
     at = np.interp(every, known, known_seconds)
-    if stands:  # one pose for all frames, in the memory of one
+    if static:  # one pose for all frames, in the memory of one
         pose = multiply(rotation_z(turns[0]), tilt)
         pose[:3, 3] = path[0]
         poses, speed = np.broadcast_to(pose, (len(every), 4, 4)), np.broadcast_to(speed[0], (len(every), 3))
@@ -217,7 +217,7 @@ def _make_track(
         path, speed = resample(at, seconds, path, speed)
         poses = np.stack([multiply(rotation_z(angle), tilt) for angle in np.interp(at, seconds, turns)])
         poses[:, :3, 3] = path
-    half, label = np.median(sightings.sizes, axis=0) / 2, int(np.bincount(sightings.labels).argmax())
+    half, label = np.median(boxes.sizes, axis=0) / 2, int(np.bincount(boxes.labels).argmax())
     return Track(
         label=label,
         instance=instance,
@@ -247,7 +247,7 @@ def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float
     return headings, tilt
 
 
-def _stands(path: NDArray[np.float64], centers: NDArray[np.float64], seconds: NDArray[np.float64]) -> bool:
+def _is_static(path: NDArray[np.float64], centers: NDArray[np.float64], seconds: NDArray[np.float64]) -> bool:
     """Return whether an object stands, from its smoothed path (F, 3) and the (F, 3) centres of its boxes, metres, world."""
     duration = float(seconds[-1] - seconds[0])
     if duration <= 0:
@@ -261,7 +261,7 @@ def _stands(path: NDArray[np.float64], centers: NDArray[np.float64], seconds: ND
         return False
     extent = float(np.hypot(*np.ptp(path[:, :2], axis=0)))
     slow = _fastest(path, seconds) < MIN_SPEED_M_S
-    return extent < _STANDING_M or slow
+    return extent < _STATIC_M or slow
 
 
 def _fastest(path: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
@@ -274,11 +274,11 @@ def _fastest(path: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
 
 
 _DRAWN = np.array([0.05, 0.05, 0.03, 0.01])  # error of a smoothed box: x, y, z in metres, yaw in radians
-_MIN_SIGHTINGS = 5  # with fewer, there is nothing to lay on each other
+_MIN_OBSERVATIONS = 5  # with fewer, there is nothing to lay on each other
 
 
 def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int, float]) -> Track:
-    """Return the track of an object's boxes with poses under which its sightings fit each other.
+    """Return the track of an object's boxes with poses under which its observations fit each other.
 
     The mean of all boxes stays where it is, in the object's frame. Objects that stand, and those that change their shape, stay as they are.
 
@@ -288,13 +288,13 @@ def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int
         times: seconds by frame.
     """
     hit = {s.frame: s for s in segments if len(s.points) >= MIN_POINTS and track.pose(s.frame) is not None}
-    if not (track.moves and track.rigid) or len(hit) < _MIN_SIGHTINGS:
+    if not (track.moves and track.rigid) or len(hit) < _MIN_OBSERVATIONS:
         return track
     rows, seconds = np.array([*hit]) - track.first, np.array([times[frame] for frame in hit])
     points = [segment.points for segment in hit.values()]
     poses = track.world_T_actor
     drawn = np.column_stack([poses[rows, :3, 3], np.unwrap(np.arctan2(poses[rows, 1, 0], poses[rows, 0, 0]))])
-    change, rates = corrections(points, seconds, drawn, _DRAWN, best_sighting(points))
+    change, rates = corrections(points, seconds, drawn, _DRAWN, best_observation(points))
     axes = np.stack([rotation_z(-yaw)[:3, :3] for yaw in drawn[:, 3].tolist()])
     own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
     own -= np.average(own, axis=0, weights=[len(some) for some in points])

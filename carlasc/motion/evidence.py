@@ -37,7 +37,7 @@ _PERIOD_S = 0.1  # between scans whose times do not rise
 
 
 @dataclass(frozen=True)
-class Sighting:
+class EvidenceScan:
     """One scan, as evidence of motion needs it.
 
     Attributes:
@@ -112,12 +112,12 @@ class FreeSpaceEvidence:
 class _Kept:
     """A scan in the window."""
 
-    scan: Sighting
+    scan: EvidenceScan
     seconds: float
     views: tuple[SortedReturns, ...]
 
     @classmethod
-    def of(cls, scan: Sighting, seconds: float) -> _Kept:
+    def of(cls, scan: EvidenceScan, seconds: float) -> _Kept:
         """Sort the points of a scan by their directions, those of each sensor by themselves."""
         if scan.origins is None:
             return cls(scan, seconds, (SortedReturns.of(scan.points),))
@@ -125,7 +125,7 @@ class _Kept:
         return cls(scan, seconds, tuple(views))
 
 
-def find_evidence(scans: Iterable[Sighting], *, movable: Collection[int] = ()) -> Iterator[FreeSpaceEvidence]:
+def find_evidence(scans: Iterable[EvidenceScan], *, movable: Collection[int] = ()) -> Iterator[FreeSpaceEvidence]:
     """Yield what moved in each scan of a drive, as soon as the scans of `HORIZON_S` after it were read.
 
     Only the scans within this time are held, so memory does not grow with the drive.
@@ -204,7 +204,7 @@ def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
 
 
 def _judge(
-    scan: Sighting, candidates: NDArray[np.int64], before: list[_Kept], after: list[_Kept]
+    scan: EvidenceScan, candidates: NDArray[np.int64], before: list[_Kept], after: list[_Kept]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which candidates were seen through most of the time, which on one side in time only, and which are static."""
     points = np.ascontiguousarray(scan.points[candidates], np.float32)
@@ -291,9 +291,9 @@ def _count_around(
     """Return how many static points, of (N, 3) points in metres, are around each group: in its cells or those beside them, at its height."""
     cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
     key = (cell[:, 0] << 21) | cell[:, 1]
-    standing = np.flatnonzero(static)
-    standing = standing[np.argsort(key[standing], kind="stable")]
-    keys, heights = key[standing], world[standing, 2]
+    rows = np.flatnonzero(static)
+    rows = rows[np.argsort(key[rows], kind="stable")]
+    keys, heights = key[rows], world[rows, 2]
     steps = np.array([(row << 21) + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
     counts = []
     for group in groups:

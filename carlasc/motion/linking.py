@@ -14,7 +14,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.motion.segments import LINKED_M_S, Segment, Standing
+from carlasc.motion.segments import LINKED_M_S, Segment, StaticPoints
 
 _MAX_GAP_S = 1.55  # an actor may be hidden for this time
 _NUMBERED_GAP_S = 10.0  # a numbered actor is the same after this time
@@ -22,11 +22,11 @@ _BACKWARDS_S = 12.0  # an actor that starts is looked for in the scans of this t
 _FARTHEST_M, _MAX_SPEED_M_S = 15.0, 40.0  # fast first test: no actor is longer or faster
 _GATE_M = 1.5  # maximum distance of a segment from the prediction of its track
 _NUMBERED_GATE_M = 6.0  # the same for a numbered actor, of which another part may be seen
-_OTHER_CLASS = 1.0  # cost of a class that is not that of the sighting before: its label may be wrong
+_OTHER_CLASS = 1.0  # cost of a class that is not that of the observation before: its label may be wrong
 _OTHER_NUMBER = 2.0  # cost of another number
 _SOON_S = 1.0  # after more than this, a numbered actor may be anywhere
 _HISTORY_S = 0.3  # a velocity is estimated over at least this time, if the scans have no flow
-_STOPPING_M_S = 1.5  # slower actors may be standing in the next scan, or in the previous one
+_STOPPING_M_S = 1.5  # slower actors may be static in the next scan, or in the previous one
 
 _UNKNOWN = np.full(3, np.nan)  # a velocity
 
@@ -44,10 +44,10 @@ class Linker:
         self._chains: list[Chain] = []
         self._numbered: list[Chain] = []
         self._seconds: dict[int, float] = {}  # of the frames that live chains may have
-        self._standing: deque[tuple[float, Standing]] = deque()
+        self._static: deque[tuple[float, StaticPoints]] = deque()
 
     def add(
-        self, frame: int, seconds: float, segments: Sequence[Segment], standing: Standing | None = None
+        self, frame: int, seconds: float, segments: Sequence[Segment], static: StaticPoints | None = None
     ) -> list[Chain]:
         """Add the segments of the next scan, and return the chains that ended.
 
@@ -55,7 +55,7 @@ class Linker:
             frame: frame number.
             seconds: time of the scan.
             segments: the actors of the scan.
-            standing: its standing points, in which an actor that stops, for example at a crossing, is found until it continues.
+            static: its static points, in which an actor that stops, for example at a crossing, is found until it continues.
         """
         self._seconds[frame] = seconds
         ended = self._end(seconds)
@@ -66,15 +66,15 @@ class Linker:
                 self._chains.append([*self._before(segment), segment])
             else:
                 chain.append(segment)
-        if standing is not None:
+        if static is not None:
             for chain in alive:  # a slow actor that was not found may have stopped
                 if chain[-1].frame < frame and _is_slow(chain[-1]):
-                    rest = standing.segment_at(chain[-1])
+                    rest = static.segment_at(chain[-1])
                     if rest is not None:
                         chain.append(rest)
-            self._standing.append((seconds, standing))
-            while self._standing[0][0] < seconds - _BACKWARDS_S:
-                self._standing.popleft()
+            self._static.append((seconds, static))
+            while self._static[0][0] < seconds - _BACKWARDS_S:
+                self._static.popleft()
         return ended
 
     def finish(self) -> list[Chain]:
@@ -137,10 +137,10 @@ class Linker:
         return _UNKNOWN
 
     def _before(self, segment: Segment) -> Chain:
-        """Return segments from the scans in which the actor of a new chain was standing where the chain starts."""
+        """Return segments from the scans in which the actor of a new chain was static where the chain starts."""
         found: Chain = []
-        for _, standing in reversed(self._standing):
-            rest = standing.segment_at(segment) if _is_slow(segment) else None
+        for _, static in reversed(self._static):
+            rest = static.segment_at(segment) if _is_slow(segment) else None
             if rest is None:
                 break
             segment = rest

@@ -1,8 +1,8 @@
-"""What was seen of a rigid actor so far: points with the planes around them, to which a sighting is registered.
+"""What was seen of a rigid actor so far: points with the planes around them, to which an observation is registered.
 
 Registration finds the position and the turn of an upright actor at which its points lie on these planes.
 
-The model grows with each sighting, and only what is new is computed then. The sums that give a plane are kept for each point, and new
+The model grows with each observation, and only what is new is computed then. The sums that give a plane are kept for each point, and new
 points enter the sums of their neighbours in the order in which a sum over all points takes them. So the planes have the same bits as
 if they were computed anew.
 """
@@ -210,11 +210,11 @@ def register(
     """Return the state, near the predicted one, that registers points to the planes of the model.
 
     Args:
-        points: (N, 3) points of the sighting, metres, world.
+        points: (N, 3) points of the observation, metres, world.
         model: what was seen of the actor so far.
         predicted: (4,) predicted state: x, y, z in metres, and yaw in radians.
         error: (4,) standard deviation of the prediction.
-        previous: (3,) position at the sighting before, metres, world.
+        previous: (3,) position at the observation before, metres, world.
         shifts: (K, 4) directions in which the ends of what is seen moved since then, and how far, in metres.
     """
     state: NDArray[np.float64] = _register(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.core.scans import Scan
 
-MIN_SPEED_M_S = 0.3  # slower points count as standing, because estimated flow is never exactly zero
+MIN_SPEED_M_S = 0.3  # slower points count as static, because estimated flow is never exactly zero
 _CELL_M = 0.4  # size of the cells in which moving points are grouped
 # Cells of one actor are closer than this along its motion, so that a pole in front does not split a vehicle. So are points with one number.
 _REACH_M = 2.0
@@ -66,9 +66,9 @@ def segment_by_flow(
 
     Args:
         frame: frame number.
-        scan: points with labels and flow, m/s over ground; points whose flow is not finite count as standing.
+        scan: points with labels and flow, m/s over ground; points whose flow is not finite count as static.
         world_T_sensor: (4, 4) pose of the scan.
-        min_speed_m_s: slower points count as standing.
+        min_speed_m_s: slower points count as static.
 
     Returns:
         Segments in the order of their first point.
@@ -130,8 +130,8 @@ def segment_by_instances(
 
 
 @dataclass(frozen=True)
-class Standing:
-    """The standing points of a scan that may belong to an actor that moves at other times.
+class StaticPoints:
+    """The static points of a scan that may belong to an actor that moves at other times.
 
     Attributes:
         frame: frame number.
@@ -148,12 +148,12 @@ class Standing:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
-    def empty(cls, frame: int) -> Standing:
+    def empty(cls, frame: int) -> StaticPoints:
         """Return an object without points."""
         return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
 
     def segment_at(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
-        """Return the standing points of a segment's class at its place; None if there are much fewer than in the segment."""
+        """Return the static points of a segment's class at its place; None if there are much fewer than in the segment."""
         lower, upper = segment.points.min(axis=0) - margin_m, segment.points.max(axis=0) + margin_m
         own = np.flatnonzero(
             (self.labels == segment.label) & ((self.points > lower) & (self.points < upper)).all(axis=1)
@@ -163,9 +163,9 @@ class Standing:
         return Segment(self.frame, segment.label, self.members[own], self.points[own], np.zeros(3), origin=self.origin)
 
 
-def standing_points(
+def static_actor_points(
     frame: int, scan: Scan, world_T_sensor: Transform, labels: Collection[int], *, min_speed_m_s: float = MIN_SPEED_M_S
-) -> Standing:
+) -> StaticPoints:
     """Return the points of a scan that stand although they are of classes that may move; none without flow and labels.
 
     Args:
@@ -176,10 +176,10 @@ def standing_points(
         min_speed_m_s: slower points stand.
     """
     if scan.flow is None or scan.labels is None:
-        return Standing.empty(frame)
+        return StaticPoints.empty(frame)
     members = np.flatnonzero(~is_fast(scan.flow, min_speed_m_s) & np.isin(scan.labels, sorted(labels)))
     points = transform_points(world_T_sensor, scan.points[members])
-    return Standing(frame, members, scan.labels[members].astype(np.int64), points, world_T_sensor[:3, 3])
+    return StaticPoints(frame, members, scan.labels[members].astype(np.int64), points, world_T_sensor[:3, 3])
 
 
 def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
-from carlasc.motion.paths import estimate_path, is_standing
+from carlasc.motion.paths import estimate_path, is_static
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.solving import headings_of, resample
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
 
 _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last segment
-_STANDING_M = 0.5  # the visible part of a standing actor may seem to move this far
+_STATIC_M = 0.5  # the visible part of a standing actor may seem to move this far
 LONGEST_M = 30.0  # no actor is longer or wider: other points have its number
 _SURE = 0.8  # actors with less confidence are doubtful
-FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
+FIRST_FOUND = 1 << 33  # actors that no field shows are numbered from here, above all instances
 _FORMATS = {
     "members": ArrayFormat(("<i4",), (None,)),
     "frames": ArrayFormat(("<i8",), (None, 3)),
@@ -99,7 +99,7 @@ class Track:
         """Whether the actor moves faster and farther at some time than a standing actor seems to, and is one thing."""
         fast = (np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any()
         return bool(
-            self.size.max() < LONGEST_M and fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STANDING_M
+            self.size.max() < LONGEST_M and fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STATIC_M
         )
 
 
@@ -124,9 +124,9 @@ def make_track(
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
     keeps_shape = label not in deformable if rigid is None else rigid
     if any(segment.velocity is None for segment in chain):
-        sightings = [segment.points for segment in chain]
-        positions, velocities, headings = estimate_path(sightings, seconds, rigid=keeps_shape)
-        if is_standing(sightings, positions, headings, seconds):
+        observations = [segment.points for segment in chain]
+        positions, velocities, headings = estimate_path(observations, seconds, rigid=keeps_shape)
+        if is_static(observations, positions, headings, seconds):
             positions, velocities, headings = (np.zeros_like(values) for values in (positions, velocities, headings))
     else:
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
@@ -367,7 +367,7 @@ def _summarize(track: Track) -> dict[str, Any]:
     speed = np.linalg.norm(track.velocity, axis=1)
     return {
         "label": track.label,
-        "instance": track.instance if track.instance < FIRST_MOVER else 0,  # a number that the data do not have
+        "instance": track.instance if track.instance < FIRST_FOUND else 0,  # a number that the data do not have
         "first": int(min(track.members, default=track.first)),
         "last": int(max(track.members, default=track.first)),
         "scans": len(track.members),

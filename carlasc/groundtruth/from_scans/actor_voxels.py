@@ -18,7 +18,7 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
 from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of, number_actors
 from carlasc.motion import BODY_MARGIN_M
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 from carlasc.storage.protocol import Sequence
 
 _CLASS_PARTS = 1 << 10  # numbers whose upper 16 bits are below this may have a class there
@@ -32,7 +32,7 @@ _NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = (
 def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
     """Return the actors with their numbers over the whole sequence."""
     highest = max((int(actor["instance"]) for actor in actors.summary), default=0)
-    numbered = [track for track in actors.tracks.values() if 0 < track.instance < FIRST_MOVER]
+    numbered = [track for track in actors.tracks.values() if 0 < track.instance < FIRST_FOUND]
     if len(numbered) < len(actors.tracks):
         upper = lower = 0
         for given in _numbers_of(feed.sequence):
@@ -125,8 +125,8 @@ def _number_points(
         if frame not in kept:
             kept[frame] = _numbered(feed, frame)
         points, numbers = kept[frame]
-        standing = ~np.isin(numbers, list(moving))
-        points, numbers = points[standing], numbers[standing]
+        static = ~np.isin(numbers, list(moving))
+        points, numbers = points[static], numbers[static]
         found = spec.flat_index(transform_points(now.grid_T_world, points))
         used = found >= 0
         used[used] = free[found[used]]

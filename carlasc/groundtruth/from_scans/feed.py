@@ -22,16 +22,16 @@ from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
 from carlasc.groundtruth.inputs import without_caches
 from carlasc.groundtruth.options import FromScans
 from carlasc.motion import (
+    EvidenceScan,
     Segment,
-    Sighting,
-    Standing,
+    StaticPoints,
     Track,
     ground_points,
     is_fast,
     segment_by_boxes,
     segment_by_flow,
     segment_by_instances,
-    standing_points,
+    static_actor_points,
 )
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
@@ -39,7 +39,7 @@ from carlasc.storage.protocol import Sequence
 from carlasc.storage.resuming import scans_digest
 from carlasc.storage.views import SequenceView
 
-_SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
+_ACTOR_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
 _SAMPLES = 5  # scans that are looked at to see whether labels name the ground
 _OTHERWISE = 0.1  # share of the points on the ground with other classes: feet of walls and kerbs have 2 to 4 %, labels that are often wrong 15 %
 _USED = ("labels", "flow", "instances", "origins", "probabilities")  # fields of a scan that are read for merging
@@ -52,13 +52,13 @@ class ScanMotion:
 
     Attributes:
         frame: frame number.
-        segments: actors that may move, with at most `_SIGHTING_POINTS` points each; `members` are complete.
-        standing: standing points of classes that may move.
+        segments: actors that may move, with at most `_ACTOR_POINTS` points each; `members` are complete.
+        static: static points of classes that may move.
     """
 
     frame: int
     segments: tuple[Segment, ...]
-    standing: Standing
+    static: StaticPoints
 
 
 class WithoutScans(SequenceView):
@@ -311,7 +311,7 @@ class ScanFeed:
             static &= ~np.isin(scan.labels, sorted(self.classes.movable))
         return np.ascontiguousarray(scan.points[static], np.float32)
 
-    def sighting(self, frame: int, boxes: Sequence_[Track]) -> Sighting:
+    def evidence_scan(self, frame: int, boxes: Sequence_[Track]) -> EvidenceScan:
         """Return a scan as evidence of motion needs it; points of actors that the sequence's own fields show are marked.
 
         Args:
@@ -325,7 +325,7 @@ class ScanFeed:
         ground = np.isin(_labels(scan), sorted(self.classes.ground)) if self.names_ground or self.finds_ground else None
         labels = _labels(scan) if self.has_labels else None
         origins = scan.others.get("origins")
-        return Sighting(frame, scan.points, pose, self.time(frame), ground, labels, explained, origins)
+        return EvidenceScan(frame, scan.points, pose, self.time(frame), ground, labels, explained, origins)
 
     def segments(self, frame: int, boxes: Sequence_[Track]) -> ScanMotion:
         """Return the actors of a scan, as the sequence's own fields show them.
@@ -334,11 +334,11 @@ class ScanFeed:
             frame: frame number.
             boxes: the tracks of the sequence's boxes.
         """
-        scan, standing, speed = self._voting_points(frame), Standing.empty(frame), self.options.motion.min_speed_m_s
+        scan, static, speed = self._voting_points(frame), StaticPoints.empty(frame), self.options.motion.min_speed_m_s
         if self.motion[:1] == ("flow",):
-            standing = standing_points(frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed)
+            static = static_actor_points(frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed)
         found = self._segments(frame, scan, boxes)
-        return ScanMotion(frame, tuple(replace(s, points=thin(s.points, _SIGHTING_POINTS)) for s in found), standing)
+        return ScanMotion(frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in found), static)
 
     def _segments(self, frame: int, scan: Scan, boxes: Sequence_[Track]) -> list[Segment]:
         """Return the actors of a scan with all of their points."""

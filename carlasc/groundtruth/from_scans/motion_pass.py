@@ -28,7 +28,7 @@ from carlasc.motion import (
     Track,
     complete_bodies,
     find_evidence,
-    follow_movers,
+    follow_actors,
     make_track,
     seen_from,
     tracks_from_boxes,
@@ -36,7 +36,7 @@ from carlasc.motion import (
 from carlasc.motion.bodies import surface_of
 from carlasc.motion.boxes import register_boxes
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors, with_surfaces
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors, with_surfaces
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -50,7 +50,7 @@ TRACKS, POSES = "tracks", "poses"
 _VERSIONS = {TRACKS: 5, POSES: 1}  # of the methods: they change only when the same input gives another result
 _NOTED_M = 0.04  # poses that are left alone are worth a note if scans disagree by more
 _BATCH = 200  # frames that are read before their finished tracks are estimated
-_MOVERS = 32  # movers whose tracks are estimated in one piece
+_ACTORS = 32  # actors whose tracks are estimated in one piece
 _SHAPE_POINTS = 128  # points of a boxed object in a scan that show its shape and its motion
 _BLOCK = (
     100,
@@ -71,7 +71,7 @@ class _FindEvidence:
     def __call__(self, block: tuple[int, ...]) -> list[FreeSpaceEvidence]:
         times = self.feed.times
         near = [f for f, s in times.items() if times[block[0]] - HORIZON_S <= s <= times[block[-1]] + HORIZON_S]
-        scans = (self.feed.sighting(frame, self.boxes) for frame in near)
+        scans = (self.feed.evidence_scan(frame, self.boxes) for frame in near)
         chosen = set(block)
         # labels that are often wrong must not take things apart
         found = find_evidence(scans, movable=self.feed.classes.movable if self.feed.names_ground else ())
@@ -135,7 +135,7 @@ class _MotionPass:
             ended: list[Chain] = []
             with self._each(partial(self.feed.segments, boxes=()), frames[begin : begin + _BATCH]) as scans:
                 for scan in scans:
-                    ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.standing)
+                    ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.static)
                     self._count(1)
             if begin + _BATCH >= len(frames):
                 ended += linker.finish()
@@ -155,7 +155,7 @@ class _MotionPass:
         with self._each(follow, [(track, segments.get(track.instance, [])) for track in boxes]) as tracks:
             return with_surfaces(list(tracks))
 
-    def movers(
+    def found(
         self, boxes: tuple[Track, ...]
     ) -> tuple[list[Track], dict[int, NDArray[np.integer]], list[NDArray[np.float64]]]:
         """Return the tracks of what moved although no field shows it, and what else `MovingActors` has: `moving` and `own`."""
@@ -173,11 +173,11 @@ class _MotionPass:
         label = 0 if self.feed.has_labels else classes.geometry_id
         moved: dict[int, NDArray[np.int64]] = {}
         own: list[NDArray[np.float64]] = []
-        movers = follow_movers(
-            evidence(), moved, deformable=classes.deformable, first_instance=FIRST_MOVER, default_label=label, own=own
+        actors = follow_actors(
+            evidence(), moved, deformable=classes.deformable, first_instance=FIRST_FOUND, default_label=label, own=own
         )
         tracks: list[Track] = []
-        while batch := list(islice(movers, _MOVERS)):
+        while batch := list(islice(actors, _ACTORS)):
             # their paths are estimated again: velocities alone would drift
             chains = [([replace(s, velocity=None) for s in m.segments], m.rigid, m.confidence) for m in batch]
             tracks += self._estimate(chains)
@@ -210,8 +210,8 @@ def find_actors(
     moving: dict[int, NDArray[np.integer]] = {}
     own: list[NDArray[np.float64]] = []
     if "evidence" in feed.motion:
-        movers, moving, own = by.movers(moving_boxes)
-        tracks += movers
+        found, moving, own = by.found(moving_boxes)
+        tracks += found
     return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, own)
 
 

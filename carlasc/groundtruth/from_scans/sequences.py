@@ -40,7 +40,7 @@ from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
 from carlasc.motion import LONGEST_M, ground_points
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors, is_doubtful
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.protocol import Sequence, Source
@@ -104,7 +104,7 @@ class ScanFrame(FrameInput):
         return merge_frame(plan, feed, self.inputs.actors, self.number, kept).grid
 
     def residuals(self) -> Mapping[int, Residual]:
-        """Return how well the sightings of the moving actors in the frame overlay with the next ones, by number of the actor."""
+        """Return how well the observations of the moving actors in the frame overlay with the next ones, by number of the actor."""
         feed, frame, found = self.inputs.feed, self.number, {}
         last = frame + feed.options.window[1]
         for number, track in self.inputs.actors.tracks.items():
@@ -244,7 +244,7 @@ class ScanSequence(StoredSequence):
         )
         if self.feed.has_labels and not self.feed.motion and self.options.dynamic != "tube":
             notes.append(f"{where}: nothing shows what moves: everything was treated as static")
-        found = sum(track.instance >= FIRST_MOVER for track in self.actors.tracks.values())
+        found = sum(track.instance >= FIRST_FOUND for track in self.actors.tracks.values())
         left_out = sum(len(points) for points in self.actors.moving.values())
         if "evidence" in self.feed.motion and (found or left_out):
             doubtful = sum(is_doubtful(actor["confidence"]) for actor in self.actors.summary if actor["moves"])

@@ -67,10 +67,10 @@ class MapFiles:
     out: Path | None
     mesh: Path | None
     distance: Path | None
-    movers: Path | None
+    actors: Path | None
 
     @classmethod
-    def of(cls, out: Any, mesh: Any, distance: Any, movers: bool, grid: str | None) -> Self:
+    def of(cls, out: Any, mesh: Any, distance: Any, actors: bool, grid: str | None) -> Self:
         """Return where things are written.
 
         Raises:
@@ -89,20 +89,20 @@ class MapFiles:
         if distance is not None and grid is None:
             advice = "scans alone do not tell free space from unknown space: make a grid with `carlasc regrid`"
             raise ArgumentError("distance", expected="the `grid` whose voxels it is of", found="none", advice=advice)
-        if movers and (grid is not None or "out" not in paths or paths["out"].suffix.lower() == OCTOMAP):
-            raise ArgumentError("movers", expected="a file of points of a drive in `out`", found=str(grid or out))
-        folder = paths["out"].with_name(f"{paths['out'].stem}_movers") if movers else None
+        if actors and (grid is not None or "out" not in paths or paths["out"].suffix.lower() == OCTOMAP):
+            raise ArgumentError("actors", expected="a file of points of a drive in `out`", found=str(grid or out))
+        folder = paths["out"].with_name(f"{paths['out'].stem}_actors") if actors else None
         return cls(paths.get("out"), paths.get("mesh"), paths.get("distance"), folder)
 
     @property
     def all(self) -> list[Path]:
         """All files, and the folder."""
-        return [path for path in (self.out, self.mesh, self.distance, self.movers) if path is not None]
+        return [path for path in (self.out, self.mesh, self.distance, self.actors) if path is not None]
 
     def check(self, overwrite: bool) -> None:
         """Check that nothing is replaced, and that packages are installed, before hours of work."""
         for path in self.all:
-            is_ours = (path / ACTORS).is_file() if path == self.movers else path.is_file()
+            is_ours = (path / ACTORS).is_file() if path == self.actors else path.is_file()
             if path.exists() and not (overwrite and is_ours):
                 found, advice = "a file" if path.is_file() else "a folder", "give another name"
                 advice = f"give `overwrite=True`, or {advice[5:]}" if is_ours else advice

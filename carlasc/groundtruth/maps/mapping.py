@@ -69,7 +69,7 @@ def map(
     cell_m: float = 0.05,
     frames: Frames = None,
     grid: str | None = None,
-    movers: bool = False,
+    actors: bool = False,
     mesh: str | os.PathLike[str] | None = None,
     distance: str | os.PathLike[str] | None = None,
     motion: MotionOptions = MotionOptions(),  # noqa: B008 (frozen)
@@ -90,7 +90,7 @@ def map(
         cell_m: size of a cell, metres; a grid has its own cells.
         frames: range of frame numbers; None for all. What moves is looked for in a few seconds more. With `grid`, it must hold one frame.
         grid: name of the grid that is the map.
-        movers: also write the body of each actor that moves, in its own frame, to the folder `<out>_movers`, with `actors.json`: its poses.
+        actors: also write the body of each actor that moves, in its own frame, to the folder `<out>_actors`, with `actors.json`: its poses.
         mesh: file of the surface of the occupied cells, with the colours of classes: .ply or .glb.
         distance: .npz file of each voxel's distance from the surface, with `grid`: see `docs/commands/map.md`.
         motion: what tells which points move, and how.
@@ -114,20 +114,20 @@ def map(
         raise ArgumentError("cell_m", expected=f"{_LEAST_CELL_M:g} metres or more", found=str(cell_m))
     if run.part.count > 1:
         raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
-    files = MapFiles.of(out, mesh, distance, movers, grid)
+    files = MapFiles.of(out, mesh, distance, actors, grid)
     files.check(overwrite)
-    opened, wanted, count, actors, notes = as_source(source), FrameRange.of(frames), 1, 0, tuple[str, ...]()
+    opened, wanted, count, bodies, notes = as_source(source), FrameRange.of(frames), 1, 0, tuple[str, ...]()
     if grid is not None:
         points = write_grid(opened, grid, wanted, files)
     else:
         options = FromScans(window=(0, 0), motion=motion, poses=poses)
         with files.folder() as folder:
             drive = DriveMap.of(opened, wanted, options, GrowingCells(Path(folder), cell_m))
-            drive.fill(run, movers)
+            drive.fill(run, actors)
             points, count, notes = drive.write(files), len(drive.frames), drive.notes()
-            if files.movers is not None and files.out is not None:
-                actors = drive.write_actors(files.movers, files.out.suffix.lower())
-    return MapResult(tuple(str(path) for path in files.all), points, count, actors, notes, time.perf_counter() - began)
+            if files.actors is not None and files.out is not None:
+                bodies = drive.write_actors(files.actors, files.out.suffix.lower())
+    return MapResult(tuple(str(path) for path in files.all), points, count, bodies, notes, time.perf_counter() - began)
 
 
 _BLOCK = 10  # scans that a worker adds up
@@ -161,8 +161,8 @@ class DriveMap:
         view = WithoutScans(sequence, hidden) if hidden else sequence
         return cls(ScanSequence(view, plan, options), chosen, cells)
 
-    def fill(self, run: Run, movers: bool) -> None:
-        """Refine poses, find what moves, and add every scan without it; with `movers`, add their bodies too."""
+    def fill(self, run: Run, actors: bool) -> None:
+        """Refine poses, find what moves, and add every scan without it; with `actors`, add their bodies too."""
         inputs = self.inputs
         progress = StepCounter(run.progress, inputs.steps_before + len(self.frames))
         progress(0)
@@ -172,7 +172,7 @@ class DriveMap:
                 inputs.actors = find_actors(inputs.feed, pool, progress)
             blocks = [tuple(self.frames[first : first + _BLOCK]) for first in range(0, len(self.frames), _BLOCK)]
             items = ((block, inputs.actors.between(block[0], block[-1])) for block in blocks)
-            with closing(run_all(_AddScans(inputs.feed, self.cells.cell_m, movers), items, pool)) as added:
+            with closing(run_all(_AddScans(inputs.feed, self.cells.cell_m, actors), items, pool)) as added:
                 for block, pieces in zip(blocks, added, strict=True):
                     self.cells.add(pieces)
                     progress(len(block))
@@ -246,7 +246,7 @@ class _AddScans:
 
     feed: ScanFeed
     cell_m: float
-    movers: bool
+    actors: bool
 
     def __call__(self, block: tuple[tuple[int, ...], MovingActors]) -> list[tuple[Part, NDArray[Any]]]:
         frames, actors = block
@@ -263,7 +263,7 @@ class _AddScans:
             labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
         chosen: list[tuple[int, NDArray[Any], NDArray[np.float64]]] = [(STATIC, np.flatnonzero(static), world[static])]
-        for number, track in merger.actors.tracks.items() if self.movers else ():
+        for number, track in merger.actors.tracks.items() if self.actors else ():
             members, pose = track.members.get(frame), track.pose(frame)
             if members is not None and pose is not None:
                 chosen.append((number, members, transform_points(invert(pose), world[members])))

@@ -1,4 +1,4 @@
-"""What a report needs to know of one frame, and of each moving actor: how often it is seen, and how well its sightings overlay when its motion is undone.
+"""What a report needs to know of one frame, and of each moving actor: how often it is seen, and how well its observations overlay when its motion is undone.
 
 A frame is measured while the frame is made, or from the files of a frame that exists already.
 """
@@ -19,21 +19,21 @@ from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.motion.refinement import RefinedPoses
 from carlasc.storage import layout
 
-_MOST_POINTS, _MOST_ASKED = 600, 50  # of one sighting: that are looked at, and whose distance is measured
+_MOST_POINTS, _MOST_ASKED = 600, 50  # of one observation: that are looked at, and whose distance is measured
 
 
 @dataclass(frozen=True)
 class Residual:
-    """How well a sighting of an actor overlays with the next one.
+    """How well an observation of an actor overlays with the next one.
 
     Attributes:
         moving_m: sum of the distances from points of one to the nearest points of the other, once the motion is undone, metres.
-        standing_m: the same, if the actor is taken to stand still.
+        static_m: the same, if the actor is taken to stand still.
         count: number of these points.
     """
 
     moving_m: float
-    standing_m: float
+    static_m: float
     count: int
 
     @classmethod
@@ -44,18 +44,18 @@ class Residual:
         world_T_actor: Transform,
         world_T_next: Transform,
     ) -> Residual:
-        """Compare two sightings.
+        """Compare two observations.
 
         Args:
-            one: (N, 3) points of a sighting, metres, world.
+            one: (N, 3) points of an observation, metres, world.
             other: (M, 3) points of the next one.
-            world_T_actor: (4, 4) pose of the actor at the first sighting.
+            world_T_actor: (4, 4) pose of the actor at the first observation.
             world_T_next: (4, 4) its pose at the next one.
         """
         one, other = thin(one, _MOST_POINTS), thin(other, _MOST_POINTS)
-        standing = _distances(one, other)
+        static = _distances(one, other)
         moving = _distances(transform_points(invert(world_T_actor), one), transform_points(invert(world_T_next), other))
-        return cls(float(moving.sum()), float(standing.sum()), len(moving))
+        return cls(float(moving.sum()), float(static.sum()), len(moving))
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,15 @@ class ActorTrack:
         instance: its number in the data; 0 if actors are not numbered.
         first: first frame in which it was seen.
         last: last frame in which it was seen.
-        sightings: number of frames in which it was seen.
-        points: number of its points in all sightings.
+        observations: number of frames in which it was seen.
+        points: number of its points in all observations.
         speed_m_s: its median speed, metres per second.
         size_m: length, width and height of its body, metres.
         seen_m: length, width and height of what was seen of it, metres.
         faces: number of its sides that were seen: front, rear, left and right.
-        residual_m: how well neighbouring sightings overlay once the motion is undone: mean distance from a point of one to the nearest
+        residual_m: how well neighbouring observations overlay once the motion is undone: mean distance from a point of one to the nearest
             point of the one before or after, metres; None if none were compared. It is at least the distance between neighbouring points.
-        residual_standing_m: the same for an actor that is taken to stand still; a motion that is true makes `residual_m` smaller.
+        residual_static_m: the same for an actor that is taken to stand still; a motion that is true makes `residual_m` smaller.
         confidence: that it is real, from 0 to 1; 1 if the data say so.
     """
 
@@ -83,14 +83,14 @@ class ActorTrack:
     instance: int
     first: int
     last: int
-    sightings: int
+    observations: int
     points: int
     speed_m_s: float
     size_m: tuple[float, float, float]
     seen_m: tuple[float, float, float]
     faces: int
     residual_m: float | None
-    residual_standing_m: float | None
+    residual_static_m: float | None
     confidence: float
 
     @classmethod
@@ -104,14 +104,14 @@ class ActorTrack:
             instance=summary["instance"],
             first=summary["first"],
             last=summary["last"],
-            sightings=summary["scans"],
+            observations=summary["scans"],
             points=summary["points"],
             speed_m_s=summary["speed_m_s"],
             size_m=(length, width, height),
             seen_m=(seen_length, seen_width, seen_height),
             faces=summary["faces"],
             residual_m=round(sum(r.moving_m for r in residuals) / count, 4) if count else None,
-            residual_standing_m=round(sum(r.standing_m for r in residuals) / count, 4) if count else None,
+            residual_static_m=round(sum(r.static_m for r in residuals) / count, 4) if count else None,
             confidence=summary["confidence"],
         )
 
@@ -119,11 +119,11 @@ class ActorTrack:
 def actors_of(
     summaries: Sequence[Mapping[str, Any]], residuals: Iterable[Mapping[int, Residual]], classes: ClassTable
 ) -> tuple[ActorTrack, ...]:
-    """Return the moving actors, in order of their first sighting.
+    """Return the moving actors, in order of their first observation.
 
     Args:
         summaries: what was found of each actor, by its number.
-        residuals: how well the sightings in each frame overlay with the next ones, by number.
+        residuals: how well the observations in each frame overlay with the next ones, by number.
         classes: class table of the labels.
     """
     by_actor: dict[int, list[Residual]] = {}
@@ -135,7 +135,7 @@ def actors_of(
 
 
 def _distances(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the distances from some points of each sighting to the nearest point of the other, metres."""
+    """Return the distances from some points of each observation to the nearest point of the other, metres."""
     found = []
     for asked, others in ((one, other), (other, one)):
         squares = np.square(thin(asked, _MOST_ASKED)[:, None] - others[None]).sum(axis=2)
@@ -212,7 +212,7 @@ class FrameFacts:
         votes: (POWERS,) int64 histogram of the votes of known voxels, by powers of two.
         votes_sum: sum of these votes; 0 if the grid has no counts.
         changes: how the grid changes if a tenth of the scans is left out; None if this was not tried.
-        residuals: how well the sightings of moving actors overlay with the next ones, by number of the actor.
+        residuals: how well the observations of moving actors overlay with the next ones, by number of the actor.
         inferred: number of known voxels that were inferred, not seen; None if the grid does not say.
     """
 

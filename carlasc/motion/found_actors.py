@@ -11,32 +11,32 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.motion.evidence import FreeSpaceEvidence
 from carlasc.motion.linking import best_pairs
-from carlasc.motion.paths import estimate_path, is_standing, middles_of, overlay
+from carlasc.motion.paths import estimate_path, is_static, middles_of, overlay
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
 
 _MAX_GAP_S = 1.0  # a mover may be hidden for this long
 _REACH_M, _MAX_SPEED_M_S = 1.0, 25.0  # maximum gap to the prediction; without one, the farthest that a mover gets
-_FAR_M = 15.0  # fast first test: nothing gets farther between two sightings
-_HISTORY = 6  # sightings that the prediction is made from
-_MIN_SIGHTINGS, _MIN_WAY_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # a mover with less earns no track
+_FAR_M = 15.0  # fast first test: nothing gets farther between two observations
+_HISTORY = 6  # observations that the prediction is made from
+_MIN_OBSERVATIONS, _MIN_WAY_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # a mover with less earns no track
 _STRAIGHT = 0.35  # extent of a path over its length; noise goes to and fro
-_MAX_JUMP_M_S = 4.0  # median deviation of the sightings' steps from the path's; more is no one thing
+_MAX_JUMP_M_S = 4.0  # median deviation of the observations' steps from the path's; more is no one thing
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
 _PERSON_M = (1.5, 2.3)  # what is narrower and lower than this changes its shape as it moves
-_SLIDE_M = 0.5  # by which sightings are slid along their path, to see whether they overlay as well then
-_SIGHTINGS, _MANY_SIGHTINGS = 10, 30  # more than the latter do not raise the confidence
+_SLIDE_M = 0.5  # by which observations are slid along their path, to see whether they overlay as well then
+_OBSERVATIONS, _MANY_OBSERVATIONS = 10, 30  # more than the latter do not raise the confidence
 _WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of one, and of the terms of `_confidence`
 _LEAST_CONFIDENCE = 0.5  # of a mover
 _STAYS_M, _SENSOR_WAY_M = 0.5, 1.0  # what moves with the sensor stays there in its frame, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: points of one scan line are within it
 _OWN_HALF_M, _OWN_REACH_M = 1.3, 3.5  # half the width of the recording vehicle, and how far from the sensor it reaches
 _OWN_MARGIN_M = 0.2  # around most of its points
-_SAMPLES = 300  # points of a sighting that its path is estimated from
+_SAMPLES = 300  # points of an observation that its path is estimated from
 
 
 @dataclass(frozen=True)
-class Mover:
+class FoundActor:
     """One thing that moved, over time.
 
     Attributes:
@@ -50,7 +50,7 @@ class Mover:
     confidence: float
 
 
-def follow_movers(
+def follow_actors(
     evidence: Iterable[FreeSpaceEvidence],
     moved: dict[int, NDArray[np.int64]],
     *,
@@ -58,7 +58,7 @@ def follow_movers(
     first_instance: int = 1,
     default_label: int = 0,
     own: list[NDArray[np.float64]] | None = None,
-) -> Iterator[Mover]:
+) -> Iterator[FoundActor]:
     """Follow what moved from scan to scan, and yield each mover that earned a track when it was seen for the last time.
 
     Args:
@@ -70,7 +70,7 @@ def follow_movers(
         own: filled with the (6,) lower and upper corners of parts of the recording vehicle, which are no movers, metres, sensor frame.
     """
     own = [] if own is None else own
-    alive: list[_MoverChain] = []
+    alive: list[_ActorChain] = []
     number = first_instance
     for found in evidence:
         moved[found.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *found.clusters]))
@@ -84,12 +84,12 @@ def follow_movers(
 
 
 def _earned(
-    chains: list[_MoverChain],
+    chains: list[_ActorChain],
     deformable: Collection[int],
     number: int,
     default_label: int,
     own: list[NDArray[np.float64]],
-) -> Iterator[Mover]:
+) -> Iterator[FoundActor]:
     """Yield the movers of the chains that earn a track, numbered from `number`; parts of the recording vehicle are added to `own`."""
     for chain in chains:
         part = chain.own_vehicle()
@@ -104,7 +104,7 @@ def _earned(
 
 @dataclass(frozen=True)
 class _Link:
-    """One sighting of a chain."""
+    """One observation of a chain."""
 
     seconds: float
     segment: Segment
@@ -132,7 +132,7 @@ class _Link:
         return _is_small(self.upper - self.lower)
 
     def joined(self, other: _Link) -> _Link:
-        """Return both as one sighting."""
+        """Return both as one observation."""
         segment = replace(
             self.segment,
             members=np.concatenate([self.segment.members, other.segment.members]),
@@ -143,13 +143,13 @@ class _Link:
         return replace(self, segment=segment, lower=lower, upper=upper, freed=freed, around=around)
 
 
-class _MoverChain:
-    """Sightings of one thing in consecutive scans."""
+class _ActorChain:
+    """Observations of one thing in consecutive scans."""
 
     def __init__(self, first: _Link) -> None:
         self.links = [first]
         self.velocity: NDArray[np.float64] | None = (
-            None  # (3,) m/s of the most recent sightings; None if there is one only
+            None  # (3,) m/s of the most recent observations; None if there is one only
         )
 
     def append(self, link: _Link) -> None:
@@ -172,7 +172,7 @@ class _MoverChain:
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
 
     def cost(self, link: _Link) -> float | None:
-        """Return how badly a sighting continues the chain; None if it cannot."""
+        """Return how badly an observation continues the chain; None if it cannot."""
         last, velocity = self.last, self.velocity
         if last.segment.label != link.segment.label:
             return None
@@ -191,15 +191,15 @@ class _MoverChain:
         return float(np.linalg.norm(gap, axis=0) + 0.3 * np.linalg.norm(offset[:2], axis=0) + 0.2 * sizes.sum())
 
     def covers(self, link: _Link) -> bool:
-        """Return whether a sighting is inside the place where the chain's next one is expected."""
+        """Return whether an observation is inside the place where the chain's next one is expected."""
         velocity = self.velocity
         shift = np.zeros(3) if velocity is None else velocity * (link.seconds - self.last.seconds)
         lower, upper = self.last.lower + shift - 0.3, self.last.upper + shift + 0.3
         return bool(((link.middle > lower) & (link.middle < upper))[:2].all())
 
-    def mover(self, deformable: Collection[int], instance: int, default_label: int) -> Mover | None:
-        """Return the thing that moved; None if its sightings do not overlay better along a path than standing."""
-        if len(self.links) < _MIN_SIGHTINGS:
+    def mover(self, deformable: Collection[int], instance: int, default_label: int) -> FoundActor | None:
+        """Return the thing that moved; None if its observations do not overlay better along a path than standing."""
+        if len(self.links) < _MIN_OBSERVATIONS:
             return None
         seconds = np.array([link.seconds for link in self.links])
         segments = [link.segment for link in self.links]
@@ -217,7 +217,7 @@ class _MoverChain:
             return None
         middles = np.stack([link.middle for link in self.links])
         steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(seconds)
-        if np.median(steps) > _MAX_JUMP_M_S or is_standing(samples, positions, headings, seconds):
+        if np.median(steps) > _MAX_JUMP_M_S or is_static(samples, positions, headings, seconds):
             return None
         confidence = self._confidence(samples, positions, headings, seconds)
         if confidence < _LEAST_CONFIDENCE:
@@ -226,7 +226,7 @@ class _MoverChain:
             replace(segment, label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
-        return Mover(tuple(found), rigid, confidence)
+        return FoundActor(tuple(found), rigid, confidence)
 
     def _confidence(
         self,
@@ -238,7 +238,7 @@ class _MoverChain:
         """Return how sure it is that the thing is real, from 0 to 1; the arguments are those of `overlay`.
 
         The terms: the share of its points that were at places seen free; the share that stands around it, at its height, of all points there;
-        the share by which its sightings overlay better than slid along its path; the logarithm of their number; and whether it is a scan
+        the share by which its observations overlay better than slid along its path; the logarithm of their number; and whether it is a scan
         line. A piece of a rail, a fence or a hedge has neighbours that stand, and overlays as well after any slide. The result is the
         logistic function of the sum.
         """
@@ -246,17 +246,17 @@ class _MoverChain:
         counts = np.array([(len(link.segment.members), link.freed, link.around) for link in self.links])
         points, freed, around = counts.sum(axis=0).tolist()
         gain = 1.0 - best / max(min(slid), 1e-3)
-        support = float(np.log(min(len(self.links), _MANY_SIGHTINGS) / _SIGHTINGS))
+        support = float(np.log(min(len(self.links), _MANY_OBSERVATIONS) / _OBSERVATIONS))
         terms = (1.0, freed / points, around / (points + around), gain, support, float(self._is_scan_line()))
         return 1.0 / (1.0 + float(np.exp(-sum(weight * term for weight, term in zip(_WEIGHTS, terms, strict=True)))))
 
     def _in_sensor(self) -> list[NDArray[np.float64]] | None:
-        """Return (M, 3) points of each sighting, metres, sensor frame, if they stay there while the sensor moves; None if they do not."""
+        """Return (M, 3) points of each observation, metres, sensor frame, if they stay there while the sensor moves; None if they do not."""
         way = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
         local = [transform_points(invert(link.world_T_sensor), link.segment.points) for link in self.links]
         middles = middles_of(local)
         stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
-        return local if stays and way > _SENSOR_WAY_M and len(local) >= _MIN_SIGHTINGS else None
+        return local if stays and way > _SENSOR_WAY_M and len(local) >= _MIN_OBSERVATIONS else None
 
     def own_vehicle(self) -> NDArray[np.float64] | None:
         """Return (6,) lower and upper corner of the place in the sensor's frame, metres, if the thing is a part of the recording vehicle."""
@@ -311,7 +311,7 @@ def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     return bool(nearest_points(*samples)[1].min() < _PARTS_M**2)
 
 
-def _link(evidence: FreeSpaceEvidence, alive: list[_MoverChain], deformable: Collection[int]) -> None:
+def _link(evidence: FreeSpaceEvidence, alive: list[_ActorChain], deformable: Collection[int]) -> None:
     """Continue chains with the clusters of a scan, and start new ones: best first, then parts of what a chain has found already."""
     links = _join_parts([_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable)
     costs = []
@@ -332,7 +332,7 @@ def _link(evidence: FreeSpaceEvidence, alive: list[_MoverChain], deformable: Col
     for i, j in extra.items():
         main = next(k for k, chain in taken.items() if chain == j)
         links[main] = links[main].joined(links[i])
-    fresh = [_MoverChain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
+    fresh = [_ActorChain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
     for i, j in taken.items():
         alive[j].append(links[i])
     alive.extend(fresh)
