@@ -1,11 +1,11 @@
 """Paths: the positions and velocities of an actor, estimated from its points alone, for scans that number actors and have no flow.
 
-An observation is the set of an actor's points in one scan. A passing car shows only its side for a long time, and registration of points to points
-slides along it. So a rigid actor is followed from scan to scan: its position is predicted from its motion so far, and then corrected by
-registering its points to the planes of everything that was seen of it before. The planes correct the prediction only in the directions that
-they determine: across a side, and along the path if the front or the back is visible.
+An observation is the set of an actor's points in one scan. A rigid actor is followed from scan to scan: its position is predicted from its
+motion so far, and corrected by registering its points to the planes of its earlier observations. The planes correct the prediction only in
+the directions that they determine: across a side, and along the path if the front or the back is visible. Registration of points to points
+would drift along the side of a passing car.
 
-Paths are smoothed, because an actor's acceleration is limited, while the error of a measured position is not.
+Paths are smoothed: the acceleration of an actor is limited, and the error of a measured position is not.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ _DRIVE_S = 0.5  # the same for a vehicle
 _POINTS = 200  # number of points of an observation that are compared
 _PAIRS, _APART_S = 12, 1.0  # pairs of observations that are compared, and their distance in time
 _MAX_DISTANCE_M, _DOUBT_M = 0.5, 0.02
-_STATIC_M = 0.38  # observations of a standing actor are closer to each other, although they show different sides of it
+_STATIC_M = 0.38  # observations of a static actor are closer to each other, although they show different sides
 _TURN_S = 1.0  # half width of the window in which directions correct registered turns
-_MIN_TURNS = 4  # the fewest directions that do
+_MIN_TURNS = 4  # least number of such directions
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _REGISTERED = 300  # number of points of an observation that are registered to the model
-_SIDE_M = 0.14  # standard deviation, across a side, of points of this side alone
+_SIDE_M = 0.14  # standard deviation of the points of one side, across it
 # Error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in radians.
 _PREDICTED = np.array([0.2, 0.2, 0.01, 0.02])
 _UNKNOWN = 5.0  # factor of this error while the motion is not known yet
-_SLOW_M_S, _END_POINTS = 1.0, 20  # the ends of slower actors, and of observations with fewer points, are not compared
+_SLOW_M_S, _END_POINTS = 1.0, 20  # slower actors and observations with fewer points are not compared by their ends
 _SAME_WIDTH_M = 0.12  # greatest difference of the widths of the same ends
-_GAIN = 0.3  # weight of the last correction in the motion
+_GAIN = 0.3  # weight of the last correction in the estimate of the motion
 
 
 def estimate_path(
@@ -46,8 +46,8 @@ def estimate_path(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Estimate the position, the velocity and the heading of an actor at each of its observations.
 
-    Rigid actors are registered, so that it does not matter which side of them is seen. For people, who change their shape as they walk, the
-    centre of the points is followed. Observations with too few points are interpolated. An actor that was seen once has velocity zero.
+    Rigid actors are registered, so the result does not depend on the side that is visible. People change their shape as they walk, so the
+    centre of their points is followed. Observations with too few points are interpolated. An actor with one observation has velocity zero.
 
     Args:
         observations: (M, 3) points of the actor at each time, metres, world.
@@ -78,8 +78,8 @@ def is_static(
     headings: NDArray[np.float64],
     seconds: NDArray[np.float64],
 ) -> bool:
-    """Return whether observations overlap as well without any motion as with the estimated motion; the arguments are those of `overlay`."""
-    still, moved = overlay(observations, positions, headings, seconds)  # with a wrong path, they overlap badly too
+    """Return whether observations align as well without motion as with the estimated motion; the arguments are those of `overlay`."""
+    still, moved = overlay(observations, positions, headings, seconds)  # a wrong path aligns them badly too
     return bool(np.isnan(still) or still < min(moved + _DOUBT_M, _STATIC_M))
 
 
@@ -90,17 +90,17 @@ def overlay(
     seconds: NDArray[np.float64],
     slides_m: Sequence[float] = (0.0,),
 ) -> tuple[float, ...]:
-    """Return how well the observations of an actor overlay, about a second apart: the mean distance to the nearest point of another, in metres.
+    """Return how well observations of an actor, about a second apart, align: the mean distance to the nearest point of the other, metres.
 
     Args:
         observations: (M, 3) points of the actor at each time, metres, world.
         positions: (F, 3) estimated positions of the actor, metres, world.
         headings: (F,) estimated headings, radians.
         seconds: (F,) times, increasing.
-        slides_m: how far the observations are slid along the heading, beside the estimated motion.
+        slides_m: shifts along the heading that are added to the estimated motion, metres.
 
     Returns:
-        The distance without any motion, and that with the estimated motion and each slide. All are NaN for a single observation.
+        The distance without motion, and the distance with the estimated motion and each shift. All are NaN for a single observation.
     """
     thinned = [thin(points, _POINTS) for points in observations]
     body = [multiply(points - positions[i], rotation_z(headings[i])[:3, :3]) for i, points in enumerate(thinned)]
@@ -114,14 +114,14 @@ def overlay(
 
 
 def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Return the mean distance of points to the nearest of others, in metres; distances above `_MAX_DISTANCE_M` count as this value."""
+    """Return the mean distance of points to the nearest of other points, metres. Each distance is at most `_MAX_DISTANCE_M`."""
     return float(np.minimum(np.sqrt(nearest_points(points, others)[1]), _MAX_DISTANCE_M).mean())
 
 
 def _limit_acceleration(
     velocities: NDArray[np.float64], seconds: NDArray[np.float64], best: int
 ) -> NDArray[np.float64]:
-    """Limit the change of (F, 3) velocities to what an actor can do, starting at the index `best` and going outwards."""
+    """Limit the change of (F, 3) velocities to the acceleration of an actor, from the index `best` outwards."""
     bounded = velocities.copy()
     for step, stop in ((1, len(seconds)), (-1, -1)):
         for index in range(best + step, stop, step):
@@ -136,17 +136,17 @@ def _limit_acceleration(
 def headings_by_turns(
     velocities: NDArray[np.float64], turns: NDArray[np.float64], seconds: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return headings that turn as registration shows, and are the direction of motion over a second or two.
+    """Return headings: registered turns, corrected by the directions of motion over a second or two.
 
-    A vehicle that enters a bend does not move where it points, so directions alone are wrong there; registered turns alone drift.
+    Directions of motion alone are wrong where a vehicle enters a bend, as it does not move where it points. Registered turns alone drift.
 
     Args:
         velocities: (F, 3) m/s.
-        turns: (F,) headings but for a constant, radians, as registration shows them.
+        turns: (F,) registered headings, except for a constant, radians.
         seconds: (F,) times, rising.
 
     Returns:
-        (F,) radians, unwrapped; those of `headings_of` if the actor is fast too seldom.
+        (F,) radians, unwrapped; those of `headings_of` if few velocities are fast enough.
     """
     fast, directions = fast_rows(velocities), headings_of(velocities)
     if len(fast) < _MIN_TURNS:
@@ -158,7 +158,7 @@ def headings_by_turns(
 def follow(
     observations: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], best: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Register the observations of a rigid, upright actor, starting with the best observation and going outwards.
+    """Register the observations of a rigid, upright actor, from the best observation outwards.
 
     Args:
         observations: (M, 3) points of the actor at each time, metres, world.
@@ -202,17 +202,17 @@ def corrections(
     error: NDArray[np.float64],
     best: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how the path of a rigid, upright actor has to change so that its observations fit each other. The change is smooth.
+    """Return the smooth change of the path of a rigid, upright actor with which its observations align.
 
     Args:
         observations: (M, 3) points of the actor at each time, metres, world.
         seconds: (F,) times, increasing.
-        states: (F, 4) x, y, z in metres, and yaw in radians, world, as they are known so far.
+        states: (F, 4) x, y, z in metres, and yaw in radians, world, before the change.
         error: (4,) their standard deviation.
         best: index of the observation to start with: see `best_observation`.
 
     Returns:
-        (F, 4) what is to be added to the states, and (F, 4) its change per second.
+        (F, 4) the change, to be added to the states, and (F, 4) its derivative per second.
     """
     laid, model = states.copy(), Planes()
     for index in [best, *range(best + 1, len(states)), *range(best - 1, -1, -1)]:
@@ -227,10 +227,10 @@ def corrections(
 def _shift_of_ends(
     before: NDArray[np.float64], now: NDArray[np.float64], velocity: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return (K, 4) the directions, world, in which two observations show the same ends of an actor, and the shift of these ends, in metres.
+    """Return (K, 4) directions, world, in which two observations show the same ends of an actor, and the displacement of these ends, metres.
 
-    A flat face determines no motion along it, but its ends do: the rear of a car that drives ahead shows where the car is across the
-    street. If what is seen has the same width in both observations, its ends are taken for the same.
+    A flat face determines no motion along it, but its ends do: the ends of the rear of a car ahead show its position across the street.
+    The ends are taken as the same if the visible part has the same width in both observations.
     """
     speed = float(np.hypot(velocity[0], velocity[1]))
     if speed < _SLOW_M_S or min(len(before), len(now)) < _END_POINTS:
@@ -245,7 +245,7 @@ def _shift_of_ends(
 
 
 def ends(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the 2 % and 98 % quantiles of (N,) values, as `np.quantile` does in ten times the time."""
+    """Return the 2 % and 98 % quantiles of (N,) values. `np.quantile` returns the same and takes ten times as long."""
     places = [(len(values) - 1) * quantile for quantile in (0.02, 0.98)]
     after = [min(int(place) + 1, len(values) - 1) for place in places]
     ranked = np.partition(values, [int(places[0]), after[0], int(places[1]), after[1]])
@@ -266,7 +266,7 @@ def middles_of(observations: Sequence[NDArray[np.float64]]) -> NDArray[np.float6
 
 
 def best_observation(observations: Sequence[NDArray[np.float64]]) -> int:
-    """Return the index of the observation to start with: one with many points, more than one side, and not at an end of the track."""
+    """Return the index of the observation to start with: it has many points, shows more than one side, and is not at an end of the track."""
     counts = np.array([len(points) for points in observations])
     across = [_least_variance(points[:, :2]) if len(points) > 2 else 0.0 for points in observations]
     inner = np.arange(len(observations))
