@@ -21,11 +21,9 @@ _LAGS = (2, 5, 10, 20)  # scans between the start and the end of a compared moti
 _ROUNDS = 8
 _ROBUST = 4.0  # squared residual, in standard deviations, above which a motion has less weight
 _SAME = 12.0  # number of motions with about the same errors: a scan is in two per lag, and neighbours are similar
-_LEAST = np.array([0.003, 0.003, 0.003, 2e-4, 2e-4, 2e-4])  # standard deviation of a scanned motion: metres, radians
+_LEAST = np.array([0.003, 0.003, 0.003, 2e-4, 2e-4, 2e-4])  # least deviation of a motion: metres, radians
 _STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # steps of the numerical derivatives
-_DETERMINED = np.array(
-    [0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03]
-)  # greatest standard error of a determined value
+_DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])  # greatest error of a known value
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])  # smaller values need no correction
 _CERTAIN = 4.0  # values of fewer standard errors need none either
 _LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values
