@@ -294,9 +294,9 @@ class TestBadInput:
         street = passing_car.write_sequence(tmp_path, ("labels",), frames=20)
         (note,) = make(street, "x", frames=(10, 11)).notes
         assert "cartesian: free space shows 1 actors that move" in note
-        assert ", although nothing else says so" in note
+        assert ", although no field of the data shows it" in note
         (note,) = make(street, "y", frames=(10, 11), settings={"motion": MotionOptions("none")}).notes
-        assert "cartesian: nothing shows what moves: everything was treated as static" in note
+        assert "cartesian: no field shows motion: all points were treated as static" in note
         assert make(street, "z", frames=(10, 11), settings={"dynamic": "tube"}).notes == ()
 
     def test_a_window_larger_than_the_sequence_is_fine(self, tmp_path):
