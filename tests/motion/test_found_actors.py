@@ -1,4 +1,4 @@
-"""Actors are followed over time, and only what overlays better along a path than without motion earns a track."""
+"""Actors are followed over time, and only actors whose observations align better along a path than without motion are found."""
 
 from dataclasses import replace
 

@@ -58,7 +58,7 @@ class FoundActors:
     Attributes:
         moved: (M,) int64 indices of the points of each frame that belong to something that moved, tracked or not. They must be left out
             of other frames.
-        tracked: the actors whose observations overlay better along an estimated path than static.
+        tracked: the actors whose observations align better along an estimated path than without motion.
     """
 
     moved: Mapping[int, NDArray[np.int64]]
@@ -91,7 +91,7 @@ def find_actors(
         default_label: class of actors without labels.
 
     Returns:
-        The points that moved, and the actors that earned a track.
+        The points that moved, and the actors with enough evidence.
     """
     moved: dict[int, NDArray[np.int64]] = {}
     evidence = find_evidence(scans, movable=movable)
