@@ -104,7 +104,7 @@ class CaptureSequence(SequenceInput):
     def _find_frames(self) -> tuple[FrameInput, ...]:
         capture = self.capture
         numbers = choose_frames(self.plan.frames, np.array(capture.frames), capture.location)
-        # Frames hold another Capture: this one caches its listing, which would be pickled with every frame.
+        # Frames hold a copy of the capture without its cached listing, which would be pickled with each frame.
         light, known = capture.light(), capture.frames
         place = np.searchsorted(known, numbers)
         around = [known[np.clip(place + step, 0, len(known) - 1)].tolist() for step in (-_TURN_FRAMES, _TURN_FRAMES)]

@@ -111,7 +111,7 @@ def label_images(
     numbered = replace(plan, voting=Voting(keep_actors=True))
     inputs = {path: ScanSequence(one, numbered, observe) for path, one in given.items()}
     for one in inputs.values():
-        _ = one.feed.motion  # raises what is wrong before anything is written
+        _ = one.feed.motion  # raises errors before anything is written
     digest = blake2b(repr([one.stamps() for one in found.values()]).encode(errors="surrogateescape"), digest_size=16)
     settings: dict[str, Any] = {"observe": repr(observe), "by": by, "pixels": digest.hexdigest()}
     settings |= {"classes": None if table is None else table.to_dict()}

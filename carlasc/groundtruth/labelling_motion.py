@@ -40,7 +40,7 @@ class MotionResult(CopyResult):
 
     Attributes:
         actors: number of moving actors.
-        notes: what was found in each sequence, in lines.
+        notes: remarks on each sequence, one line each.
     """
 
     actors: int = 0
@@ -89,7 +89,7 @@ def label_motion(
     plan = GridPlan(GridSpec.published(), layout.EVALUATION, observe, Voting(keep_actors=True), FrameRange())
     inputs = {path: ScanSequence(one, plan, observe) for path, one in given.items()}
     for one in inputs.values():
-        _ = one.feed.motion  # raises what is wrong before anything is written
+        _ = one.feed.motion  # raises errors before anything is written
     copy = DerivedCopy.begin(
         source,
         out,
@@ -125,7 +125,7 @@ def label_motion(
 
 
 def find_moving(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]) -> None:
-    """Find the actors of a sequence, or read what an interrupted run kept with `writer`."""
+    """Find the actors of a sequence, or read the result that an interrupted run kept with `writer`."""
     if writer is not None:
         inputs.prepare(writer, run, step)
         return

@@ -74,7 +74,7 @@ class FromScans:
                 raise ArgumentError(name, expected=f"{options.__name__}(...)", found=repr(value))
         if self.dynamic == "tube" and self.motion.source != "auto":
             raise ArgumentError(
-                "motion", expected='none with dynamic "tube", which ignores what moves', found=repr(self.motion.source)
+                "motion", expected='none with dynamic "tube", which ignores motion', found=repr(self.motion.source)
             )
         low, high = self.min_range_m or 0.0, math.inf if self.max_range_m is None else self.max_range_m
         if not 0 <= low < high:
@@ -97,7 +97,7 @@ class FromGrid:
 
 
 Observe = FromCapture | FromScans | FromGrid
-"""What the `observe` argument of `regrid` takes."""
+"""The type of the argument `observe` of `regrid`."""
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def refine(
     Raises:
         ArgumentError: `poses.refine` is "never".
         ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted run had other options.
-        MissingDataError: there are no scans, or no poses and `poses` says that they are those of the data.
+        MissingDataError: there are no scans, or no poses and `poses.source` is "file".
         FormatError: poses or times are not valid.
         DependencyError: poses have to be estimated, and kiss-icp is not installed.
         StorageError: the files cannot be written.
@@ -141,14 +141,14 @@ class _RefinedSequence(DerivedSequence):
 def _refine(
     sequence: Sequence, options: FromScans, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]
 ) -> _RefinedSequence:
-    """Refine the poses of a sequence, or read what an interrupted run kept with `writer`."""
+    """Refine the poses of a sequence, or read the result that an interrupted run kept with `writer`."""
     posed = sequence
     if estimated := must_estimate(sequence, options):
         posed = with_estimated_poses(sequence)
         check_trajectory(posed, options)
     feed = ScanFeed(posed, options)
     change = refine_sequence(feed, writer, run, step)
-    mounting = None if estimated else _mounting(feed, change)  # estimated poses are those of the sensor
+    mounting = None if estimated else _mounting(feed, change)  # estimated poses are poses of the sensor
     if mounting is None or not mounting.wrong.any():
         return _RefinedSequence(sequence, posed, change)
     seconds = np.array(list(feed.times.values()))

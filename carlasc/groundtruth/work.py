@@ -218,7 +218,7 @@ class FrameFailure:
     Attributes:
         sequence: location of its sequence in the source.
         frame: its number in the source.
-        message: what went wrong, in one line.
+        message: the error, in one line.
     """
 
     sequence: str
@@ -321,7 +321,7 @@ class Work:
 
     Attributes:
         jobs: the sequences.
-        plan: what is made.
+        plan: the plan of the run.
         spread: how the work is spread. Frames that are stored together are in one part.
         failures: frames that could not be made.
         wanted: number of frames to make.

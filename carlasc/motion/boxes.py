@@ -110,7 +110,7 @@ def segment_by_boxes(
         frame: frame number.
         scan: points, with labels if it has any.
         world_T_sensor: (4, 4) pose of the scan.
-        tracks: the tracks. Those that do not extend to the frame have no points.
+        tracks: the tracks. Tracks that do not extend to the frame have no segment.
         ground: ids of the ground classes.
         floor_m: points of other classes than the track's count as ground up to this height above the bottom of its box, metres.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.motion.evidence import FreeSpaceEvidence
 from carlasc.motion.linking import best_pairs
-from carlasc.motion.paths import estimate_path, is_static, middles_of, overlay
+from carlasc.motion.paths import estimate_path, is_static, middles_of, misalignment
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
 
@@ -24,7 +24,7 @@ _STRAIGHT = 0.35  # least extent of a path over its length: noise moves back and
 _MAX_JUMP_M_S = 4.0  # greatest median deviation of the observations' steps from the path's
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
 _PERSON_M = (1.5, 2.3)  # actors that are narrower and lower change their shape as they move
-_SLIDE_M = 0.5  # observations are shifted along their path by so much, to test whether they still align
+_SHIFT_M = 0.5  # observations are shifted along their path by so much, to test whether they still align
 _OBSERVATIONS, _MANY_OBSERVATIONS = 10, 30  # more than the latter do not raise the confidence
 _WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of 1 and of the terms of `_confidence`
 _LEAST_CONFIDENCE = 0.5  # of an actor
@@ -62,7 +62,7 @@ def follow_actors(
     """Follow what moved from scan to scan, and yield each actor that has enough evidence, after its last observation.
 
     Args:
-        evidence: what moved in each scan, in order of time.
+        evidence: the evidence of each scan, in order of time.
         moved: filled with the (M,) indices of the points that moved, tracked or not, by frame.
         deformable: classes of actors that change their shape as they move. Without labels, small actors do.
         first_instance: number of the first actor; others follow.
@@ -236,17 +236,17 @@ class _ActorChain:
         headings: NDArray[np.float64],
         seconds: NDArray[np.float64],
     ) -> float:
-        """Return the probability that the actor is real, from 0 to 1; the arguments are those of `overlay`.
+        """Return the probability that the actor is real, from 0 to 1; the arguments are those of `misalignment`.
 
         It is the logistic function of a weighted sum of these terms: the share of its points at places that were seen free; the share of
         static points among all points around it; the share by which its observations align better than shifted along its path; the
         logarithm of their number; and whether it is a scan line. The second and the third term reject pieces of rails, fences and
         hedges: these have static neighbours, and align as well after any shift.
         """
-        _, best, *slid = overlay(samples, positions, headings, seconds, (0.0, -_SLIDE_M, _SLIDE_M))
+        _, best, *shifted = misalignment(samples, positions, headings, seconds, (0.0, -_SHIFT_M, _SHIFT_M))
         counts = np.array([(len(link.segment.members), link.freed, link.around) for link in self.links])
         points, freed, around = counts.sum(axis=0).tolist()
-        gain = 1.0 - best / max(min(slid), 1e-3)
+        gain = 1.0 - best / max(min(shifted), 1e-3)
         support = float(np.log(min(len(self.links), _MANY_OBSERVATIONS) / _OBSERVATIONS))
         terms = (1.0, freed / points, around / (points + around), gain, support, float(self._is_scan_line()))
         return 1.0 / (1.0 + float(np.exp(-sum(weight * term for weight, term in zip(_WEIGHTS, terms, strict=True)))))

@@ -100,7 +100,7 @@ def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np
     rows = np.column_stack([chosen[:, :2], np.ones(len(chosen))])
     samples = np.random.default_rng(0).integers(0, len(chosen), (_TRIALS, 3))
     x, y, z = np.moveaxis(chosen[samples[:, 1:]] - chosen[samples[:, :1]], 2, 0)  # from the first point to the others
-    area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]  # twice that of the triangle, in square metres
+    area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]  # twice the area of the triangle, square metres
     wide = np.abs(area) > 1.0
     x, y, z, area, corner = x[wide], y[wide], z[wide], area[wide], chosen[samples[wide, 0]]
     along_x = (z[:, 0] * y[:, 1] - z[:, 1] * y[:, 0]) / area

@@ -20,7 +20,7 @@ from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_points
 
 MIN_POINTS = 100  # scans with fewer points do not determine the motion
-_NEAR_M = 8.0  # ground farther away is left out
+_NEAR_M = 8.0  # farther ground is left out
 _START = 10  # scans from which the motion at the start is estimated
 _PERIOD_S = 0.1  # between scans whose times are not known
 

@@ -17,8 +17,8 @@ class PoseOptions:
     """Where the poses of scans come from.
 
     Attributes:
-        source: "file": those of the data; "kiss-icp": estimated from the scans (needs the extra `kitti`); "auto": those of the data
-            where they exist, otherwise estimated. Estimated poses are written only where the sequence has none.
+        source: "file": the poses of the data; "kiss-icp": estimated from the scans (needs the extra `kitti`); "auto": the poses of the
+            data where they exist, otherwise estimated. Estimated poses are written only where the sequence has none.
         refine: whether poses are changed so that neighbouring scans agree. "auto": where scans agree clearly better afterwards, measured
             in places that take no part; "always": also where they do not; "never". The given poses are not overwritten.
         force: accept poses that are farther apart than a vehicle can move or turn, or under which scans do not overlap.

@@ -78,17 +78,17 @@ def is_static(
     headings: NDArray[np.float64],
     seconds: NDArray[np.float64],
 ) -> bool:
-    """Return whether observations align as well without motion as with the estimated motion; the arguments are those of `overlay`."""
-    still, moved = overlay(observations, positions, headings, seconds)  # a wrong path aligns them badly too
+    """Return whether observations align as well without motion as with the estimated motion; the arguments are those of `misalignment`."""
+    still, moved = misalignment(observations, positions, headings, seconds)  # a wrong path aligns them badly too
     return bool(np.isnan(still) or still < min(moved + _DOUBT_M, _STATIC_M))
 
 
-def overlay(
+def misalignment(
     observations: Sequence[NDArray[np.float64]],
     positions: NDArray[np.float64],
     headings: NDArray[np.float64],
     seconds: NDArray[np.float64],
-    slides_m: Sequence[float] = (0.0,),
+    shifts_m: Sequence[float] = (0.0,),
 ) -> tuple[float, ...]:
     """Return how well observations of an actor, about a second apart, align: the mean distance to the nearest point of the other, metres.
 
@@ -97,7 +97,7 @@ def overlay(
         positions: (F, 3) estimated positions of the actor, metres, world.
         headings: (F,) estimated headings, radians.
         seconds: (F,) times, increasing.
-        slides_m: shifts along the heading that are added to the estimated motion, metres.
+        shifts_m: shifts along the heading that are added to the estimated motion, metres.
 
     Returns:
         The distance without motion, and the distance with the estimated motion and each shift. All are NaN for a single observation.
@@ -108,9 +108,9 @@ def overlay(
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:
-            slid = [_mean_distance(body[i] + np.array([slide, 0.0, 0.0]), body[j]) for slide in slides_m]
-            found.append([_mean_distance(thinned[i], thinned[j]), *slid])
-    return tuple(np.mean(found, axis=0).tolist()) if found else (np.nan,) * (1 + len(slides_m))
+            shifted = [_mean_distance(body[i] + np.array([shift, 0.0, 0.0]), body[j]) for shift in shifts_m]
+            found.append([_mean_distance(thinned[i], thinned[j]), *shifted])
+    return tuple(np.mean(found, axis=0).tolist()) if found else (np.nan,) * (1 + len(shifts_m))
 
 
 def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:

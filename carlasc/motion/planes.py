@@ -123,7 +123,7 @@ def nearest_within(
 
     Args:
         points: (N, 3) points.
-        pose: (4, 4) from the frame of the model to that of the points, rigid.
+        pose: (4, 4) from the frame of the model to the frame of the points, rigid.
         model: (M, 3) points, sorted.
         order: (M,) index of each point of the model before sorting.
         axis: the axis of sorting.

@@ -29,7 +29,7 @@ class Segment:
 
     Attributes:
         frame: frame number.
-        label: class of the actor: that of most of its points.
+        label: most frequent class of its points.
         members: (M,) int64 indices of the points in the scan.
         points: (M, 3) float64 metres, world.
         velocity: (3,) m/s, world; None if the scan has no flow.
@@ -155,7 +155,7 @@ class StaticPoints:
         return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
 
     def segment_at(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
-        """Return the static points of a segment's class at its position; None if they are far fewer than those of the segment."""
+        """Return the static points of a segment's class at its position; None if the segment has far more points."""
         lower, upper = segment.points.min(axis=0) - margin_m, segment.points.max(axis=0) + margin_m
         own = np.flatnonzero(
             (self.labels == segment.label) & ((self.points > lower) & (self.points < upper)).all(axis=1)

@@ -135,7 +135,7 @@ def principal_axes(covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64
 def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (3, 3) rotation nearest to a (3, 3) mean of rotations; the identity if these have no mean direction."""
     rotation = matrix
-    for _ in range(30):  # Newton's method for the polar decomposition: four or five times where rotations are alike
+    for _ in range(30):  # Newton's method for the polar decomposition: four or five steps for similar rotations
         rows = np.cross(rotation[[1, 2, 0]], rotation[[2, 0, 1]])
         volume = float((rotation[0] * rows[0]).sum())
         if volume < 1e-12:
@@ -171,7 +171,7 @@ def smooth_at(
     weights: NDArray[np.float64],
     half_s: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what `smooth` returns for the time of one index alone: (D,) and (D,)."""
+    """Return the (D,) value and the (D,) derivative of `smooth` at one index."""
     distance = np.abs(seconds - seconds[index])
     near = np.flatnonzero(distance <= half_s + 1e-9)
     if len(near) < 4:

@@ -44,7 +44,7 @@ class Track:
     """One actor over time.
 
     Attributes:
-        label: class of the actor, which is that of most of its points.
+        label: most frequent class of its points.
         instance: number of the actor; 0 if actors are not numbered.
         members: (M,) indices of the points of the actor in each scan that sees it, by frame.
         first: frame of `world_T_actor[0]`.

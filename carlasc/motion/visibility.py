@@ -127,7 +127,7 @@ def look_up(
     Args:
         points: (M, 3) metres.
         asked: (A,) indices of the points that are looked up.
-        pose: from the points' frame to that of the other scan.
+        pose: from the frame of the points to the frame of the other scan.
         view: the returns of the other scan.
         bit: number of the bit to set.
         free: (M,) gets the bit where the place of the point is free.

@@ -50,7 +50,7 @@ class MapResult:
         points: number of points, or of occupied voxels.
         frames: number of scans; 1 for a grid.
         actors: number of actors whose bodies were written.
-        notes: remarks about what was found, one line each.
+        notes: remarks on the results, one line each.
         elapsed_s: duration, in seconds.
     """
 
