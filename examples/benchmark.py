@@ -48,7 +48,7 @@ def main(
     out: Annotated[Path, typer.Argument(help="Folder for drives, runs and results. A second run continues there.")],
     size: Annotated[
         Literal["tiny", "small", "medium", "long", "full"],
-        typer.Option(help="small, medium and long: on a CPU, in minutes, an hour and a day; full: on a GPU."),
+        typer.Option(help="small, medium and long: on a CPU, in minutes, hours and a day; full: on a GPU."),
     ] = "tiny",
     study: Annotated[
         list[Study] | None,

@@ -27,9 +27,9 @@ def map(
         float, typer.Option("--cell", help="Size of a cell, in metres: one point is written per cell.")
     ] = 0.05,
     frames: FramesOption = None,
-    movers: Annotated[
+    actors: Annotated[
         bool,
-        typer.Option("--movers", help="Also write the body of each actor, in its own frame, to the folder OUT_movers."),
+        typer.Option("--actors", help="Also write the body of each actor, in its own frame, to the folder OUT_actors."),
     ] = False,
     mesh: Annotated[
         Path | None,
@@ -63,7 +63,7 @@ def map(
             cell_m=cell_m,
             frames=frames,
             grid=grid,
-            movers=movers,
+            actors=actors,
             mesh=mesh,
             distance=distance,
             motion=carlasc.motion.MotionOptions(motion),
@@ -79,5 +79,5 @@ def map(
     for name in result.files:
         echo(name)
     what, of = ("voxels", f"of {grid}") if grid is not None else ("points", f"of {result.frames} scans")
-    bodies = f", {result.actors} actors beside it" if movers else ""
+    bodies = f", {result.actors} actors beside it" if actors else ""
     echo(f"{result.points:,} {what} {of}{bodies}, in {result.elapsed_s:.1f} s")

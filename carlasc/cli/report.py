@@ -76,18 +76,18 @@ def _print_actors(actors: tuple[ActorTrack, ...], *, everything: bool) -> None:
     from carlasc.cli.tables import print_table
 
     shown = actors if everything else actors[:_SHOWN]
-    header = ["Actor", "Instance", "Frames", "Sightings", "Points", "m/s", "Size m", "Residual m", "Standing m", "Sure"]
+    header = "Actor|Instance|Frames|Observations|Points|m/s|Size m|Residual m|Static m|Sure".split("|")
     rows = [
         [
             actor.label,
             str(actor.instance or ""),
             f"{actor.first}..{actor.last}",
-            str(actor.sightings),
+            str(actor.observations),
             str(actor.points),
             f"{actor.speed_m_s:.1f}",
             " x ".join(f"{side:.1f}" for side in actor.size_m),
             "" if actor.residual_m is None else f"{actor.residual_m:.2f}",
-            "" if actor.residual_standing_m is None else f"{actor.residual_standing_m:.2f}",
+            "" if actor.residual_static_m is None else f"{actor.residual_static_m:.2f}",
             f"{actor.confidence:.0%}",
         ]
         for actor in shown

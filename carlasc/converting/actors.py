@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
-from carlasc.motion.paths import estimate_path, is_standing
+from carlasc.motion.paths import estimate_path, is_static
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 
@@ -23,14 +23,14 @@ Velocity = tuple[float, float, float]
 """(vx, vy, vz) in m/s over ground, right-handed sensor frame."""
 
 _MAX_GAP = 10  # frames for which an actor may be hidden; after a longer gap a new path begins
-_MAX_SIGHTINGS = 400  # of one path
-_MAX_POINTS = 1000  # of one sighting
+_MAX_OBSERVATIONS = 400  # of one path
+_MAX_POINTS = 1000  # of one observation
 _FARTHEST_M = 1e4  # no LiDAR sees so far: such numbers are damage, also infinity and NaN
 _BATCH = 32  # paths that are estimated together
 
 
 @dataclass(frozen=True)
-class ActorSighting:
+class ActorObservation:
     """The points of one actor in one scan.
 
     Attributes:
@@ -49,7 +49,7 @@ def find_actors(
     labels: NDArray[np.unsignedinteger],
     instances: NDArray[np.uint32],
     classes: ClassTable,
-) -> tuple[ActorSighting, ...]:
+) -> tuple[ActorObservation, ...]:
     """Return the numbered actors of a scan that may move: those of moving classes, or of movable classes if the table has no moving ones.
 
     Args:
@@ -63,7 +63,7 @@ def find_actors(
     order = wanted[np.argsort(instances[wanted], kind="stable")]
     groups = np.split(order, np.flatnonzero(np.diff(instances[order])) + 1) if len(order) else []
     return tuple(
-        ActorSighting(
+        ActorObservation(
             int(instances[own[0]]), int(np.bincount(labels[own]).argmax()), thin(points[own, :3], _MAX_POINTS)
         )
         for own in groups
@@ -71,8 +71,8 @@ def find_actors(
 
 
 @dataclass
-class _SightingChain:
-    """The sightings of one actor without a long gap."""
+class _ObservationChain:
+    """The observations of one actor without a long gap."""
 
     actor: int
     label_counts: dict[int, int] = field(default_factory=dict)
@@ -87,7 +87,7 @@ class _SightingChain:
 
     @property
     def label(self) -> int:
-        """The class of most sightings, the lowest of several."""
+        """The class of most observations, the lowest of several."""
         return max(sorted(self.label_counts), key=self.label_counts.__getitem__)
 
 
@@ -97,20 +97,20 @@ class _VelocityEstimate:
 
     classes: ClassTable
 
-    def __call__(self, chain: _SightingChain) -> list[Velocity]:
+    def __call__(self, chain: _ObservationChain) -> list[Velocity]:
         """Return the velocity in each frame of a chain, in the sensor frame of that frame."""
         poses, seconds = np.stack(chain.poses), np.array(chain.seconds)
-        sightings = [transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)]
+        observations = [transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)]
         rigid = chain.label not in self.classes.deformable
-        positions, velocities, headings = estimate_path(sightings, seconds, rigid=rigid)
-        if not self.classes.moving and is_standing(sightings, positions, headings, seconds):
+        positions, velocities, headings = estimate_path(observations, seconds, rigid=rigid)
+        if not self.classes.moving and is_static(observations, positions, headings, seconds):
             velocities = np.zeros_like(velocities)
         own = multiply(invert(poses)[:, :3, :3], velocities[:, :, None])[:, :, 0]
         return [(x, y, z) for x, y, z in own.tolist()]
 
 
 class ActorMotion:
-    """Collects the sightings of actors, frame by frame, and estimates their velocities.
+    """Collects the observations of actors, frame by frame, and estimates their velocities.
 
     If the class table has no classes of moving actors, actors that stay where they are get zero.
 
@@ -121,11 +121,11 @@ class ActorMotion:
 
     def __init__(self, classes: ClassTable, run: Run = Run(workers=1)) -> None:  # noqa: B008 (frozen)
         self._estimate, self._run_options = _VelocityEstimate(classes), run
-        self._chains: dict[int, _SightingChain] = {}
-        self._ended: list[_SightingChain] = []
+        self._chains: dict[int, _ObservationChain] = {}
+        self._ended: list[_ObservationChain] = []
         self._velocities: dict[int, dict[int, Velocity]] = {}
 
-    def add(self, frame: int, seconds: float, first_T_sensor: Transform, actors: Iterable[ActorSighting]) -> None:
+    def add(self, frame: int, seconds: float, first_T_sensor: Transform, actors: Iterable[ActorObservation]) -> None:
         """Add the actors of the next frame.
 
         Args:
@@ -134,16 +134,16 @@ class ActorMotion:
             first_T_sensor: (4, 4) pose of the sensor.
             actors: what was seen of each actor.
         """
-        for sighting in actors:
-            chain = self._chains.get(sighting.actor)
-            if chain is None or frame - chain.frames[-1] > _MAX_GAP or len(chain.frames) >= _MAX_SIGHTINGS:
+        for observation in actors:
+            chain = self._chains.get(observation.actor)
+            if chain is None or frame - chain.frames[-1] > _MAX_GAP or len(chain.frames) >= _MAX_OBSERVATIONS:
                 self._ended += [] if chain is None else [chain]
-                chain = self._chains[sighting.actor] = _SightingChain(sighting.actor)
-            chain.label_counts[sighting.label] = chain.label_counts.get(sighting.label, 0) + 1
+                chain = self._chains[observation.actor] = _ObservationChain(observation.actor)
+            chain.label_counts[observation.label] = chain.label_counts.get(observation.label, 0) + 1
             chain.frames.append(frame)
             chain.seconds.append(seconds)
             chain.poses.append(first_T_sensor)
-            chain.points.append(sighting.points)
+            chain.points.append(observation.points)
         for actor in [actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > _MAX_GAP]:
             self._ended.append(self._chains.pop(actor))
         if len(self._ended) >= _BATCH:
@@ -158,7 +158,7 @@ class ActorMotion:
 
     def _run(self) -> None:
         chains = sorted(
-            self._ended, key=_SightingChain.size, reverse=True
+            self._ended, key=_ObservationChain.size, reverse=True
         )  # so that no worker has a long one left at the end
         self._ended = []
         with closing(run_all(self._estimate, chains, self._run_options)) as estimates:

@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.actors import ActorSighting, find_actors
+from carlasc.converting.actors import ActorObservation, find_actors
 from carlasc.converting.assembling import Assembled, Rig, VehicleMotion, read_scan
 from carlasc.converting.layout_options import AxesAndClasses
 from carlasc.converting.protocol import FrameHandle
@@ -62,7 +62,7 @@ class ConvertedFrame:
     fields: Fields = field(default_factory=dict)
     failure: str | None = None
     points: NDArray[np.float32] | None = None
-    actors: tuple[ActorSighting, ...] = ()
+    actors: tuple[ActorObservation, ...] = ()
     unnumbered: int = 0
 
 

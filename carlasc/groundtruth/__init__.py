@@ -1,4 +1,4 @@
-"""Ground truth: observations are turned into votes and votes into grids, and a run does so for a whole data set."""
+"""Ground truth: observations give votes, votes give grids, and a run makes the grids of a whole data set."""
 
 import lazy_loader
 

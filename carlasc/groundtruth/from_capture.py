@@ -1,4 +1,4 @@
-"""Grids from raw captures: every sensor of the capture votes on the instant of each frame."""
+"""Grids from raw captures: all sensors of the capture vote for the instant of each frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from carlasc.groundtruth.seen import Views
 
 _TURN_FRAMES = 3  # frames before and after
-_TURNING_M_S = 1.0  # of slower actors, the direction of the velocity is not that of the actor
+_TURNING_M_S = 1.0  # the velocity of slower actors does not show their heading
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class CaptureFrame(FrameInput):
     sensors: tuple[int, ...]
     number: int
     source_frame: int
-    around: tuple[int, int]  # a frame before and one after: between them, the turning of actors is measured
+    around: tuple[int, int]  # a frame before and one after: the turn rates of actors are measured between them
 
     def fields(self) -> tuple[str, ...]:
         """Return points, labels, flow and instances, and the pictures that the frame has."""
@@ -83,7 +83,7 @@ class CaptureFrame(FrameInput):
             yield Observation(recording.scan.points, _present(recording.scan.labels), ego_T_sensor)
 
     def _turns(self) -> dict[int, float]:
-        """Return how fast actors turn about the vertical, rad/s: how the direction of their velocity changes."""
+        """Return the turn rates of actors about the vertical, rad/s: the change of the direction of their velocity."""
         before, after = (self.capture.read_velocities(frame) for frame in self.around)
         seconds, turns = (self.around[1] - self.around[0]) * layout.FRAME_PERIOD_S, dict[int, float]()
         for actor in before.keys() & after.keys() if seconds else ():
@@ -104,7 +104,7 @@ class CaptureSequence(SequenceInput):
     def _find_frames(self) -> tuple[FrameInput, ...]:
         capture = self.capture
         numbers = choose_frames(self.plan.frames, np.array(capture.frames), capture.location)
-        # Frames hold another Capture: this one caches its listing, which would be pickled with every frame.
+        # Frames hold a copy of the capture without its cached listing, which would be pickled with each frame.
         light, known = capture.light(), capture.frames
         place = np.searchsorted(known, numbers)
         around = [known[np.clip(place + step, 0, len(known) - 1)].tolist() for step in (-_TURN_FRAMES, _TURN_FRAMES)]
@@ -143,7 +143,7 @@ class CaptureSequence(SequenceInput):
     def record(self) -> dict[str, Any]:
         """Return the frames and the number of sensors.
 
-        An open end of the range stays open, so that a run continues after the capture has grown.
+        An open end of the range stays open, so that a later run continues after the capture has grown.
         """
         asked, first, last = self.plan.frames, self.frames[0].source_frame, self.frames[-1].source_frame
         frames = f"{first}:" if asked.stop is None else f"{first}:{last + 1}" if asked.only is None else str(asked)
@@ -165,6 +165,6 @@ def capture_sequences(source: str | os.PathLike[str] | Source | Capture, plan: G
 
 
 def _present(array: NDArray[Any] | None) -> NDArray[Any]:
-    if array is None:  # does not happen: Capture.read refuses recordings without labels or instances
+    if array is None:  # never: Capture.read refuses recordings without labels or instances
         raise FormatError("recording", expected="labels and instances", found="none")
     return array

@@ -1,4 +1,4 @@
-"""Grids from finer grids: each voxel takes the class of most of the known cells in it."""
+"""Grids from finer grids: each voxel takes the most frequent class of the known cells in it."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
     """Make a coarser grid from a finer one.
 
-    A fine cell belongs to the coarse voxel that contains its centre. Each voxel takes the class of most of its known cells, ties go
-    to the lowest id, and counts are added up.
+    A fine cell belongs to the coarse voxel that contains its centre. Each voxel takes the most frequent class of its known cells (ties go
+    to the lowest id), and the sum of their counts.
 
     Args:
         grid: the finer grid.
@@ -67,7 +67,7 @@ def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
 def _boxes(fine: Grid, spec: GridSpec) -> NDArray[np.uint8] | None:
     """Return the boxes around the occupied cells of a finer grid in each voxel of a coarser one."""
     corners = np.stack(list(np.ndindex(2, 2, 2))) - 0.5
-    corners *= (1 - 1e-3) * fine.spec.voxel_size  # those on a border belong to the voxel beside it
+    corners *= (1 - 1e-3) * fine.spec.voxel_size  # a corner on a border would belong to the voxel beside it
     centers = fine.spec.centers()[fine.labels > 0]
     points = (centers[:, None] + corners).reshape(-1, 3).astype(np.float32)
     seen = Observation(points, np.ones(len(points), np.uint8), np.eye(4))
@@ -78,7 +78,7 @@ def check_coarser(fine: GridSpec, coarse: GridSpec) -> None:
     """Check that a grid `coarse` can be made from a grid `fine`.
 
     Raises:
-        ArgumentError: it cannot; says why.
+        ArgumentError: it cannot, with the reason.
     """
     if fine.coordinates != coarse.coordinates:
         raise ArgumentError(
@@ -115,7 +115,7 @@ class ResampledFrame(FrameInput):
         return scan_fields(self.sequence, self.number)
 
     def views(self) -> Views:
-        """Return the cameras of the sequence, and where they were."""
+        """Return the cameras of the sequence, and their poses."""
         return stored_views(self.sequence, self.number)
 
     def make(self, plan: GridPlan) -> FrameData:

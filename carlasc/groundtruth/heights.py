@@ -1,4 +1,4 @@
-"""The height of the sensor above the ground, and grids that reach down to the ground below a sensor that is higher than CarlaSC's."""
+"""The height of the sensor above the ground, and grids that are moved to the ground for sensors higher than CarlaSC's."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from carlasc.core.grids import GridSpec
 from carlasc.motion import ground_height, ground_points
 
-_BELOW = 0.05  # share of ground points that may be below a grid
-_LOW = 0.05  # quantile of the heights of ground points that a grid must reach down to
-_OF_EACH = 1000  # heights that stand for those of one drive
-_REACH_M = 25.0  # horizontal distance within which the ground is looked for
-_SLACK_M = 0.6  # a grid that begins so far below the ground wastes voxels
+_BELOW = 0.05  # greatest share of ground points below a grid
+_LOW = 0.05  # quantile of the heights of ground points that a moved grid contains
+_OF_EACH = 1000  # number of heights that represent one drive
+_REACH_M = 25.0  # greatest horizontal distance of ground points
+_SLACK_M = 0.6  # a grid that begins so far below the ground is moved up
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def ground_of(
     Args:
         points: (N, 3) metres, in the frame of the sensor.
         labels: (N,) class ids, or None.
-        ground: ids of the ground classes; if there are none, labels do not tell.
+        ground: ids of the ground classes; without any, heights decide.
     """
     found = ground_points(points) if labels is None or not ground else np.isin(labels, sorted(ground))
     return points[found]
@@ -61,7 +61,7 @@ def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float = _REACH_M)
 
 
 def joined(grounds: Sequence[Ground]) -> Ground:
-    """Return the ground in the scans of several drives, at least one. Each counts equally, however many points it has."""
+    """Return the ground in the scans of one or more drives. Each drive has the same weight, for any number of points."""
     if len(grounds) == 1:
         return grounds[0]
     shares = np.linspace(0, 1, _OF_EACH)
@@ -75,7 +75,7 @@ def share_below(ground: Ground, spec: GridSpec) -> float:
 
 
 def fit_to_ground(spec: GridSpec, ground: Ground) -> GridSpec:
-    """Return a grid moved up or down by whole voxels so that the ground is in its lowest layers; the same grid if it is there already."""
+    """Return a grid moved up or down by whole voxels so that the ground is in its lowest layers; unchanged if it already is."""
     size = float(spec.voxel_size[2])
     low = float(np.quantile(ground.heights_m, _LOW))
     if share_below(ground, spec) <= _BELOW and low - spec.lower[2] < max(_SLACK_M, 2 * size):
@@ -84,5 +84,5 @@ def fit_to_ground(spec: GridSpec, ground: Ground) -> GridSpec:
     if not layers:
         return spec
     (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
-    low, high = (float(np.float32(z + layers * size)) for z in (z0, z1))  # as params.json keeps bounds
+    low, high = (float(np.float32(z + layers * size)) for z in (z0, z1))  # params.json has float32 bounds
     return replace(spec, lower=(x0, y0, low), upper=(x1, y1, high))

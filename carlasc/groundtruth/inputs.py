@@ -1,6 +1,6 @@
-"""What a run reads, whatever its grids are made from: sequences and their frames, and the plan that all of them share.
+"""The inputs of a run: sequences and their frames, and the plan that they share, for every source of grids.
 
-A sequence knows its frames and what exists once per sequence. A frame is a small object that pickles into a worker process and is
+A sequence has its frames, and the data that exist once per sequence. A frame is a small object that pickles into a worker process and is
 read there.
 """
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class GridPlan:
-    """What a run makes: the same for each of its sequences and frames.
+    """The plan of a run, which is the same for all sequences and frames.
 
     Attributes:
         spec: geometry of the grids.
@@ -48,7 +48,7 @@ class GridPlan:
         frames: frame numbers of the source.
 
     Raises:
-        ArgumentError: `observe` is of another type, or cannot say how certain voxels are, or who is in them, although `voting` asks for it.
+        ArgumentError: `observe` has another type, or does not provide the certainty or the actors of voxels that `voting` requires.
     """
 
     spec: GridSpec
@@ -82,12 +82,12 @@ class GridPlan:
 
     @property
     def rule(self) -> VoteRule:
-        """The rule by which votes are counted: the one of `voting`, or the default of `observe`."""
+        """The rule that counts votes: that of `voting`, or the default of `observe`."""
         return self.voting.rule or ("ray" if isinstance(self.observe, FromScans) else "sensor")
 
     @property
     def needs_evidence(self) -> bool:
-        """Whether frames must say how certain each voxel is: `FrameData.evidence`."""
+        """Whether frames need the certainty of each voxel: `FrameData.evidence`."""
         return self.voting.keep_evidence or self.voting.min_confidence > 0
 
     def fields(self) -> tuple[str, ...]:
@@ -101,15 +101,15 @@ class GridPlan:
 
 @dataclass(frozen=True)
 class FrameData:
-    """What is made of one frame.
+    """The data of one frame.
 
     Attributes:
         fields: the scan fields that are written beside the grid, by name.
         grid: the grid.
         votes: the votes that decided the grid; None for a resampled grid.
-        evidence: how certain each voxel is; None unless the plan needs it (`GridPlan.needs_evidence`).
-        actors: who is in each voxel; None unless the plan asks for it.
-        boxes: (V, 6) the boxes around the points in each voxel; None unless the plan asks what cameras see.
+        evidence: the certainty of each voxel; None unless the plan needs it (`GridPlan.needs_evidence`).
+        actors: the actor of each voxel; None unless the plan needs it.
+        boxes: (V, 6) uint8 boxes around the points in each voxel; None unless the plan keeps the cameras that see each voxel.
     """
 
     fields: Mapping[str, NDArray[Any]]
@@ -145,7 +145,7 @@ class FrameInput(ABC):
         """
 
     def views(self) -> Views:
-        """Return the cameras of the sequence, each with where it was when it took its image of the frame."""
+        """Return the cameras of the sequence, each with its pose when it took its image of the frame."""
         return ()
 
     def thinned(self, plan: GridPlan) -> Grid | None:
@@ -153,7 +153,7 @@ class FrameInput(ABC):
         return None
 
     def residuals(self) -> Mapping[int, Residual]:
-        """Return how well the sightings of the moving actors in the frame overlay with the next ones, by number of the actor."""
+        """Return how well the observations of the moving actors in the frame align with the next ones, by number of the actor."""
         return {}
 
 
@@ -175,14 +175,14 @@ class SequenceInput(ABC):
         """The chosen frames in increasing order.
 
         Raises:
-            MissingDataError: no frame is in the range, or something that all frames need does not exist.
-            FormatError: something that all frames need is not valid.
+            MissingDataError: no frame is in the range, or data that all frames need do not exist.
+            FormatError: data that all frames need are not valid.
         """
         return self._find_frames()
 
     @abstractmethod
     def _find_frames(self) -> tuple[FrameInput, ...]:
-        """Return the chosen frames, as `frames` says."""
+        """Return the chosen frames: see `frames`."""
 
     @abstractmethod
     def poses(self) -> NDArray[np.float64] | None:
@@ -198,10 +198,10 @@ class SequenceInput(ABC):
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Return what params.json says about the source. A run with another record does not continue the grid."""
+        """Return the record of the source in params.json. A run with another record does not continue the grid."""
 
     def most_points(self) -> int | None:
-        """Return the largest number of points of a few scans, which tells a store how much room a frame needs; None if none can be read."""
+        """Return the largest number of points of some scans, for stores that reserve space; None if no scan can be read."""
         frames = self.frames
         chosen = {frames[0].source_frame, frames[len(frames) // 2].source_frame, frames[-1].source_frame}
         found = []
@@ -219,10 +219,10 @@ class SequenceInput(ABC):
     def prepare(  # noqa: B027 (most sequences need nothing)
         self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]
     ) -> None:
-        """Do what is done once per sequence before its frames are made.
+        """Do the work that comes once per sequence, before its frames are made.
 
         Args:
-            writer: where the sequence is written, and what is kept beside the grids.
+            writer: writes the sequence, and the results that are kept beside the grids.
             run: how the work is spread.
             steps: called with the number of steps since the last call, `steps_before` in all.
         """
@@ -233,15 +233,15 @@ class SequenceInput(ABC):
         return 0
 
     def frame(self, number: int) -> FrameInput | None:
-        """Return a frame of the output that an earlier run made, also one that is not chosen now; None if it is not known."""
+        """Return a frame of the output, also one that only an earlier run chose; None if it is unknown."""
         return next((frame for frame in self.frames if frame.number == number), None)
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
-        """Return what `prepare` found of each actor, by number; None if no actor is tracked."""
+        """Return the facts of each actor from `prepare`, by number; None if actors are not tracked."""
         return None
 
     def pose_facts(self) -> PoseFacts | None:
-        """Return how poses were refined; None if they were not to be."""
+        """Return how poses were refined; None if refinement is off."""
         return None
 
     def notes(self) -> list[str]:
@@ -250,7 +250,7 @@ class SequenceInput(ABC):
 
 
 class StoredSequence(SequenceInput):
-    """A sequence of the layout: its scans, poses and times are kept, and frames keep their numbers."""
+    """A sequence of the layout. Its scans, poses, times and frame numbers are kept."""
 
     def __init__(self, sequence: Sequence, plan: GridPlan) -> None:
         self.sequence, self.plan = sequence, plan
@@ -276,10 +276,10 @@ class StoredSequence(SequenceInput):
 
 
 def choose_frames(frames: FrameRange, available: NDArray[np.int64], where: str) -> list[int]:
-    """Return the available frame numbers that are in a range.
+    """Return the available frame numbers in a range.
 
     Raises:
-        MissingDataError: there is none; the message starts with `where`.
+        MissingDataError: no number is in the range; the message starts with `where`.
     """
     chosen: list[int] = frames.select(available).tolist()
     if not chosen:
@@ -296,7 +296,7 @@ def scan_fields(sequence: Sequence, frame: int) -> tuple[str, ...]:
 
 
 def stored_views(sequence: Sequence, frame: int) -> Views:
-    """Return the cameras of a sequence of the layout, each with where it was when it took its image of a frame."""
+    """Return the cameras of a sequence of the layout, each with its pose when it took its image of a frame."""
     return [(camera, scan_T_camera(sequence, camera, frame)) for camera in cameras_of(sequence).values()]
 
 
@@ -307,7 +307,7 @@ def parent_path(sequence: Sequence) -> str:
 
 
 def without_caches(sequence: Sequence) -> Sequence:
-    """Return a copy of a sequence without its cached properties, small enough to be sent to a worker with every frame."""
+    """Return a copy of a sequence without its cached properties, which is small enough to send to a worker with each frame."""
     light = copy.copy(sequence)
     for name in [n for n in vars(light) if isinstance(getattr(type(light), n, None), cached_property)]:
         del vars(light)[name]

@@ -1,7 +1,8 @@
-"""Classes of pixels written to the points that cameras see: a copy of a data set with labels and their probabilities.
+"""Labels from images: a copy of a data set whose points have the classes of the pixels that show them, with probabilities.
 
-Each point asks the images of its own frame and of frames around it. An image answers if nothing hides the point from it: no voxel of the merged
-grid, and no points of the scan of the image's frame. What moves asks its own frame only, at the place where it was when the image was taken.
+Each point is projected into the images of its own frame and of frames around it. An image counts if it shows the point: no voxel of the merged
+grid hides the point, and no points of the scan of the image's frame do. A moving point is projected into the images of its own frame only, at
+its position when the image was taken.
 """
 
 from __future__ import annotations
@@ -47,23 +48,19 @@ from carlasc.storage.protocol import Sequence, Source
 _WRITTEN = ("labels", "probabilities")
 
 # Chosen on two simulated drives: see docs/howto/cameras.md.
-_ASKED = (0, -3, 3, -6, 6, -10, 10, -15, 15, -20, 20)  # frames whose images a point asks, relative to its own
-_OTHER, _BEHIND_VOXELS = (
-    np.float32(0.02),
-    np.float32(0.25),
-)  # weights of images of other frames, and of own ones for points behind voxels
+_OFFSETS = (0, -3, 3, -6, 6, -10, 10, -15, 15, -20, 20)  # frames of images, relative to the frame of a point
+_OTHER = np.float32(0.02)  # weight of images of other frames
+_BEHIND_VOXELS = np.float32(0.25)  # weight of images of the own frame, for points behind voxels
 _KEPT_BYTES = 1 << 28  # of images
-_CELL_PX = 4.0  # least side of the cells in which the points of a scan hide others
-_FILLED = 1.0  # points of a scan in a cell, on average
-_NEARER, _NEARER_M = 0.04, 0.3  # share of the depth, and metres, by which points are nearer that hide another
-_HEIGHT_M = 1.5  # of a camera above the ground, about
-_REACH_CELLS = 2  # cells to either side in which such points are looked for
-_RING = 0.5  # weight of the pixels around a point's own one, all together, next to that one
-_NEAR_M, _NEAR = (
-    (0.25, 0.5, 1.0, 2.0),
-    np.float32(0.02),
-)  # cells of a scan whose points have one class if nothing else says it, and its probability
-_EDGE = 2.0  # power of a pixel's agreement with those around it by which it counts
+_CELL_PX = 4.0  # least side of the cells in which points of a scan hide other points
+_FILLED = 1.0  # mean number of points of a scan in a cell
+_NEARER, _NEARER_M = 0.04, 0.3  # points that hide another are nearer by this share of the depth, and this distance
+_HEIGHT_M = 1.5  # approximate height of a camera above the ground
+_REACH_CELLS = 2  # cells on each side that are searched for such points
+_RING = 0.5  # weight of all pixels around the pixel of a point, relative to this pixel
+_NEAR_M = (0.25, 0.5, 1.0, 2.0)  # cells of a scan in which points that no image shows get the classes of others
+_NEAR = np.float32(0.02)  # the probability of such a class
+_EDGE = 2.0  # power of the agreement of a pixel with the pixels around it, which is its weight
 
 
 def label_images(
@@ -79,23 +76,23 @@ def label_images(
 ) -> LabelResult:
     """Write a copy of a data set whose points have the classes of the pixels that show them. The source is not changed.
 
-    Points that no image shows have the class of scans without labels, with a probability of nearly 0: they say where something is, and other
-    scans say what. Grids are left out. Files that do not change are hard links to those of the source, where both are folders of one file
-    system: no file of either may be edited in place. An interrupted run leaves `<out>.part`; the same call again finishes it.
+    Points that no image shows get the class of scans without labels, with a probability of nearly 0: they show that a voxel is occupied, and
+    other scans show its class. Grids are left out. Files that do not change are hard links to those of the source, where both are folders of one
+    file system: do not edit such files in place. An interrupted run leaves `<out>.part`; the same call again finishes it.
 
     Args:
-        source: what has the points, and cameras: anything that `carlasc.open` takes, or a source.
+        source: the data set with points and cameras: anything that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
         pixels: a folder with the classes of pixels, `<sequence>/<camera>/000000.png` (ids of classes) or `.npy`: (H, W) ids, or (H, W, C)
             probabilities by id; for a single sequence the folders of cameras may lie in the folder itself. None: `image_labels` of the source.
         classes: class table of the pixels: its name, a JSON file, or a table; None for the one of each sequence. As in `carlasc.label`.
-        by: what made the classes of pixels; None for the name of the folder `pixels`, or "images".
-        observe: which scans are merged into the grid that hides points, what tells which points move, and where poses come from.
+        by: source of the classes of pixels, such as a network; None for the name of the folder `pixels`, or "images".
+        observe: which scans are merged into the grid that hides points, how moving points are found, and where poses come from.
         overwrite: replace a data set at `out` that `label` has made.
         run: how the work is spread. Steps of progress are files.
 
     Returns:
-        What was written.
+        The files that were written.
 
     Raises:
         ArgumentError: `classes` or `by` is not valid.
@@ -114,7 +111,7 @@ def label_images(
     numbered = replace(plan, voting=Voting(keep_actors=True))
     inputs = {path: ScanSequence(one, numbered, observe) for path, one in given.items()}
     for one in inputs.values():
-        _ = one.feed.motion  # raises what is wrong before anything is written
+        _ = one.feed.motion  # raises errors before anything is written
     digest = blake2b(repr([one.stamps() for one in found.values()]).encode(errors="surrogateescape"), digest_size=16)
     settings: dict[str, Any] = {"observe": repr(observe), "by": by, "pixels": digest.hexdigest()}
     settings |= {"classes": None if table is None else table.to_dict()}
@@ -135,7 +132,7 @@ def label_images(
 
 
 class _ShownSequence(DerivedSequence):
-    """A sequence with the classes that images show."""
+    """A sequence with classes from images."""
 
     def __init__(self, whole: Sequence, painter: Painter, by: str) -> None:
         target = painter.reader.target
@@ -151,15 +148,15 @@ class _ShownSequence(DerivedSequence):
 
 
 class _ClassImage(NamedTuple):
-    """What an image says of points.
+    """An image of classes.
 
     Attributes:
         camera: the camera.
-        world_T_camera: (4, 4) where it was.
-        seconds: when it was taken, after the scan of its frame.
+        world_T_camera: (4, 4) pose of the camera.
+        seconds: time of the image after the scan of its frame.
         ids: (H, W) classes of pixels.
-        sure: (H, W) float16, their probabilities; None: 1.
-        nearest: (rows, columns) depth of the nearest point of the scan in each cell, infinite without one.
+        sure: (H, W) float16, probabilities of the classes; None: 1.
+        nearest: (rows, columns) depth of the nearest point of the scan in each cell, metres, infinite without one.
         cell_px: side of a cell.
     """
 
@@ -179,10 +176,10 @@ class Painter:
     Attributes:
         plan: geometry of the merged grid.
         feed: the scans of the sequence.
-        actors: what moves in them, with numbers.
+        actors: the moving actors, with numbers.
         pixels: the classes of pixels.
         reader: the class tables of the pixels and of the result.
-        key: by which copies of it in a process share images.
+        key: copies with the same key share images within a process.
     """
 
     plan: GridPlan
@@ -196,7 +193,7 @@ class Painter:
         """Return the (N,) classes of the points of a scan, and the (N, 6) field `probabilities`."""
         sums = self.sums(frame)
         shares = sums / np.maximum(sums.sum(axis=1, keepdims=True), np.float32(1e-6))
-        _ask_neighbours(shares, self.feed.sequence.scan(frame, ()).points)
+        _fill_from_neighbours(shares, self.feed.sequence.scan(frame, ()).points)
         shown = shares.any(axis=1)
         other = self.reader.target.geometry_id
         labels, pairs = np.full(len(sums), other, np.uint32), np.zeros((len(sums), 6), np.uint16)
@@ -206,12 +203,12 @@ class Painter:
         labels[shown] = pairs[shown, 0]
         return labels, pairs
 
-    def sums(self, frame: int, asked: tuple[int, ...] = _ASKED) -> NDArray[np.float32]:
-        """Return (N, C) what images say of each point of a scan, in the table of the pixels: weights of classes by id.
+    def sums(self, frame: int, offsets: tuple[int, ...] = _OFFSETS) -> NDArray[np.float32]:
+        """Return the (N, C) weights of classes that images give to each point of a scan, by id in the table of the pixels.
 
         Args:
             frame: the scan.
-            asked: frames of the images, relative to it.
+            offsets: frames of the images, relative to it.
         """
         feed, spec = self.feed, self.plan.spec
         pose, points = feed.pose(frame), feed.sequence.scan(frame, ()).points.astype(np.float64)
@@ -222,7 +219,7 @@ class Painter:
         near = self.actors.between(frame + first, frame + last)
         solid = merge_frame(self.plan, feed, near, frame, window).grid.labels > 0
         sums = np.zeros((len(points), max(self.reader.classes.names) + 1), np.float32)
-        for offset in asked:
+        for offset in offsets:
             for photo in self._photos(frame + offset):
                 frame_T_camera = invert(pose) @ photo.world_T_camera
                 rows = np.flatnonzero(~moves) if offset else np.arange(len(points))
@@ -232,13 +229,13 @@ class Painter:
                 kept = np.flatnonzero(photo.camera.contains(pixels))
                 kept = kept[~_hidden(photo, pixels[kept], in_camera[kept, 2])]
                 weights = see_points(then[kept], solid, spec, frame_T_camera[:3, 3]).astype(np.float32)
-                # A scan shows best what hides its own points: voxels are larger than what is in them.
+                # Points of a scan hide its own points more exactly than voxels do, which are larger than their content.
                 weights = weights * _OTHER if offset else np.maximum(weights, _BEHIND_VOXELS)
                 _add(sums, rows[kept], weights, photo, np.rint(pixels[kept]).astype(np.int64))
         return sums
 
     def _photos(self, frame: int) -> Iterator[_ClassImage]:
-        """Yield what the images of a frame say; those of frames that were asked last are kept."""
+        """Yield the images of a frame. The images of the frames that were read last are kept."""
         key = (self.key, frame)
         if key not in _PHOTOS:
             _PHOTOS[key] = list(self._read_photos(frame))
@@ -280,13 +277,13 @@ class Painter:
             yield _ClassImage(camera, pose @ place, late, ids, sure, nearest, cell)
 
 
-_PHOTOS: OrderedDict[tuple[str, int], list[_ClassImage]] = OrderedDict()  # of this process, those asked last at the end
+_PHOTOS: OrderedDict[tuple[str, int], list[_ClassImage]] = OrderedDict()  # of this process, the last used at the end
 
 
 def _nearest(
     camera: CameraModel, pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the depth of the nearest point in each cell of an image, infinite where there is none, and the side of a cell in pixels."""
+    """Return the depth of the nearest point in each cell of an image, metres, infinite without one, and the side of a cell, pixels."""
     area = camera.width * camera.height
     cell = max(_CELL_PX, float(np.sqrt(_FILLED * area / max(len(pixels), 1))))
     shape = int(camera.height // cell) + 1, int(camera.width // cell) + 1
@@ -323,25 +320,25 @@ def _add(
     photo: _ClassImage,
     pixels: NDArray[np.int64],
 ) -> None:
-    """Add what the pixels at some points say to the weights of classes: the less pixels around them agree, the less it counts."""
+    """Add the classes of the pixels at some points to the weights. A pixel that disagrees with the pixels around it has less weight."""
     height, width = photo.ids.shape
-    said = np.zeros((len(rows), sums.shape[1]), np.float32)
+    votes = np.zeros((len(rows), sums.shape[1]), np.float32)
     each = np.arange(len(rows))
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             weight = np.float32(1 if down == right == 0 else _RING / 8)
             at = np.clip(pixels[:, 1] + down, 0, height - 1), np.clip(pixels[:, 0] + right, 0, width - 1)
-            said[each, photo.ids[at]] += weight if photo.sure is None else weight * photo.sure[at]
-    said[:, 0] = 0  # pixels without a class
-    total = said.sum(axis=1, keepdims=True)
-    agreement = said.max(axis=1, keepdims=True) / np.maximum(total, np.float32(1e-6))
-    sums[rows] += said * weights[:, None] * agreement**_EDGE
+            votes[each, photo.ids[at]] += weight if photo.sure is None else weight * photo.sure[at]
+    votes[:, 0] = 0  # pixels without a class
+    total = votes.sum(axis=1, keepdims=True)
+    agreement = votes.max(axis=1, keepdims=True) / np.maximum(total, np.float32(1e-6))
+    sums[rows] += votes * weights[:, None] * agreement**_EDGE
 
 
-def _ask_neighbours(shares: NDArray[np.float32], points: NDArray[np.floating]) -> None:
-    """Give points of which no image says anything the shares of classes of the points in the same cell, the smallest that has some.
+def _fill_from_neighbours(shares: NDArray[np.float32], points: NDArray[np.floating]) -> None:
+    """Give points that no image shows the shares of classes of other points in the same cell, the smallest cell with such points.
 
-    The ground, and what is on it, have different classes.
+    Ground and other points are kept apart.
     """
     ground = ground_points(points)
     for side in _NEAR_M:

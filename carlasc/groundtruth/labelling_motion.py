@@ -1,4 +1,4 @@
-"""What moves, and which actor each point belongs to, written back to the scans: a copy of a data set with instances and flow."""
+"""Motion labels: a copy of a data set whose scans have the instance and the flow of each point."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
 _WRITTEN = ("flow", "instances")
-_FOUND = "found by carlasc from "  # what carlasc.json says of motion, before what showed it
+_FOUND = "found by carlasc from "  # words of carlasc.json about motion, before its source
 
 
 @dataclass
 class MotionResult(CopyResult):
-    """What `label_motion` did: what writing a copy did, and this.
+    """The result of `label_motion`.
 
     Attributes:
-        actors: number of actors that move.
-        notes: what was found in each sequence, in lines.
+        actors: number of moving actors.
+        notes: remarks on each sequence, one line each.
     """
 
     actors: int = 0
@@ -55,25 +55,26 @@ def label_motion(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> MotionResult:
-    """Write a copy of a data set whose scans say which actor each point belongs to, and how fast it moves. The source is not changed.
+    """Write a copy of a data set whose scans have the actor and the velocity of each point. The source is not changed.
 
-    The fields `instances` and `flow` are made from the bodies of what moves, which `observe` says how to find: with its defaults from the best
-    field that exists, and from free space. An actor has one number in the whole sequence, that of the data where it has one. Points of what stands keep
-    the numbers of the data. Where the class table has classes of what moves, such as SemanticKITTI's, labels become these. Grids are left out. Files that do not change are hard links to those of the source, where both are folders of one
-    file system: no file of either may be edited in place. An interrupted run leaves `<out>.part`; the same call again finishes it.
+    The fields `instances` and `flow` are made from the bodies of moving actors, which are found as `observe` says: by default from the best
+    field that exists, and from free space. An actor has one number in the whole sequence: its number in the data, if it has one. Points of
+    static actors keep the numbers of the data. Points of moving actors get moving classes, if the class table has any, as SemanticKITTI's.
+    Grids are left out. Files that do not change are hard links to those of the source, where both are folders of one file system: do not edit
+    such files in place. An interrupted run leaves `<out>.part`; the same call again finishes it.
 
     Args:
-        source: what has the points: anything that `carlasc.open` takes, or a source.
+        source: the data set with the points: anything that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
-        observe: what tells which points move, and where poses come from. `dynamic` is "align".
+        observe: how moving points are found, and where poses come from. `dynamic` is "align".
         overwrite: replace a data set at `out` that this function has made.
         run: how the work is spread. Steps of progress are scans, then files.
 
     Returns:
-        What was written, and what was found.
+        The files that were written, and the actors that were found.
 
     Raises:
-        ArgumentError: `observe` does not look for actors.
+        ArgumentError: `observe` does not find actors.
         ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted run had other options.
         MissingDataError: there are no scans, or not the field that `observe` asks for.
         FormatError: poses or times are not valid.
@@ -88,7 +89,7 @@ def label_motion(
     plan = GridPlan(GridSpec.published(), layout.EVALUATION, observe, Voting(keep_actors=True), FrameRange())
     inputs = {path: ScanSequence(one, plan, observe) for path, one in given.items()}
     for one in inputs.values():
-        _ = one.feed.motion  # raises what is wrong before anything is written
+        _ = one.feed.motion  # raises errors before anything is written
     copy = DerivedCopy.begin(
         source,
         out,
@@ -112,8 +113,8 @@ def label_motion(
             notes += [note for note in one.notes() if "grids" not in note]
         tables = {one.metadata.classes.name for one in given.values() if not one.metadata.classes.standing}
         if tables and any("labels" in one.fields() for one in given.values()):
-            found = f"the classes {', '.join(sorted(tables))} do not tell what moves from what stands"
-            notes.append(f"{found}: labels are as they were; instances and flow say what moves")
+            found = f"the classes {', '.join(sorted(tables))} do not separate moving and static actors"
+            notes.append(f"{found}: labels do not change; instances and flow show motion")
         after = replace(pool, progress=step.stage(files))
         copied = copy.write(moving, after)
     return MotionResult(
@@ -124,7 +125,7 @@ def label_motion(
 
 
 def find_moving(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]) -> None:
-    """Find the actors of a sequence, or read what an interrupted run kept with `writer`."""
+    """Find the actors of a sequence, or read the result that an interrupted run kept with `writer`."""
     if writer is not None:
         inputs.prepare(writer, run, step)
         return
@@ -133,7 +134,7 @@ def find_moving(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, s
 
 
 class _MovingSequence(DerivedSequence):
-    """A sequence with the instances and the flow of what was found to move."""
+    """A sequence with the instances and the flow of the actors that were found."""
 
     def __init__(self, whole: Sequence, feed: ScanFeed, actors: MovingActors) -> None:
         extra = {**whole.metadata.extra, "motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}"}
@@ -145,7 +146,7 @@ class _MovingSequence(DerivedSequence):
         self._feed, self.actors = feed, actors
 
     def make(self, frame: int) -> dict[str, NDArray[Any]]:
-        """Return the fields of a frame that are found, and its labels if they change."""
+        """Return the new fields of a frame, and its labels if they change."""
         instances, flow = points_of_actors(self._feed, self.actors.between(frame, frame), frame)
         found: dict[str, NDArray[Any]] = {"instances": instances, "flow": flow}
         if frame in self.made.get("labels", ()):
@@ -159,11 +160,11 @@ class _MovingSequence(DerivedSequence):
 def points_of_actors(
     feed: ScanFeed, actors: MovingActors, frame: int
 ) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
-    """Return the actor of each point of a scan, and how fast it moves.
+    """Return the actor and the velocity of each point of a scan.
 
     Args:
         feed: the scans.
-        actors: what moves, with numbers.
+        actors: the moving actors, with numbers.
         frame: number of the scan.
 
     Returns:
@@ -173,20 +174,20 @@ def points_of_actors(
     scan, pose = feed.sequence.scan(frame, tuple(sorted(fields))), feed.pose(frame)
     moving = {track.instance for track in actors.tracks.values()}
     numbers = np.zeros(len(scan), np.uint32) if scan.instances is None else scan.instances.astype(np.uint32)
-    numbers[np.isin(numbers, list(moving))] = 0  # these have tracks, which know better
+    numbers[np.isin(numbers, list(moving))] = 0  # points of moving actors get the numbers of tracks
     flow, world = np.zeros((len(scan), 3)), transform_points(pose, scan.points)
     classes = feed.classes
     if scan.labels is not None and feed.names_ground and classes.ground:
         ground = np.isin(scan.labels, sorted(classes.ground))
     else:
         ground = ground_points(scan.points)
-        if scan.labels is not None:  # wheels are near the ground, and are none
+        if scan.labels is not None:  # wheels are near the ground, but not ground
             ground &= ~np.isin(scan.labels, sorted(classes.movable))
     if "boxes" in feed.sequence.fields() and (boxes := feed.sequence.boxes(frame)) is not None:
-        standing = boxes.select(~np.isin(boxes.tracks, list(moving)))
-        row = standing.owners(scan.points)
+        static = boxes.select(~np.isin(boxes.tracks, list(moving)))
+        row = static.owners(scan.points)
         boxed = (row >= 0) & (numbers == 0) & ~ground
-        numbers[boxed] = standing.tracks[row[boxed]]
+        numbers[boxed] = static.tracks[row[boxed]]
     rows = _Rows(scan.points)
     tracks = [(n, t) for n, t in actors.tracks.items() if t.pose(frame) is not None]
     for number, track in sorted(tracks, key=lambda item: -float(np.prod(item[1].size))):
@@ -200,7 +201,7 @@ def points_of_actors(
 
 
 class _Rows:
-    """Finds points of a scan again, by their coordinates: what merges scans has left out some points, and sorted others."""
+    """Finds points of a scan by their coordinates, after merging left out some points and sorted others."""
 
     def __init__(self, points: NDArray[np.float32]) -> None:
         keys = _keys(points)
@@ -208,7 +209,7 @@ class _Rows:
         self._sorted = keys[self._order]
 
     def of(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the indices of all points of the scan that are at some places of its points."""
+        """Return the indices of all points of the scan with the coordinates of (M, 3) points."""
         keys = np.unique(_keys(points))
         first, last = (np.searchsorted(self._sorted, keys, side) for side in ("left", "right"))
         found = [self._order[begin:end] for begin, end in zip(first.tolist(), last.tolist(), strict=True)]
@@ -221,7 +222,7 @@ def _keys(points: NDArray[np.float32]) -> NDArray[Any]:
 
 
 def _inside(track: Track, frame: int, world: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (N,) which places, metres, world, are in the body of a track."""
+    """Return (N,) bool: which (N, 3) positions, metres, world, are in the body of a track."""
     pose = track.world_T_actor[frame - track.first]
     near = (np.abs(world - pose[:3, 3]) <= np.linalg.norm(np.maximum(-track.lower, track.upper))).all(axis=1)
     local = transform_points(invert(pose), world[near])

@@ -1,4 +1,4 @@
-"""The options of `regrid`: what observes the scene, and how its votes are counted. All of them check themselves."""
+"""The options of `regrid`: what observes the scene, and how its votes are counted. Each is checked when it is made."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class FromScans:
         dynamic: what happens to moving points. "align": each moving actor is completed from all scans, at its position in the
             frame; "current": only the frame's own moving points are used; "drop": none; "tube": all points stay where they
             were seen, as in SemanticKITTI, and moving actors leave ghost trails.
-        complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown; "mirror": a vehicle's side that was
-            not seen is taken from its other side; "body": and what is still missing from vehicles of the same drive that were seen well, or
-            from the usual shape of vehicles. These voxels are marked as inferred.
-        own_path: count what the recording vehicle drove through as free space.
-        motion: what tells which points move, and how.
-        poses: where poses come from. Those of a sequence without any are estimated from its scans, unless `PoseOptions("file")` is given.
-        rays: which rays of other scans than the frame's own are followed. "all"; "enough": near the sensor, where they are dense, one of
-            up to four, which counts as these. With the rule "ray" only.
+        complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown; "mirror": an unseen side of a vehicle
+            is taken from its other side; "body": all other unseen parts are taken from similar vehicles of the same drive, or from the
+            usual shape of vehicles. These voxels are marked as inferred.
+        own_path: count the space that the recording vehicle drove through as free.
+        motion: how moving points are found.
+        poses: where poses come from. Missing poses are estimated from the scans, unless `PoseOptions("file")` is given.
+        rays: which rays of other frames' scans vote. "all"; "enough": near the sensor, where rays are dense, one of up to four votes, with
+            their weight. With the rule "ray" only.
         min_range_m: leave out nearer points, in metres; None for the value of carlasc.json, or 0.
         max_range_m: leave out farther points, in metres; None for the value of carlasc.json, or no limit.
 
@@ -74,7 +74,7 @@ class FromScans:
                 raise ArgumentError(name, expected=f"{options.__name__}(...)", found=repr(value))
         if self.dynamic == "tube" and self.motion.source != "auto":
             raise ArgumentError(
-                "motion", expected='none with dynamic "tube", which ignores what moves', found=repr(self.motion.source)
+                "motion", expected='none with dynamic "tube", which ignores motion', found=repr(self.motion.source)
             )
         low, high = self.min_range_m or 0.0, math.inf if self.max_range_m is None else self.max_range_m
         if not 0 <= low < high:
@@ -97,7 +97,7 @@ class FromGrid:
 
 
 Observe = FromCapture | FromScans | FromGrid
-"""What the `observe` argument of `regrid` takes."""
+"""The type of the argument `observe` of `regrid`."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,10 @@ class Voting:
             counts; "ray": a voxel is occupied where enough of the rays that enter it end in it. None: "ray" for scans, otherwise "sensor".
         free_step_m: distance between two free samples on a ray, in metres.
         keep: also write the votes of every class.
-        keep_evidence: also write how certain each voxel is: the fields `occupied`, `classes`, `flags` and `views` of the grid. For scans
+        keep_evidence: also write the certainty of each voxel: the fields `occupied`, `classes`, `flags` and `views` of the grid. For scans
             with the rule "ray" only.
-        keep_actors: also write which actor each voxel belongs to, and how it moves: the fields `instance` and `velocity` of the grid. Not
-            for grids from a finer grid; of scans with `dynamic="align"` only.
+        keep_actors: also write the actor and the velocity of each voxel: the fields `instance` and `velocity` of the grid. Not for grids
+            from a finer grid; for scans with `dynamic="align"` only.
         min_confidence: voxels that are neither free nor occupied with at least this probability become unknown; 0 to 0.5 keeps all.
             For scans with the rule "ray" only.
         keep_seen: also write which cameras see each voxel: the field `seen` of the grid. For Cartesian grids and up to eight cameras.
@@ -139,12 +139,12 @@ class Voting:
 
 @dataclass(frozen=True)
 class GridOptions:
-    """What grids are made, and from what: what `regrid` and `convert` share.
+    """The options of grids that `regrid` and `convert` share.
 
     Attributes:
         spec: geometry of the grids; None takes the published coarse one.
         observe: what observes the scene; None takes a capture if there is one, otherwise scans.
-        voting: how votes are counted; None takes the default of what observes the scene.
+        voting: how votes are counted; None takes the default of `observe`.
         follow_ground: in a conversion, move the grid up or down by whole voxels where the ground is below it, or far above its lower
             bound; False keeps the bounds of `spec`.
     """

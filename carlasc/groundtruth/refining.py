@@ -1,4 +1,4 @@
-"""Refined poses as those of a data set: a copy of it with another poses.txt, whose other files are hard links to the same bytes."""
+"""A copy of a data set with refined poses: poses.txt is new, and all other files are hard links to those of the source."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
-_RUN = 60  # scans whose motions are compared to find where the sensor is
-_ESTIMATED, _REFINED, _LEFT = "kiss-icp", "refined", "left as given"  # what carlasc.json says of poses, with commas
+_RUN = 60  # number of scans in a run, for the mounting of the sensor
+_ESTIMATED, _REFINED, _LEFT = "kiss-icp", "refined", "left as given"  # words for poses in carlasc.json
 
 
 @dataclass
 class RefineResult(CopyResult):
-    """What `refine` did: what writing a copy did, and this.
+    """The result of `refine`.
 
     Attributes:
         refined: paths of the sequences whose poses were refined.
-        scans: number of scans whose motion is not the given one.
+        scans: number of scans with a changed motion.
         notes: what was done to the poses of each sequence, one line each.
     """
 
@@ -55,27 +55,27 @@ def refine(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> RefineResult:
-    """Write a copy of a data set whose poses were changed so that neighbouring scans agree. The source is not changed.
+    """Write a copy of a data set with poses that are changed so that neighbouring scans agree. The source is not changed.
 
-    Poses that are good already are left as they are. Where scans show that poses are those of another point of the vehicle, or late, this is
-    corrected first, as far as the drive determines it. Sequences without scans are left out, and so are grids, which were made with other
-    poses. Files that do not change are hard links to those of the source, where both are folders of one file system: no file of either
-    may be edited in place, which carlasc never does. An interrupted run leaves `<out>.part`; the same call again finishes it.
+    Good poses do not change. Poses of another point of the vehicle, and late poses, are corrected first, as far as the drive determines the
+    correction. Sequences without scans are left out. Grids are left out too, because they were made with other poses. Files that do not change
+    are hard links to those of the source, where both are folders of one file system: do not edit such files in place (carlasc never does). An
+    interrupted run leaves `<out>.part`; the same call again finishes it.
 
     Args:
-        source: what has the points: anything that `carlasc.open` takes, or a source.
+        source: the data set with the points: anything that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
         poses: where poses come from, and when they are refined. Estimated poses, of sequences that have none, are refined too.
         overwrite: replace a data set at `out` that `refine` has made.
         run: how the work is spread. Steps of progress are scans, then files. Each part refines the poses of all sequences.
 
     Returns:
-        What was written, and what was done to the poses of each sequence.
+        The files that were written, and what was done to the poses of each sequence.
 
     Raises:
-        ArgumentError: poses are not to be refined.
+        ArgumentError: `poses.refine` is "never".
         ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted run had other options.
-        MissingDataError: there are no scans, or no poses and `poses` says that they are those of the data.
+        MissingDataError: there are no scans, or no poses and `poses.source` is "file".
         FormatError: poses or times are not valid.
         DependencyError: poses have to be estimated, and kiss-icp is not installed.
         StorageError: the files cannot be written.
@@ -114,10 +114,10 @@ def refine(
 
 
 class _RefinedSequence(DerivedSequence):
-    """A sequence with refined poses, or with its own ones if they were left alone.
+    """A sequence with refined poses, or with its own poses if these are good.
 
     Attributes:
-        scans: number of scans whose motion is not the given one.
+        scans: number of scans with a changed motion.
         note: what was done to the poses, in a line.
     """
 
@@ -141,14 +141,14 @@ class _RefinedSequence(DerivedSequence):
 def _refine(
     sequence: Sequence, options: FromScans, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]
 ) -> _RefinedSequence:
-    """Refine the poses of a sequence, or read what an interrupted run kept with `writer`."""
+    """Refine the poses of a sequence, or read the result that an interrupted run kept with `writer`."""
     posed = sequence
     if estimated := must_estimate(sequence, options):
         posed = with_estimated_poses(sequence)
         check_trajectory(posed, options)
     feed = ScanFeed(posed, options)
     change = refine_sequence(feed, writer, run, step)
-    mounting = None if estimated else _mounting(feed, change)  # estimated poses are those of the sensor
+    mounting = None if estimated else _mounting(feed, change)  # estimated poses are poses of the sensor
     if mounting is None or not mounting.wrong.any():
         return _RefinedSequence(sequence, posed, change)
     seconds = np.array(list(feed.times.values()))
@@ -166,7 +166,7 @@ def _refine(
 
 
 def _mounting(feed: ScanFeed, change: RefinedPoses) -> Mounting | None:
-    """Return where the sensor is in the frame of the given poses, and how late these are; None if nothing tells."""
+    """Return the mounting of the sensor in the frame of the given poses; None if it cannot be estimated."""
     runs = [
         (row, change.poses[row : min(row + _RUN, last + 1)])
         for first, last, refined in change.stretches()
@@ -177,7 +177,7 @@ def _mounting(feed: ScanFeed, change: RefinedPoses) -> Mounting | None:
 
 
 def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:
-    """Return the lines of poses.txt: that of the first scan stays, as poses are those in the frame of the first one."""
+    """Return the lines of poses.txt. The pose of the first scan stays: it is the origin of the others."""
     if not change.refined.any():
         return posed.poses
     frames = posed.frames("points")
@@ -188,10 +188,10 @@ def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:
 
 
 def _left(change: RefinedPoses) -> str:
-    """Return the line that says that poses were left alone."""
+    """Return the note on poses that were not changed."""
     before, _ = change.disagreements_m
     if before is None:
-        return "poses left as they are: nothing tells how far neighbouring scans disagree"
+        return "poses left as they are: the distance between neighbouring scans is unknown"
     return f"poses left as they are: neighbouring scans disagree by {100 * before:.1f} cm"
 
 

@@ -1,4 +1,4 @@
-"""The run over a data set: it makes the grid of every frame, in parallel, and continues what an earlier run left unfinished."""
+"""The run over a data set: it makes the grid of every frame, in parallel, and continues an unfinished earlier run."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from carlasc.storage.transport.targets import check_shared
 from carlasc.storage.transport.trees import is_url
 
 RULES = {"capture": 1, "scans": 2, "grid": 1}
-"""Version of the rule by which grids are made, by what observes the scene. It changes only when the same input gives other grids."""
+"""Version of the rule that makes grids, by what observes the scene. It changes only when the same input gives other grids."""
 
 
 @dataclass(frozen=True)
 class RegridResult:
-    """What a run did.
+    """The result of a run.
 
     Attributes:
         grids: locations of the grids.
@@ -96,11 +96,11 @@ def regrid(
         frames: range of the source's frame numbers; None for all. A capture's frames are renumbered from 0.
         name: name of the grid's folder; None for a name by its size.
         overwrite: replace a grid that `regrid` made with other settings.
-        run: how the work is spread, whether this is only a part of it, and who is told of its progress. The part that finds that no frame
-            is missing any more writes the report, and finishes a packed store.
+        run: how the work is spread, whether this is only a part of it, and what shows its progress. The last part to finish writes the
+            report, and finishes a packed store.
 
     Returns:
-        What was made, what existed already, and what failed.
+        The frames that were made, that existed already, and that failed.
 
     Raises:
         ArgumentError: an argument is not valid.
@@ -125,9 +125,9 @@ def regrid(
             open_things.enter_context(job.writer)
         work = Work(jobs, plan, pool)
         failures = work.run()
-    if sink is not out and (work.has_written or not sink.is_finished):  # a sink of the caller may get more
+    if sink is not out and (work.has_written or not sink.is_finished):  # the caller may write more into its own sink
         if run.part.count == 1:
-            sink.finish(incomplete=True)  # what is missing could not be made, and is reported
+            sink.finish(incomplete=True)  # missing frames could not be made, and are reported
         elif not any(job.missing() for job in jobs):
             sink.finish()
 
@@ -138,7 +138,7 @@ def regrid(
 
 
 def _choose(source: str | os.PathLike[str] | Source | Capture) -> Observe:
-    """Return what observes the scene if the caller does not say: a capture if there is one, otherwise scans.
+    """Return the default of `observe`: a capture if there is one, otherwise scans.
 
     Raises:
         MissingDataError: there is neither.
@@ -169,7 +169,7 @@ def _sequences(source: str | os.PathLike[str] | Source | Capture, plan: GridPlan
     """Return the sequences of a source.
 
     Raises:
-        ArgumentError: the source cannot hold what observes the scene, or the plan does not fit it.
+        ArgumentError: the source does not fit `observe` or the plan.
         MissingDataError: there is no sequence.
     """
     if isinstance(plan.observe, FromCapture):
@@ -182,10 +182,10 @@ def _sequences(source: str | os.PathLike[str] | Source | Capture, plan: GridPlan
 
 
 def _folder_of(source: str | os.PathLike[str] | Source | Capture) -> str | Path:
-    """Return the folder to write to if the caller does not say: the source, beside raw/ and `<coordinates>/`.
+    """Return the default of `out`: the source, beside raw/ and `<coordinates>/`.
 
     Raises:
-        ArgumentError: the source is not a folder, so nothing can be written into it.
+        ArgumentError: the source is not a folder.
     """
     if isinstance(source, Source | Capture):
         raise ArgumentError("out", expected="where to write, as the source is not a folder", found="None")
@@ -199,7 +199,7 @@ def _folder_of(source: str | os.PathLike[str] | Source | Capture) -> str | Path:
 
 
 def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bool) -> SequenceJob:
-    """Compare what exists with what this run makes, and stop before anything is written if they do not agree."""
+    """Compare the existing output with the plan of this run; if they differ, stop before anything is written."""
     path = "/".join(part for part in (inputs.path, plan.spec.coordinates) if part)
     writer = sink.sequence(path)
     how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
@@ -211,7 +211,7 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bo
         check_views(plan.spec, inputs.frames[0].views(), inputs.location)
     record |= {"labels": inputs.metadata.predicted} if inputs.metadata.predicted else {}
     settings = plan.spec.to_params(inputs.metadata.classes.num_channels) | {RECORD: record}
-    params = parse_json(to_json(settings), plan.grid)  # as it is read again
+    params = parse_json(to_json(settings), plan.grid)  # as a later run reads it
     numbers = [frame.number for frame in inputs.frames]
     exists = check_grid(writer, plan.grid, params, numbers, overwrite=overwrite)
     documents = {
@@ -226,10 +226,10 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bo
 
 
 def _begin(job: SequenceJob) -> None:
-    """Write the documents of a sequence: the settings of its grid first, so that a run with others that began at the same time finds them.
+    """Write the documents of a sequence, the settings of its grid first: a run with other settings that began at the same time finds them.
 
     Raises:
-        ConflictError: such a run was faster.
+        ConflictError: such a run wrote its settings first.
     """
     writer, params = job.writer, layout.params_file(job.plan.grid)
     if job.replaces:

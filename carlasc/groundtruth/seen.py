@@ -1,8 +1,8 @@
 """Which voxels of a grid each camera sees: the field `seen`, one bit per camera.
 
-A voxel is seen if a ray from the camera's centre to its own centre is not stopped by an occupied voxel before. This is the rule of Occ3D, with one
-deviation: where the points in a voxel are known, only the box around them stops rays (`carlasc.groundtruth.voting.filled`), because a pole or a
-kerb fills a small part of its voxels. An occupied voxel is also seen if a ray reaches the middle of its box. Unknown voxels stop nothing.
+A camera sees a voxel if no occupied voxel stops the ray from the centre of the camera to the centre of the voxel. This is the rule of Occ3D,
+with one deviation: where the points in a voxel are known, only the box around them stops rays (`carlasc.groundtruth.voting.filled`), because a
+pole or a kerb fills a small part of its voxels. An occupied voxel is also seen if a ray reaches the middle of its box. Unknown voxels stop no ray.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from carlasc.errors import ArgumentError
 from carlasc.groundtruth.voting.filled import STEPS
 
 MOST_CAMERAS = 8
-"""The number of cameras that the bits of a voxel have room for."""
+"""The greatest number of cameras: one per bit of a voxel."""
 
 Views = Sequence[tuple[CameraModel, Transform | None]]
-"""Cameras, and (4, 4) scan_T_camera of each when it took its image; None where it took none."""
+"""Cameras, and (4, 4) scan_T_camera of each when it took its image; None without an image."""
 
-_BESIDE = 1.5  # voxels along the longest axis, from a point, that do not hide it
-_BEYOND_M = 0.02  # by which boxes are larger. Chosen on simulated drives: see docs/howto/cameras.md
+_BESIDE = 1.5  # voxels within this distance of a point, along the longest axis, do not hide it
+_BEYOND_M = 0.02  # margin of boxes. Chosen on simulated drives: see docs/howto/cameras.md
 
 
 class _Solid(NamedTuple):
-    """What stops rays in a grid, in units of voxels.
+    """The obstacles for rays in a grid, in units of voxels.
 
     Attributes:
         size: (3,) numbers of voxels.
         occupied: (V,) bool, voxels that stop rays.
-        boxes: (V, 6) where they do, in 1/256 from first to last; (0, 6): everywhere.
-        beyond: (3,) by which the boxes are larger.
+        boxes: (V, 6) uint8, the part of each voxel that stops rays, in 1/256 from first to last; (0, 6): whole voxels.
+        beyond: (3,) margin of the boxes.
     """
 
     size: NDArray[np.int64]
@@ -47,14 +47,14 @@ class _Solid(NamedTuple):
 
     @classmethod
     def of(cls, occupied: NDArray[np.bool_], spec: GridSpec, boxes: NDArray[np.uint8] | None = None) -> _Solid:
-        """Return what stops rays in a grid: its occupied voxels, or, where points in them are known, the boxes around these."""
+        """Return the obstacles of a grid: its occupied voxels, or the boxes around their points where these are known."""
         blocks = np.ascontiguousarray(occupied, np.bool_).reshape(-1)
         filled = np.empty((0, 6), np.uint8) if boxes is None else boxes
         return cls(np.array(spec.size), blocks, filled, _BEYOND_M / np.array(spec.voxel_size, np.float64))
 
 
 def check_views(spec: GridSpec, views: Views, where: str) -> None:
-    """Check that it can be said which voxels some cameras see.
+    """Check that `see_voxels` can be used with a grid and cameras.
 
     Raises:
         ArgumentError: the grid is not Cartesian, or there are no cameras, or more than eight.
@@ -73,12 +73,12 @@ def check_views(spec: GridSpec, views: Views, where: str) -> None:
 def see_voxels(
     occupied: NDArray[np.bool_], spec: GridSpec, views: Views, boxes: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:
-    """Return which cameras see each voxel.
+    """Return the cameras that see each voxel.
 
     Args:
         occupied: (X, Y, Z) voxels that stop rays.
         spec: the grid, which is Cartesian.
-        views: at most eight cameras, and where they are.
+        views: at most eight cameras, with their poses.
         boxes: (V, 6) the boxes around the points in each voxel; None: voxels stop rays as a whole, as in Occ3D.
 
     Returns:
@@ -121,16 +121,16 @@ def _mark_seen(voxels, eye, solid, bit, seen):  # type: ignore[no-untyped-def]
 def see_points(
     points: NDArray[np.floating], occupied: NDArray[np.bool_], spec: GridSpec, eye: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return (N,) which points no voxel of a grid hides from a place. What is outside of the grid hides nothing.
+    """Return (N,) bool: which points are visible from an eye, because no voxel of a grid hides them. Space outside of the grid hides nothing.
 
-    The voxel that a point is in, and its neighbours, hide it as little as the surface that it lies on does. Ground is reached at so flat an
-    angle that its own voxels would hide it, so a ray from above the point, by the height of a voxel, is tried too.
+    The voxel of a point and its neighbours do not hide it: they hold the surface of the point. Rays meet the ground at a grazing angle, and its
+    own voxels would hide it. A second ray therefore starts one voxel above the point.
 
     Args:
         points: (N, 3) metres, in the frame of the grid.
         occupied: (X, Y, Z) voxels that stop rays.
         spec: the grid, which is Cartesian.
-        eye: (3,) metres, the place.
+        eye: (3,) position of the eye, metres, in the frame of the grid.
     """
     lower, edge = np.array(spec.lower, np.float64), np.array(spec.voxel_size, np.float64)
     reached = np.empty(len(points), np.bool_)
@@ -147,18 +147,18 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
         reached[n] = False
         for raised in range(2):
             at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2] + raised
-            way_x, way_y, way_z = eye[0] - at_x, eye[1] - at_y, eye[2] - at_z
-            far = max(abs(way_x), abs(way_y), abs(way_z))
-            first = 1.0 if far <= _BESIDE else _BESIDE / far  # share of the way after which voxels hide the point
-            for at, way, last in ((at_x, way_x, size[0]), (at_y, way_y, size[1]), (at_z, way_z, size[2])):
-                if at < 0 or at >= last:  # where the way comes into the grid
+            ray_x, ray_y, ray_z = eye[0] - at_x, eye[1] - at_y, eye[2] - at_z
+            far = max(abs(ray_x), abs(ray_y), abs(ray_z))
+            first = 1.0 if far <= _BESIDE else _BESIDE / far  # from this share of the ray on, voxels hide the point
+            for at, ray, last in ((at_x, ray_x, size[0]), (at_y, ray_y, size[1]), (at_z, ray_z, size[2])):
+                if at < 0 or at >= last:  # where the ray enters the grid
                     edge = 1e-9 if at < 0 else last - 1e-9
-                    share = (edge - at) / way if way != 0 else 2.0
+                    share = (edge - at) / ray if ray != 0 else 2.0
                     first = max(first, share if share > 0 else 2.0)
             if first >= 1.0:
                 reached[n] = True
                 break
-            at_x, at_y, at_z = at_x + first * way_x, at_y + first * way_y, at_z + first * way_z
+            at_x, at_y, at_z = at_x + first * ray_x, at_y + first * ray_y, at_z + first * ray_z
             x, y, z = int(np.floor(at_x)), int(np.floor(at_y)), int(np.floor(at_z))
             if x < 0 or y < 0 or z < 0 or x >= size[0] or y >= size[1] or z >= size[2]:
                 reached[n] = True
@@ -170,16 +170,16 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
 
 @jit
 def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
-    """Return whether nothing lies between a place in a voxel and the eye that stops rays."""
+    """Return whether no obstacle lies between a position in a voxel and the eye."""
     size, (x, y, z) = solid.size, cell
-    way = way_x, way_y, way_z = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
-    step_x, step_y, step_z = (1 if way_x > 0 else -1), (1 if way_y > 0 else -1), (1 if way_z > 0 else -1)
-    each_x = abs(1.0 / way_x) if way_x != 0 else np.inf
-    each_y = abs(1.0 / way_y) if way_y != 0 else np.inf
-    each_z = abs(1.0 / way_z) if way_z != 0 else np.inf
-    next_x = ((x + (1 if way_x > 0 else 0)) - at[0]) / way_x if way_x != 0 else np.inf
-    next_y = ((y + (1 if way_y > 0 else 0)) - at[1]) / way_y if way_y != 0 else np.inf
-    next_z = ((z + (1 if way_z > 0 else 0)) - at[2]) / way_z if way_z != 0 else np.inf
+    ray = ray_x, ray_y, ray_z = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
+    step_x, step_y, step_z = (1 if ray_x > 0 else -1), (1 if ray_y > 0 else -1), (1 if ray_z > 0 else -1)
+    each_x = abs(1.0 / ray_x) if ray_x != 0 else np.inf
+    each_y = abs(1.0 / ray_y) if ray_y != 0 else np.inf
+    each_z = abs(1.0 / ray_z) if ray_z != 0 else np.inf
+    next_x = ((x + (1 if ray_x > 0 else 0)) - at[0]) / ray_x if ray_x != 0 else np.inf
+    next_y = ((y + (1 if ray_y > 0 else 0)) - at[1]) / ray_y if ray_y != 0 else np.inf
+    next_z = ((z + (1 if ray_z > 0 else 0)) - at[2]) / ray_z if ray_z != 0 else np.inf
     while True:
         if next_x <= next_y and next_x <= next_z:
             if next_x >= 1.0:
@@ -204,21 +204,21 @@ def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
                 return True
         voxel = (x * size[1] + y) * size[2] + z
         if solid.occupied[voxel]:
-            if next_x >= 1.0 and next_y >= 1.0 and next_z >= 1.0:  # what the eye itself is in stops nothing
+            if next_x >= 1.0 and next_y >= 1.0 and next_z >= 1.0:  # the voxel of the eye itself stops no ray
                 return True
-            if _is_stopped(at, way, (x, y, z), voxel, solid):
+            if _is_stopped(at, ray, (x, y, z), voxel, solid):
                 return False
 
 
 @jit
-def _is_stopped(at, way, cell, voxel, solid):  # type: ignore[no-untyped-def]
-    """Return whether an occupied voxel stops a ray that goes through it: the box around its points, if they are known."""
+def _is_stopped(at, ray, cell, voxel, solid):  # type: ignore[no-untyped-def]
+    """Return whether an occupied voxel, or the box around its points if they are known, stops a ray through the voxel."""
     boxes, first, last = solid.boxes, 0.0, 1.0
     if not len(boxes) or boxes[voxel, 0] > boxes[voxel, 3]:
         return True
     for axis in range(3):
         low = cell[axis] + boxes[voxel, axis] / STEPS - solid.beyond[axis] - at[axis]
         high = cell[axis] + (1.0 + boxes[voxel, 3 + axis]) / STEPS + solid.beyond[axis] - at[axis]
-        enter, leave = low / way[axis], high / way[axis]
+        enter, leave = low / ray[axis], high / ray[axis]
         first, last = max(first, min(enter, leave)), min(last, max(enter, leave))
     return first < last

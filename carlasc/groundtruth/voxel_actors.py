@@ -1,6 +1,6 @@
-"""Which actor each voxel of a grid belongs to, and how it moves; and how both follow from the points of recordings.
+"""The actor and the velocity of each voxel of a grid, and how the points of recordings give them.
 
-Each actor has one number over a whole sequence, although its tracks may be several.
+Each actor has one number in the whole sequence, also if it has several tracks.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from carlasc.captures.raw import SensorRecording
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.motion.segments import MIN_SPEED_M_S
-from carlasc.motion.tracks import FIRST_MOVER, Track
+from carlasc.motion.tracks import FIRST_FOUND, Track
 from carlasc.storage.field_files import VELOCITY_DTYPE
 
 _POINTS_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("actor", np.uint32), ("points", np.int64)])
@@ -24,11 +24,11 @@ _POINTS_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("actor", n
 
 @dataclass(frozen=True)
 class VoxelActors:
-    """Who is in the voxels of a grid, and how fast.
+    """The actors in the voxels of a grid, and their velocities.
 
     Attributes:
-        instance: (X, Y, Z) uint32, number of the actor that each voxel belongs to over the whole sequence; 0 for none.
-        velocity: (M,) `field_files.VELOCITY_DTYPE`, sorted by voxel: the voxels that move, m/s, axes of the frame's sensor, ego motion removed.
+        instance: (X, Y, Z) uint32, number of the actor of each voxel in the whole sequence; 0 for none.
+        velocity: (M,) `field_files.VELOCITY_DTYPE`, sorted by voxel: the moving voxels, m/s, axes of the frame's sensor, ego motion removed.
     """
 
     instance: NDArray[np.uint32]
@@ -63,8 +63,8 @@ class ActorPoints:
 
     Attributes:
         spec: the grid.
-        turns: how fast actors turn about the vertical, rad/s, by their numbers.
-        deformable: classes of what does not turn as a whole.
+        turns: turn rates of actors about the vertical, rad/s, by their numbers.
+        deformable: classes of actors that do not turn as a whole.
     """
 
     def __init__(self, spec: GridSpec, turns: Mapping[int, float], deformable: Collection[int]) -> None:
@@ -73,7 +73,7 @@ class ActorPoints:
         self._velocity: dict[int, NDArray[np.float64]] = {}
         self._extent: dict[
             int, tuple[NDArray[np.float64], NDArray[np.float64]]
-        ] = {}  # lowest and highest x and y of the points of what turns
+        ] = {}  # bounds in x, y of turning actors
 
     def add(self, recording: SensorRecording, grid_T_sensor: Transform) -> None:
         """Add the points of a recording; numbers of actors are those of the whole recording."""
@@ -96,7 +96,7 @@ class ActorPoints:
                 self._extent[actor] = np.minimum(lower, places.min(axis=0)), np.maximum(upper, places.max(axis=0))
 
     def of(self, labels: NDArray[np.unsignedinteger]) -> VoxelActors:
-        """Return the actors of a grid with these labels, (X, Y, Z): of the points of a voxel's class, the number that most have; ties go to the lowest."""
+        """Return the actors of a grid with (X, Y, Z) labels: the most frequent number of the points of a voxel's class; ties go to the lowest."""
         counts = self._counts
         counts = counts[counts["label"] == labels.reshape(-1)[counts["voxel"]]]
         best = counts[np.lexsort((counts["actor"], -counts["points"], counts["voxel"]))]
@@ -109,7 +109,7 @@ class ActorPoints:
         return VoxelActors.of(self.spec, instance, known["voxel"].astype(np.int64), velocity)
 
     def _turn(self, rows: NDArray[np.void], velocity: NDArray[np.float64]) -> None:
-        """Add to the velocity of each voxel what the turning of its actor, about the middle of its points, adds."""
+        """Add to the velocity of each voxel the turn of its actor about the middle of the points of the actor."""
         for actor, (lower, upper) in self._extent.items():
             own = np.flatnonzero((rows["actor"] == actor) & ~np.isin(rows["label"], list(self.deformable)))
             arm = centers_of(self.spec, rows["voxel"][own])[:, :2] - (lower + upper) / 2
@@ -117,7 +117,7 @@ class ActorPoints:
 
 
 def centers_of(spec: GridSpec, voxels: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Return (N, 3) the centres of voxels, by their flat indices, metres, grid frame."""
+    """Return the (N, 3) centres of voxels, metres, grid frame, from their (N,) flat indices."""
     index = np.stack(np.unravel_index(voxels, spec.size), axis=-1)
     return spec.from_axes(np.asarray(spec.lower) + (index + 0.5) * np.asarray(spec.voxel_size)).astype(np.float64)
 
@@ -133,25 +133,25 @@ def _sum(rows: NDArray[np.void]) -> NDArray[np.void]:
     return found
 
 
-_FEWEST_COMMON = 3  # frames in which two tracks must have poses to be compared
-_AROUND_M = 0.3  # what is so near to a body may be a part of it
-_INSIDE = 0.7  # part of them in which one is in the other's body, if both are of one actor
+_FEWEST_COMMON = 3  # least number of frames in which two compared tracks have poses
+_AROUND_M = 0.3  # margin around a body
+_INSIDE = 0.7  # least share of these frames with one actor in the body of the other
 
 
 def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, int]:
     """Return the number of the actor of each track, by the number of the track.
 
-    It is that of the data where these have numbers. Other tracks are numbered above all of them, in the order in which they begin. Tracks are of
-    one actor if they have one class, no two numbers, and the middle of what was seen of the smaller one is in the larger one's body most of the time; people only
-    where not both were seen in one scan.
+    Numbers of the data are kept. Other tracks get higher numbers, in the order of their first frames. Two tracks belong to one actor if they
+    have the same class, at most one of them has a number, and the middle of the visible part of the smaller one is mostly in the body of the
+    larger one; tracks of people only if no scan shows both.
 
     Args:
-        tracks: what moves.
-        highest: the highest number that the data have.
+        tracks: the moving actors.
+        highest: the highest number in the data.
     """
     order = sorted(tracks, key=lambda number: (tracks[number].first, number))
     group = {number: number for number in order}
-    numbers = {n: t.instance for n, t in tracks.items() if 0 < t.instance < FIRST_MOVER}
+    numbers = {n: t.instance for n, t in tracks.items() if 0 < t.instance < FIRST_FOUND}
 
     def root(number: int) -> int:
         while group[number] != number:
@@ -169,16 +169,14 @@ def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, in
                 kept, joined = (second, first) if second in numbers else (first, second)
                 group[joined] = kept
     following = max([highest, *numbers.values()], default=0)
-    seen: dict[int, set[int]] = {}  # scans in which each number of the data was seen
+    seen: dict[int, set[int]] = {}  # scans that show each number of the data
     found: dict[int, int] = {}
     for number in sorted(order, key=lambda number: (-len(tracks[number].members), number)):
         own = root(number)
         if own in found or own not in numbers:
             continue
         members = {f for n in order if root(n) == own for f in tracks[n].members}
-        if not members & seen.get(
-            numbers[own], set()
-        ):  # otherwise the number is in two places, and the longer track has it
+        if not members & seen.get(numbers[own], set()):  # at two places at once, the longer track has the number
             seen.setdefault(numbers[own], set()).update(members)
             found[own] = numbers[own]
     for number in order:
@@ -189,7 +187,7 @@ def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, in
 
 
 def _are_one(one: Track, other: Track) -> bool:
-    """Return whether two tracks are of one actor."""
+    """Return whether two tracks belong to one actor."""
     if one.label != other.label or ((not one.rigid or not other.rigid) and set(one.members) & set(other.members)):
         return False
     small, large = sorted((one, other), key=lambda track: float(np.prod(track.size)))
@@ -199,7 +197,7 @@ def _are_one(one: Track, other: Track) -> bool:
         return False
     poses = (track.world_T_actor[begin - track.first : end - track.first] for track in (large, small))
     large_T_world, world_T_small = invert(next(poses)), next(poses)
-    seen = (small.extent.lower + small.extent.upper) / 2  # of what was completed, nobody knows where it is
+    seen = (small.extent.lower + small.extent.upper) / 2  # not of the completed body, whose position is uncertain
     middle = multiply(large_T_world, world_T_small, np.append(seen, 1.0)[:, None])[:, :3, 0]
     inside = ((middle > large.lower - _AROUND_M) & (middle < large.upper + _AROUND_M)).all(axis=1)
     return bool(inside.mean() >= _INSIDE)

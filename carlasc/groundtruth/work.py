@@ -1,6 +1,6 @@
-"""The work of a run: the frames of all its sequences are made in parallel, and each sequence whose frames all exist gets a report.
+"""The work of a run: the frames of all sequences are made in parallel, and each complete sequence gets a report.
 
-A `FrameTask` pickles into a worker, where a frame is made, or one that exists is measured.
+A `FrameTask` pickles into a worker, where a frame is made, or an existing frame is measured.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class FrameResult:
 
     Attributes:
         task: the task.
-        outputs: what it made, by field, until it is written.
+        outputs: the arrays that it made, by field, until they are written.
         error: why it failed; None if it did not.
-        facts: what the report needs to know of the frame.
+        facts: the facts of the frame for the report.
     """
 
     task: FrameTask
@@ -57,7 +57,7 @@ class FrameTask(ABC):
     Attributes:
         number: frame number in the output.
         frame: the frame, if the run knows it.
-        plan: what the run makes.
+        plan: the plan of the run.
         classes: class table of the grid.
         sampled: whether the frame is also made without a tenth of the scans.
     """
@@ -80,10 +80,10 @@ class MakeFrame(FrameTask):
     frame: FrameInput
 
     def run(self) -> FrameResult:
-        """Make the frame. What it made is returned, and not written yet."""
+        """Make the frame. The arrays are returned, and not written yet."""
         plan, number = self.plan, self.number
         try:
-            thinned = self.frame.thinned(plan) if self.sampled else None  # first, while there are no outputs to keep
+            thinned = self.frame.thinned(plan) if self.sampled else None  # first, while no outputs take memory
             data = self.frame.make(plan)
             outputs, grid = _outputs_of(data, plan, number)
             if plan.voting.keep_seen:
@@ -110,7 +110,7 @@ class MeasureFrame(FrameTask):
     writer: SequenceWriter
 
     def run(self) -> FrameResult:
-        """Read the frame. One that cannot be read is left out of the report."""
+        """Read the frame. A frame that cannot be read is left out of the report."""
         plan = self.plan
         names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
         try:
@@ -130,7 +130,7 @@ class MeasureFrame(FrameTask):
 
 @dataclass(frozen=True)
 class Batch:
-    """Tasks that a worker does one after another: to make the frames that are stored together, or to measure a frame.
+    """Tasks that a worker runs one after another: the frames that are stored together, or the measurement of one frame.
 
     Attributes:
         writer: where the frames are written.
@@ -142,11 +142,11 @@ class Batch:
 
 
 def run_batch(batch: Batch) -> list[FrameResult]:
-    """Do the work of a batch, and write what it made if the writer can be used in workers.
+    """Run the tasks of a batch, and write the frames if the writer works in workers.
 
     Raises:
         ConflictError: a scan exists already, and differs from that of this run.
-        StorageError: nothing can be written, so every other batch would fail in the same way.
+        StorageError: nothing can be written, so all other batches would fail too.
     """
     done: list[FrameResult] = []
     for task in batch.tasks:
@@ -188,10 +188,10 @@ def write_frames(writer: SequenceWriter, results: Series[FrameResult]) -> None:
 
 
 def _outputs_of(data: FrameData, plan: GridPlan, frame: int) -> tuple[Outputs, Grid]:
-    """Return everything that is written for a frame, the grid last, and the grid.
+    """Return all arrays to write for a frame, the grid last, and the grid.
 
     Raises:
-        MissingDataError: the frame does not say how certain each voxel is, and the plan asks for it.
+        MissingDataError: the plan needs the certainty of each voxel, and the frame does not have it.
     """
     labels, counts, evidence = data.grid.labels, data.grid.counts, data.evidence
     if plan.needs_evidence and evidence is None:
@@ -218,7 +218,7 @@ class FrameFailure:
     Attributes:
         sequence: location of its sequence in the source.
         frame: its number in the source.
-        message: what went wrong, in one line.
+        message: the error, in one line.
     """
 
     sequence: str
@@ -228,7 +228,7 @@ class FrameFailure:
 
 @dataclass(frozen=True)
 class SequenceJob:
-    """What a run does with one sequence: what is made, where it goes, and the documents to write first."""
+    """The job of a run for one sequence: its inputs, its writer, and the documents to write first."""
 
     path: str
     inputs: SequenceInput
@@ -244,11 +244,11 @@ class SequenceJob:
         return frozenset(frame.number for frame in self.inputs.frames)
 
     def block_of(self, number: int) -> int:
-        """Return the block of a frame: the frames of a block are stored together."""
+        """Return the block of a frame. The frames of a block are stored together."""
         return number // self.writer.block
 
     def announce(self) -> None:
-        """Say what is going to be written, to a store that needs to know."""
+        """Announce the fields and frames to a store that reserves space."""
         frames: dict[str, list[int]] = {name: sorted(self.numbers) for name in self.plan.fields()}
         for frame in self.inputs.frames:
             for name in frame.fields():
@@ -257,7 +257,7 @@ class SequenceJob:
         self.writer.expect(frames, {"points": points} if points else None)
 
     def missing(self) -> set[int]:
-        """Return the frames that lack a file now; other commands may write at the same time."""
+        """Return the frames that lack a file at this moment: other commands may write at the same time."""
         self.writer.refresh()
         has, grid = self.writer.has, self.plan.fields()
         frames = self.inputs.frames
@@ -266,7 +266,7 @@ class SequenceJob:
         }
 
     def report(self) -> Report | None:
-        """Return the report that an earlier run with the same settings left; None if there is none."""
+        """Return the report of an earlier run with the same settings; None without one."""
         name = layout.report_file(self.plan.grid)
         data = self.writer.read_document(name)
         try:
@@ -283,7 +283,7 @@ class SequenceJob:
 
     @property
     def reported(self) -> frozenset[int]:
-        """The frames that the report is about: those of this run, and those of the report that exists."""
+        """The frames of the report: those of this run, and those of the existing report."""
         report = self.report()
         return self.numbers if report is None else self.numbers | set(report.frames)
 
@@ -321,8 +321,8 @@ class Work:
 
     Attributes:
         jobs: the sequences.
-        plan: what is made.
-        spread: how the work is spread. Of a part of it, frames that are stored together are dealt out together.
+        plan: the plan of the run.
+        spread: how the work is spread. Frames that are stored together are in one part.
         failures: frames that could not be made.
         wanted: number of frames to make.
         skipped: number of frames of this part that exist already.
@@ -338,9 +338,9 @@ class Work:
     has_written: bool = False
 
     def run(self) -> list[FrameFailure]:
-        """Make what is missing, and return the frames that could not be made.
+        """Make the missing frames, and return the frames that could not be made.
 
-        Sequences follow each other without a pause: while the last frames of one are made, the next one is prepared and begun.
+        Sequences follow each other without a pause: the next sequence is prepared while the last frames of one are made.
         """
         dealt = self._deal()
         ours = [job.missing() & numbers for job, numbers in zip(self.jobs, dealt, strict=True)]
@@ -364,7 +364,7 @@ class Work:
             for job, missing in zip(self.jobs, ours, strict=True):
                 while len(made[id(job)]) < len(missing):
                     done = next(results)
-                    write_frames(under_way.popleft().writer, done)  # what the writer cannot write in workers
+                    write_frames(under_way.popleft().writer, done)  # frames of a writer that does not work in workers
                     made[id(job)] += [replace(result, outputs={}) for result in done]
                     steps(len(done))
                 self._finish(job, made.pop(id(job)), steps)
@@ -377,7 +377,7 @@ class Work:
         return [{i for i in job.numbers if (n, job.block_of(i)) in dealt} for n, job in enumerate(self.jobs)]
 
     def _finish(self, job: SequenceJob, made: list[FrameResult], steps: StepCounter) -> None:
-        """Note what failed, and write the report; where other parts make frames of the sequence, the last of them writes it."""
+        """Note the failures, and write the report; if other parts make frames of the sequence, the last part writes it."""
         self.has_written |= bool(made)
         for done in made:
             if isinstance(done.task, MakeFrame) and done.error is not None:
@@ -393,6 +393,6 @@ class Work:
 
 
 def _batches(job: SequenceJob, tasks: Series[FrameTask]) -> Iterator[Batch]:
-    """Yield tasks in batches: those of frames that are stored together in one."""
+    """Yield tasks in batches; the frames that are stored together are in one batch."""
     for _, group in groupby(tasks, key=lambda task: job.block_of(task.number)):
         yield Batch(job.writer, tuple(group))

@@ -171,7 +171,7 @@ def _bars(rows: Sequence[tuple[str, float]]) -> str:
 
 
 def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
-    """Return one line per actor, from its first to its last sighting; it is the paler the more frames in between do not show it."""
+    """Return one line per actor, from its first to its last observation; it is the paler the more frames in between do not show it."""
     first = min([*(actor.first for actor in actors), *frames[:1]])
     last = max([*(actor.last for actor in actors), *frames[-1:]])
     scale = 560 / max(last - first, 1)
@@ -180,7 +180,7 @@ def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
         y, x, width = row * _ROW, 130 + (actor.first - first) * scale, max((actor.last - actor.first) * scale, 2)
         name = f"{actor.label} {actor.instance or ''}".strip()
         lines.append(f'<text x="0" y="{y + 13}">{escape(name)}</text>')
-        share = actor.sightings / (actor.last - actor.first + 1)
+        share = actor.observations / (actor.last - actor.first + 1)
         bar = (
             f'<rect x="{x:.1f}" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}" fill-opacity="{share:.2f}"/>'
         )
@@ -202,12 +202,12 @@ def _actor_table(actors: Sequence[ActorTrack]) -> str:
         "instance",
         "first",
         "last",
-        "sightings",
+        "observations",
         "points",
         "m/s",
         "size, m",
         "residual, m",
-        "standing, m",
+        "static, m",
         "sure",
     ]
     rows = [
@@ -216,12 +216,12 @@ def _actor_table(actors: Sequence[ActorTrack]) -> str:
             actor.instance or None,
             actor.first,
             actor.last,
-            actor.sightings,
+            actor.observations,
             actor.points,
             f"{actor.speed_m_s:.1f}",
             " x ".join(f"{side:.1f}" for side in actor.size_m),
             _metres(actor.residual_m),
-            _metres(actor.residual_standing_m),
+            _metres(actor.residual_static_m),
             f"{actor.confidence:.0%}",
         ]
         for actor in actors

@@ -1,8 +1,8 @@
-"""Bodies: how large an actor is, although no scan saw all of it.
+"""Bodies: the size and the surface of an actor, completed where no scan saw it.
 
-A scan sees only the faces of an actor that are turned to the sensor. Pooled over its whole track, the sightings show some of its faces; a
-car that drives ahead shows its rear alone. Length and width are known if they can be read off the faces that were seen. Otherwise they are
-those of similar actors of the same data, or of a table, and the body extends from the face that was seen away from the sensor.
+A scan sees only the faces of an actor that are turned to the sensor. All observations of a track together show some of its faces: of a car
+ahead, only the rear. Length and width are known if the visible faces show them. Otherwise they are taken from similar actors of the same
+data, or from a table, and the body extends from the visible face away from the sensor.
 """
 
 from __future__ import annotations
@@ -13,42 +13,39 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-_TRIM = 0.01  # fraction of points that may be outside an actor's body: outliers, points of a neighbour
-_FACE_POINTS, _FACE_SHARE = (
-    12,
-    0.02,
-)  # a face was seen if scans with so many points, and this share of them, looked at it
-_FACE_SINE = 0.26  # a ray sees a face, and not along it, if it meets the face at 15 degrees or more
+_TRIM = 0.01  # share of points that may be outside the body: outliers, points of a neighbour
+_FACE_POINTS, _FACE_SHARE = 12, 0.02  # a face is visible if scans with so many points, and this share, see it
+_FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
-_SHORTEST = 0.6, 0.85  # no vehicle is shorter, or narrower, than these fractions of the usual size of its kind
-_HIGHER = 1.6  # less than this part of its height is hidden
-_EXAMPLES = 3  # a size is learned from at least this many actors, and a shape from at most this many
-_CELL_M, _BIN_M = 0.1, 0.2  # cells in which surfaces are kept, and in which those of several actors are compared
-_ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # vehicles that are narrower, or shorter, have two wheels
-_WIDEST_M = 2.4, 2.8  # of cars, and of longer vehicles: what seems wider has points of a neighbour
-_LOWEST_M = 1.0  # of what seems lower, only a part was seen
+_SHORTEST = 0.6, 0.85  # no vehicle is shorter, or narrower, than these shares of the usual size of its kind
+_HIGHER = 1.6  # the height may grow by less than this factor
+_EXAMPLES = 3  # a size is learned from at least so many actors, and a shape from at most so many
+_CELL_M, _BIN_M = 0.1, 0.2  # cells of surfaces, and cells in which surfaces of several actors are compared
+_ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # narrower or shorter vehicles have two wheels
+_WIDEST_M = 2.4, 2.8  # of cars, and of longer vehicles: wider ones have points of a neighbour
+_LOWEST_M = 1.0  # of lower ones, only a part was seen
 
-BODY_MARGIN_M = 0.1  # by which the box of an actor is larger than its body
+BODY_MARGIN_M = 0.1  # margin of the box of an actor around its body
 _CLEARANCE_M, _SPACING_M = 0.15, 0.1
-_INSET_M = 0.22  # by which the usual shell is inside the box: a voxel needs some depth of the body to be occupied
+_INSET_M = 0.22  # depth of the usual shell inside the box: an occupied voxel holds some depth of the body
 # Of a car, as fractions: the height of its body, the ends and the width of its cabin.
 _BELT, _CABIN, _CABIN_WIDE = 0.62, (0.08, 0.75), 0.85
 
 LENGTH, WIDTH = 0, 1
-# Length and width, metres, of vehicles with two wheels, cars, vans (at least so high), and lorries and buses (at least so wide).
+# Length and width, metres, of vehicles with two wheels, cars, vans, and lorries and buses.
 _TWO_WHEELS, _CAR, _VAN, _LORRY = (1.8, 0.7), (4.4, 1.85), (5.4, 2.0), (7.5, 2.5)
 _LORRY_WIDE_M, _LORRY_HIGH_M, _LORRY_LONG_M, _LORRY_TOP_M, _VAN_HIGH_M = 2.25, 2.3, 6.0, 2.8, 1.95
 
 
 @dataclass(frozen=True)
 class Extent:
-    """What the sightings of an actor show of its size.
+    """The size of an actor, as its observations show it.
 
     Attributes:
         lower: (3,) metres, lower corner of the box around its points, actor frame (x forward, y to the side).
         upper: (3,) metres, upper corner.
-        faces: whether the rear, the front, the side of low y and the side of high y were seen.
-        points: number of points that it is taken from.
+        faces: whether the rear, the front, the side of low y and the side of high y are visible in some scan.
+        points: number of points of the observations.
         seen_from: x and y of the sensor, metres, actor frame: mean over the points.
     """
 
@@ -60,7 +57,7 @@ class Extent:
 
     @property
     def size(self) -> NDArray[np.float64]:
-        """(3,) metres: length, width and height of what was seen."""
+        """(3,) metres: length, width and height of the visible part."""
         return self.upper - self.lower
 
     @property
@@ -71,33 +68,33 @@ class Extent:
 
     @property
     def plausible(self) -> tuple[bool, bool]:
-        """Whether length and width are those that a vehicle of this width or length, and this height, can have; less is only a part of it."""
+        """Whether length and width are large enough for a vehicle of this width or length, and this height; smaller ones are of a part of it."""
         length, width = (bool(self.size[axis] > share * _table(self, axis)) for axis, share in enumerate(_SHORTEST))
         return length, width
 
     @property
     def exemplary(self) -> bool:
-        """Whether others can be completed by its shape: its front, its rear and one of its sides were seen."""
+        """Whether its shape can complete similar actors: its front, its rear and one side are visible."""
         rear, front, low, high = self.faces
         return rear and front and (low or high) and all(self.plausible)
 
 
-def measure(sightings: Sequence[NDArray[np.float64]], sensors: NDArray[np.float64]) -> Extent:
-    """Return what sightings show of an actor's size.
+def measure(observations: Sequence[NDArray[np.float64]], sensors: NDArray[np.float64]) -> Extent:
+    """Return the size of an actor, as its observations show it.
 
     Args:
-        sightings: (M, 3) points of the actor in each scan, metres, actor frame.
+        observations: (M, 3) points of the actor in each scan, metres, actor frame.
         sensors: (F, 3) position of the sensor in each scan, metres, actor frame.
     """
-    points = np.concatenate(list(sightings))
+    points = np.concatenate(list(observations))
     lower, upper = np.quantile(points, _TRIM, axis=0), np.quantile(points, 1 - _TRIM, axis=0)
-    return seen_from(lower, upper, np.array([len(sighting) for sighting in sightings]), sensors)
+    return seen_from(lower, upper, np.array([len(observation) for observation in observations]), sensors)
 
 
 def seen_from(
     lower: NDArray[np.float64], upper: NDArray[np.float64], counts: NDArray[np.integer], sensors: NDArray[np.float64]
 ) -> Extent:
-    """Return the extent of a box whose faces were seen from some places.
+    """Return the extent of a box, with the faces that sensors saw.
 
     Args:
         lower: (3,) lower corner, metres, actor frame.
@@ -117,10 +114,10 @@ def seen_from(
 
 
 class Sizes:
-    """Lengths, widths and shapes of actors that were seen well, by class."""
+    """The lengths, widths and shapes of actors with many visible faces, by class."""
 
     def __init__(self, examples: Sequence[tuple[int, Extent, NDArray[np.float32]]]) -> None:
-        """Learn from the classes of actors, their extents, and the points of their surfaces, (P, 3) each, actor frame; none if not kept."""
+        """Learn from the classes of actors, their extents, and the (P, 3) points of their surfaces, metres, actor frame; P may be 0."""
         self._known: dict[int, NDArray[np.float64]] = {}
         self._shapes = {label: list[tuple[Extent, NDArray[np.float32]]]() for label, _, _ in examples}
         for label, shapes in self._shapes.items():
@@ -129,9 +126,9 @@ class Sizes:
             shapes += [(e, surface) for e, surface in own if e.exemplary and len(surface)]
 
     def complete(self, label: int, extent: Extent) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of the whole body: lengths and widths that are not known are those of similar actors.
+        """Return the corners of the whole body: unknown lengths and widths are taken from similar actors.
 
-        A body is never smaller than what was seen of it, unless no vehicle is so wide.
+        A body is never smaller than its visible part, unless that is wider than any vehicle.
 
         Returns:
             (3,) lower and (3,) upper corner, metres, actor frame.
@@ -139,7 +136,7 @@ class Sizes:
         extent = _without_neighbours(extent)
         lower, upper = extent.lower.copy(), extent.upper.copy()
         known, plausible = extent.known, extent.plausible
-        if not any(known):  # seen too little, or too far away, to say what it is
+        if not any(known):  # too few points, or too far away
             return lower, upper
         for axis in (LENGTH, WIDTH):
             if known[axis] and plausible[axis]:
@@ -149,14 +146,14 @@ class Sizes:
                 upper[axis] += missing
             else:
                 lower[axis] -= missing
-        if not extent.exemplary:  # what is nearer, or the lowest ray, may hide the wheels
+        if not extent.exemplary:  # other things may hide the wheels, or the lowest ray may pass above them
             lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
         if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:  # the top of a lorry may be above the highest ray
             upper[2] = max(upper[2], lower[2] + _LORRY_TOP_M)
         return lower, upper
 
     def _expected(self, label: int, extent: Extent, axis: int) -> float:
-        """Return the length or the width of actors whose other size is that of `extent`, and the height too if there are such."""
+        """Return the length or the width of actors like `extent` in the other size, and in the height if some are."""
         other = 1 - axis
         sizes = self._known.get(label, np.empty((0, 3)))
         far = (sizes - extent.size) / np.maximum(extent.size, _CELL_M)
@@ -167,7 +164,7 @@ class Sizes:
         return _table(extent, axis)
 
     def _height(self, label: int, size: NDArray[np.float64]) -> float:
-        """Return the height of actors that are as long and as wide as `size`, (3,) metres; if there are none, its own."""
+        """Return the height of actors that are as long and as wide as `size`, (3,) metres; without such actors, its own height."""
         sizes = self._known.get(label, np.empty((0, 3)))
         alike = sizes[(np.abs(sizes - size) < _ALIKE * size)[:, :2].all(axis=1) & (sizes[:, 2] < _HIGHER * size[2])]
         return float(np.median(alike[:, 2])) if len(alike) >= _EXAMPLES else float(size[2])
@@ -175,13 +172,13 @@ class Sizes:
     def surface(
         self, label: int, lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
     ) -> NDArray[np.float32]:
-        """Return points on the surface that a vehicle of this size has: those of the actors most alike, otherwise the usual ones.
+        """Return points on the surface of a vehicle of this size: from the most similar actors, otherwise the usual shell.
 
         Args:
             label: its class.
             lower: (3,) lower corner of its body, metres, actor frame.
             upper: (3,) upper corner.
-            extent: what was seen of it.
+            extent: its visible part.
 
         Returns:
             (P, 3) float32, metres, actor frame.
@@ -207,13 +204,13 @@ class Sizes:
 
 
 def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the centres of the cells that two points or more are in, (P, 3) float32, of points (M, 3), metres."""
+    """Return the (P, 3) float32 centres of the cells that hold two or more of (M, 3) points, metres."""
     cells, count = np.unique(np.round(points / _CELL_M).astype(np.int32), axis=0, return_counts=True)
     return (cells[count > 1] * _CELL_M).astype(np.float32)
 
 
 def _without_neighbours(extent: Extent) -> Extent:
-    """Return the extent, no wider than a vehicle of its length: on the side that the sensor looked at are its own points."""
+    """Return the extent, cut to the greatest width of a vehicle of its length; the side towards the sensor stays."""
     length, wide, height = extent.size.tolist()
     if wide <= _WIDEST_M[length > _LORRY_LONG_M or not extent.known[LENGTH]]:
         return extent
@@ -231,7 +228,7 @@ def _is_lorry(length: float, width: float, height: float) -> bool:
 
 
 def _table(extent: Extent, axis: int) -> float:
-    """Return a usual length or width for an actor of which the other size is known."""
+    """Return the usual length or width of an actor whose other size is known."""
     length, width, height = extent.size.tolist()
     if width > _LORRY_WIDE_M if axis == LENGTH else length > _LORRY_LONG_M:
         return _LORRY[axis]
@@ -248,7 +245,7 @@ def usual_shell(lower: NDArray[np.float64], upper: NDArray[np.float64], extent: 
     Args:
         lower: (3,) lower corner of the body's box, metres, actor frame.
         upper: (3,) upper corner.
-        extent: what was seen of it.
+        extent: its visible part.
 
     Returns:
         (P, 3) float32, metres, actor frame.

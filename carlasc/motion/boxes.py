@@ -1,8 +1,8 @@
 """Tracks from annotated boxes: the boxes of one object over time, smoothed, and the points of a scan that are in them.
 
-A person draws each box some centimetres and a degree off, which blurs what is merged. Boxes therefore follow the points that are in them: the
-sightings of a moving object are laid on each other, as those of actors without boxes are, but each stays near the smoothed box of its
-scan. So objects that few rays hit stay where they were drawn.
+Each drawn box is wrong by some centimetres and a degree, which blurs merged scans. Boxes are therefore corrected by the points in them: the
+observations of a moving object are registered, as for actors without boxes, and each stays near the smoothed box of its scan. Objects with
+few points keep their drawn poses.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
 from carlasc.core.scans import Scan, finite
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent
-from carlasc.motion.paths import MIN_POINTS, best_sighting, corrections
+from carlasc.motion.paths import MIN_POINTS, best_observation, corrections
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.solving import nearest_rotation, resample, smooth
 from carlasc.motion.tracks import Track
 
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
 _FILLED_IN = 0.3  # weight of a box that was not annotated in its frame
-_STANDING_M = 1.0  # annotated boxes of an object that stands may move this far, but not steadily
-_STEADY_M, _STEADY = 0.3, 5.0  # a shorter way counts if it is so many times as long as its deviation from a line
-_HOLD_S = 1.0  # an object that stands for this long stands in all frames
+_STATIC_M = 1.0  # boxes of a static object may move this far, but not steadily
+_STEADY_M, _STEADY = 0.3, 5.0  # a shorter displacement counts if it is so many times its deviation from a line
+_HOLD_S = 1.0  # an object that is static for this time is static in all frames
 _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last box
-_JUMP_M, _MAX_SPEED_M_S = 1.5, 40.0  # boxes that are farther apart are different objects with one number
-_ROUNDING_M = 0.01  # more than the rounding of a place
+_JUMP_M, _MAX_SPEED_M_S = 1.5, 40.0  # boxes that are farther apart belong to different objects with one number
+_ROUNDING_M = 0.01  # more than the rounding of a position
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class _ObjectBoxes:
         poses: (F, 4, 4) world_T_box.
         sizes: (F, 3) metres.
         labels: (F,) class ids.
-        weights: (F,) how much each box counts.
+        weights: (F,) weight of each box.
     """
 
     frames: NDArray[np.int64]
@@ -65,18 +65,18 @@ def tracks_from_boxes(
 ) -> list[Track]:
     """Return the tracks of annotated boxes.
 
-    Whether an object stands is decided over all of its boxes, because annotated boxes of a parked car move by some decimetres. An
-    object that stands has one pose, the median of its boxes, and velocity 0 in all frames of `times`. The poses of others are
+    All boxes of an object together decide whether it is static, because annotated boxes of a parked car move by some decimetres. A
+    static object has one pose, the median of its boxes, and velocity 0 in all frames of `times`. The poses of moving objects are
     smoothed, and interpolated where boxes are missing. No points are used.
 
     Args:
         boxes: the boxes of each annotated frame, sensor frame.
-        poses: (4, 4) world_T_sensor of at least these frames.
+        poses: (4, 4) world_T_sensor of these frames, or of more.
         times: seconds of all frames of the sequence, increasing.
         deformable: classes whose objects change their shape.
 
     Returns:
-        The tracks in order of their numbers, without members: `segment_by_boxes` finds those of a scan. An object whose boxes jump
+        The tracks in order of their numbers, without members: `segment_by_boxes` finds the members in a scan. An object whose boxes jump
         has several tracks with the same number.
     """
     found: dict[int, list[tuple[int, int]]] = {}  # frames and rows by track
@@ -89,7 +89,7 @@ def tracks_from_boxes(
     return [
         _make_track(track, part, known, seconds, deformable)
         for track in sorted(found)
-        for part in _split_at_jumps(_sightings([(frame, world[frame], row) for frame, row in found[track]], times))
+        for part in _split_at_jumps(_boxes_of([(frame, world[frame], row) for frame, row in found[track]], times))
     ]
 
 
@@ -104,20 +104,19 @@ def segment_by_boxes(
 ) -> list[Segment]:
     """Return the points of a scan that are in the boxes of tracks.
 
-    Points of ground classes are in none. A point in the boxes of several tracks belongs to the smallest one.
+    Points of ground classes belong to no track. A point in the boxes of several tracks belongs to the smallest one.
 
     Args:
         frame: frame number.
         scan: points, with labels if it has any.
         world_T_sensor: (4, 4) pose of the scan.
-        tracks: tracks, of which those that extend to the frame are used.
+        tracks: the tracks. Tracks that do not extend to the frame have no segment.
         ground: ids of the ground classes.
-        floor_m: points that are not labelled as the actor's class are taken for the ground up to this height above the bottom
-            of its box, metres.
+        floor_m: points of other classes than the track's count as ground up to this height above the bottom of its box, metres.
 
     Returns:
-        The segments of the tracks that have points in the scan, in the order of the tracks. The label, the number and the velocity are
-        those of the track.
+        The segments of the tracks that have points in the scan, in the order of the tracks. Each has the label, the number and the
+        velocity of its track.
     """
     owners = np.full(len(scan), -1, np.int64)
     usable = finite(scan.points)
@@ -154,7 +153,7 @@ def _inside(
     labels: NDArray[np.unsignedinteger] | None,
     floor_m: float,
 ) -> NDArray[np.int64]:
-    """Return the indices of the points (M, 3), world, that are in a track's box at a pose, and not on the ground below it."""
+    """Return the indices of the (M, 3) points, world, that are in a track's box at a pose and above its ground."""
     reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
     near = np.flatnonzero(np.abs(points[:, 1] - pose[1, 3]) <= reach)
     body = transform_points(invert(pose), points[near])
@@ -165,7 +164,7 @@ def _inside(
     return near[inside & above]
 
 
-def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
+def _boxes_of(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
     """Return the boxes of one object, given as (frame, boxes of the frame in the world frame, row)."""
     chosen = [boxes.select(np.array([row])) for _, boxes, row in found]
     frames = np.array([frame for frame, _, _ in found], np.int64)
@@ -179,37 +178,37 @@ def _sightings(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) 
     )
 
 
-def _split_at_jumps(sightings: _ObjectBoxes) -> list[_ObjectBoxes]:
-    """Split the boxes of a number where no object can get from one to the next."""
-    steps = np.linalg.norm(np.diff(sightings.poses[:, :3, 3], axis=0), axis=1)
-    jumps = np.flatnonzero(steps > _JUMP_M + _MAX_SPEED_M_S * np.diff(sightings.seconds)) + 1
-    return [sightings.part(rows) for rows in np.split(np.arange(len(sightings.frames)), jumps)]
+def _split_at_jumps(boxes: _ObjectBoxes) -> list[_ObjectBoxes]:
+    """Split the boxes of a number where no object can move from one to the next in time."""
+    steps = np.linalg.norm(np.diff(boxes.poses[:, :3, 3], axis=0), axis=1)
+    jumps = np.flatnonzero(steps > _JUMP_M + _MAX_SPEED_M_S * np.diff(boxes.seconds)) + 1
+    return [boxes.part(rows) for rows in np.split(np.arange(len(boxes.frames)), jumps)]
 
 
 def _make_track(
     instance: int,
-    sightings: _ObjectBoxes,
+    boxes: _ObjectBoxes,
     known: NDArray[np.int64],
     known_seconds: NDArray[np.float64],
     deformable: Collection[int],
 ) -> Track:
     """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence, increasing, and their times."""
-    seconds, centers = sightings.seconds, sightings.poses[:, :3, 3]
-    headings, tilt = _headings_and_tilt(sightings.poses[:, :3, :3])
+    seconds, centers = boxes.seconds, boxes.poses[:, :3, 3]
+    headings, tilt = _headings_and_tilt(boxes.poses[:, :3, :3])
     frames, at = known, known_seconds
-    path, speed = smooth(centers, seconds, sightings.weights, _SMOOTH_S)
-    stands = _stands(path, centers, seconds)
-    if stands:
+    path, speed = smooth(centers, seconds, boxes.weights, _SMOOTH_S)
+    static = _is_static(path, centers, seconds)
+    if static:
         path, speed = np.tile(np.median(centers, axis=0), (len(seconds), 1)), np.zeros_like(speed)
         turns = np.full(len(seconds), np.median(headings))
     else:
-        turns = smooth(headings[:, None], seconds, sightings.weights, _SMOOTH_S)[0][:, 0]
-    if not stands or seconds[-1] - seconds[0] < _HOLD_S:
+        turns = smooth(headings[:, None], seconds, boxes.weights, _SMOOTH_S)[0][:, 0]
+    if not static or seconds[-1] - seconds[0] < _HOLD_S:
         inside = (at > seconds[0] - _EXTRAPOLATE_S) & (at < seconds[-1] + _EXTRAPOLATE_S)
         frames = frames[inside]
     every = np.arange(frames[0], frames[-1] + 1)
     at = np.interp(every, known, known_seconds)
-    if stands:  # one pose for all frames, in the memory of one
+    if static:  # all frames share the memory of one pose
         pose = multiply(rotation_z(turns[0]), tilt)
         pose[:3, 3] = path[0]
         poses, speed = np.broadcast_to(pose, (len(every), 4, 4)), np.broadcast_to(speed[0], (len(every), 3))
@@ -217,7 +216,7 @@ def _make_track(
         path, speed = resample(at, seconds, path, speed)
         poses = np.stack([multiply(rotation_z(angle), tilt) for angle in np.interp(at, seconds, turns)])
         poses[:, :3, 3] = path
-    half, label = np.median(sightings.sizes, axis=0) / 2, int(np.bincount(sightings.labels).argmax())
+    half, label = np.median(boxes.sizes, axis=0) / 2, int(np.bincount(boxes.labels).argmax())
     return Track(
         label=label,
         instance=instance,
@@ -233,9 +232,9 @@ def _make_track(
 
 
 def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float64], Transform]:
-    """Return the (F,) headings of boxes in radians, unwrapped, and the mean of what is left of their (F, 3, 3) rotations.
+    """Return the (F,) headings of boxes, radians, unwrapped, and the mean of their (F, 3, 3) rotations without the headings.
 
-    Annotators confuse the front of a box with its back: headings that differ by half a turn count as the same, and most boxes decide.
+    Annotators confuse the front of a box with its back. Headings that differ by half a turn therefore count as equal, and the majority decides.
     """
     angles = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
     headings = np.unwrap(angles, period=np.pi)
@@ -247,54 +246,54 @@ def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float
     return headings, tilt
 
 
-def _stands(path: NDArray[np.float64], centers: NDArray[np.float64], seconds: NDArray[np.float64]) -> bool:
-    """Return whether an object stands, from its smoothed path (F, 3) and the (F, 3) centres of its boxes, metres, world."""
+def _is_static(path: NDArray[np.float64], centers: NDArray[np.float64], seconds: NDArray[np.float64]) -> bool:
+    """Return whether an object is static, from its (F, 3) smoothed path and the (F, 3) centres of its boxes, metres, world."""
     duration = float(seconds[-1] - seconds[0])
     if duration <= 0:
         return True
     line, offsets = centers[:, :2].mean(axis=0), (seconds - seconds.mean())[:, None]
     velocity = (offsets * centers[:, :2]).sum(axis=0) / np.square(offsets).sum()
-    way = float(np.hypot(*velocity)) * duration
+    length = float(np.hypot(*velocity)) * duration
     deviation = centers[:, :2] - line - offsets * velocity
-    steady = way > max(_STEADY_M, _STEADY * float(np.sqrt(np.square(deviation).sum(axis=1).mean())))
-    if steady and way / duration > MIN_SPEED_M_S:
+    steady = length > max(_STEADY_M, _STEADY * float(np.sqrt(np.square(deviation).sum(axis=1).mean())))
+    if steady and length / duration > MIN_SPEED_M_S:
         return False
     extent = float(np.hypot(*np.ptp(path[:, :2], axis=0)))
     slow = _fastest(path, seconds) < MIN_SPEED_M_S
-    return extent < _STANDING_M or slow
+    return extent < _STATIC_M or slow
 
 
 def _fastest(path: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
-    """Return the greatest mean speed over `_HOLD_S` along a path, in m/s; over all of it if it is shorter."""
+    """Return the greatest mean speed over `_HOLD_S` along a path, in m/s; over the whole path if it is shorter."""
     then = np.minimum(np.searchsorted(seconds, seconds + _HOLD_S), len(seconds) - 1)
     elapsed = seconds[then] - seconds
     whole = (elapsed >= min(_HOLD_S, float(seconds[-1] - seconds[0])) - 1e-9) & (elapsed > 0)
-    way = np.linalg.norm(path[then, :2] - path[:, :2], axis=1)
-    return float((way[whole] / elapsed[whole]).max(initial=0.0))
+    length = np.linalg.norm(path[then, :2] - path[:, :2], axis=1)
+    return float((length[whole] / elapsed[whole]).max(initial=0.0))
 
 
 _DRAWN = np.array([0.05, 0.05, 0.03, 0.01])  # error of a smoothed box: x, y, z in metres, yaw in radians
-_MIN_SIGHTINGS = 5  # with fewer, there is nothing to lay on each other
+_MIN_OBSERVATIONS = 5  # with fewer, boxes are not corrected
 
 
 def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int, float]) -> Track:
-    """Return the track of an object's boxes with poses under which its sightings fit each other.
+    """Return the track of an object's boxes with poses under which its observations align.
 
-    The mean of all boxes stays where it is, in the object's frame. Objects that stand, and those that change their shape, stay as they are.
+    The mean of all boxes does not change, in the frame of the object. Tracks of static and of deformable objects do not change.
 
     Args:
         track: the track of the boxes.
-        segments: the points in its boxes, one segment for each scan, in order of frames.
+        segments: the points in its boxes, one segment per scan, in order of frames.
         times: seconds by frame.
     """
     hit = {s.frame: s for s in segments if len(s.points) >= MIN_POINTS and track.pose(s.frame) is not None}
-    if not (track.moves and track.rigid) or len(hit) < _MIN_SIGHTINGS:
+    if not (track.moves and track.rigid) or len(hit) < _MIN_OBSERVATIONS:
         return track
     rows, seconds = np.array([*hit]) - track.first, np.array([times[frame] for frame in hit])
     points = [segment.points for segment in hit.values()]
     poses = track.world_T_actor
     drawn = np.column_stack([poses[rows, :3, 3], np.unwrap(np.arctan2(poses[rows, 1, 0], poses[rows, 0, 0]))])
-    change, rates = corrections(points, seconds, drawn, _DRAWN, best_sighting(points))
+    change, rates = corrections(points, seconds, drawn, _DRAWN, best_observation(points))
     axes = np.stack([rotation_z(-yaw)[:3, :3] for yaw in drawn[:, 3].tolist()])
     own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
     own -= np.average(own, axis=0, weights=[len(some) for some in points])

@@ -1,8 +1,8 @@
-"""Evidence of motion: points at places that were free space at other times, without flow, instances or labels that say so.
+"""Evidence of motion: points at places that were free space at other times. It needs no flow, instances or labels.
 
-Each point that is not ground is looked up in scans up to `HORIZON_S` before and after. If its place was seen through more often than it was
-seen occupied, or always on one side in time, something was there that moved. Such points are grouped into clusters, and a cluster gets the
-points around it that nothing shows to be static.
+Each point that is not ground is looked up in scans up to `HORIZON_S` before and after. A point moved if rays passed through its place more
+often than they ended there, or if all scans on one side in time saw it free. Such points are grouped into clusters. A cluster also gets the
+points around it that are not known to be static.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ HORIZON_S = 5.0
 """Scans up to this many seconds before and after a scan are looked up."""
 
 _OFFSETS_S = (0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0)
-_AGREEING = 2  # scans that must have seen through a place
-_IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest inwards, saw through it
+_AGREEING = 2  # least number of scans that saw a place free
+_IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest inwards, saw it free
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
-_JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and the others are as it is
-_BAND_M = 0.3  # what stands this much below or above a cluster, in its cells or beside them, is around it
-_FLAGGED_SHARE = 0.6  # a cluster with this share of moved points is one object, which moved with all its points
-_PERIOD_S = 0.1  # between scans whose times do not rise
+_JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and decides for the others
+_BAND_M = 0.3  # static points so far below or above a cluster, in its cells or beside them, are around it
+_FLAGGED_SHARE = 0.6  # a cluster with this share of moved points moved as a whole
+_PERIOD_S = 0.1  # period of scans whose times do not increase
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """One scan, as evidence of motion needs it.
+class EvidenceScan:
+    """One scan in which evidence of motion is searched for.
 
     Attributes:
         frame: frame number.
         points: (N, 3) float32, metres, in the frame of a sensor that is mounted upright.
         world_T_sensor: (4, 4).
         seconds: time of the scan.
-        ground: (N,) bool, which points are ground; None to find out from their positions.
+        ground: (N,) bool, which points are ground; None: found from their positions.
         labels: (N,) class ids; None if the scan has none.
-        explained: (N,) bool, points of actors that are known already; None if there are none. They are never evidence.
-        origins: (N, 3) where the ray of each point began, metres; None: at the sensor. Points with one origin are next to each other.
+        explained: (N,) bool, points of known actors, which are never evidence; None if there are none.
+        origins: (N, 3) origins of the rays, metres, sensor frame; None: at the sensor. Points with one origin follow each other.
     """
 
     frame: int
@@ -71,17 +71,17 @@ class Sighting:
 
 @dataclass(frozen=True)
 class FreeSpaceEvidence:
-    """What moved in one scan.
+    """The clusters of points that moved in one scan.
 
     Attributes:
         frame: frame number.
         seconds: time of the scan.
         count: number of points of the scan.
-        clusters: (M,) int64 indices of the points of each thing that moved.
+        clusters: (M,) int64 indices of the points of each cluster.
         points: (M, 3) float64 of the same points, metres, world.
-        labels: class of most points of each cluster; 0 without labels.
+        labels: most frequent class of each cluster; 0 without labels.
         freed: number of points of each cluster at places that were free at other times.
-        around: number of points that stand around each cluster, at its height: many, if it is a piece of what stands.
+        around: number of static points around each cluster, at its height. It is large for pieces of static objects.
         world_T_sensor: (4, 4) pose of the scan.
     """
 
@@ -96,12 +96,12 @@ class FreeSpaceEvidence:
     world_T_sensor: Transform
 
     def thinned(self, most: int = 400) -> FreeSpaceEvidence:
-        """Return the same with at most so many `points` for each cluster; `clusters` stay complete."""
+        """Return the same with at most `most` of the `points` of each cluster; `clusters` stay complete."""
         return replace(self, points=tuple(thin(points, most) for points in self.points))
 
     @property
     def moved(self) -> NDArray[np.bool_]:
-        """(N,) bool: which points of the scan belong to something that moved."""
+        """(N,) bool: which points of the scan are in a cluster."""
         flags = np.zeros(self.count, np.bool_)
         for members in self.clusters:
             flags[members] = True
@@ -112,27 +112,27 @@ class FreeSpaceEvidence:
 class _Kept:
     """A scan in the window."""
 
-    scan: Sighting
+    scan: EvidenceScan
     seconds: float
     views: tuple[SortedReturns, ...]
 
     @classmethod
-    def of(cls, scan: Sighting, seconds: float) -> _Kept:
-        """Sort the points of a scan by their directions, those of each sensor by themselves."""
+    def of(cls, scan: EvidenceScan, seconds: float) -> _Kept:
+        """Sort the points of each sensor of a scan by their directions."""
         if scan.origins is None:
             return cls(scan, seconds, (SortedReturns.of(scan.points),))
         views = (SortedReturns.of(scan.points[own], scan.origins[own]) for own in _sensors(scan.origins))
         return cls(scan, seconds, tuple(views))
 
 
-def find_evidence(scans: Iterable[Sighting], *, movable: Collection[int] = ()) -> Iterator[FreeSpaceEvidence]:
-    """Yield what moved in each scan of a drive, as soon as the scans of `HORIZON_S` after it were read.
+def find_evidence(scans: Iterable[EvidenceScan], *, movable: Collection[int] = ()) -> Iterator[FreeSpaceEvidence]:
+    """Yield the evidence of each scan of a drive, when the scans of the `HORIZON_S` after it were read.
 
-    Only the scans within this time are held, so memory does not grow with the drive.
+    Only scans within this time are held, so memory does not grow with the drive.
 
     Args:
-        scans: the scans in order of time. Times that do not rise are replaced by 0.1 s per scan.
-        movable: classes of objects that can move; points of different ones are not grouped together.
+        scans: the scans in order of time. Times that do not increase are replaced by 0.1 s per scan.
+        movable: classes of actors. Points of different movable classes are not grouped together.
 
     Yields:
         The evidence of each scan, in the order of the scans.
@@ -179,7 +179,7 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
 
 
 def _sensors(origins: NDArray[np.float32]) -> list[NDArray[np.int64]]:
-    """Return the points of each sensor, by where their (N, 3) rays began, metres: the places of a sensor that moves follow on each other."""
+    """Return the points of each sensor, by the (N, 3) origins of their rays, metres: origins of one moving sensor are close to each other."""
     found: list[tuple[list[NDArray[np.float32]], list[NDArray[np.int64]]]] = []
     for part, origin in runs_of_origins(origins, len(origins)):
         near = (own for own in found if np.linalg.norm(np.array(own[0]) - origin, axis=1).min() < SAME_PLACE_M)
@@ -192,7 +192,7 @@ def _sensors(origins: NDArray[np.float32]) -> list[NDArray[np.int64]]:
 
 
 def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
-    """Return the positions of the scans to look up, before and after the current one, nearest first."""
+    """Return the indices of the scans to look up, before and after the current one, nearest first."""
     seconds = np.array([kept.seconds for kept in window]) - window[current].seconds
     sides: tuple[list[int], list[int]] = ([], [])
     for side, sign in zip(sides, (-1, 1), strict=True):
@@ -204,15 +204,13 @@ def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
 
 
 def _judge(
-    scan: Sighting, candidates: NDArray[np.int64], before: list[_Kept], after: list[_Kept]
+    scan: EvidenceScan, candidates: NDArray[np.int64], before: list[_Kept], after: list[_Kept]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which candidates were seen through most of the time, which on one side in time only, and which are static."""
+    """Return which candidates are at places that were free most of the time, free on one side in time, and occupied (static)."""
     points = np.ascontiguousarray(scan.points[candidates], np.float32)
     free, hit = np.zeros((2, 2, len(points)), np.uint32)
     asked, left = np.arange(len(points), dtype=np.int32), [len(before), len(after)]
-    while any(
-        left
-    ):  # from the farthest inwards; most places are occupied in so many scans that the nearest change nothing
+    while any(left):  # from the farthest inwards: most places are decided before the nearest scans
         for side, others in enumerate((before, after)):
             if left[side]:
                 left[side] -= 1
@@ -223,7 +221,7 @@ def _judge(
         asked = undecided(asked, free, hit, (left[0], left[1]), (_AGREEING, _IN_A_ROW))
     seen_through = np.bitwise_count(free).sum(axis=0, dtype=np.int64)
     occupied = np.bitwise_count(hit).sum(axis=0, dtype=np.int64)
-    # Bits above the highest hit are those of the scans farther away than all that saw the place occupied.
+    # Bits above the highest hit belong to scans that are farther in time than all hits.
     smeared = hit.copy()
     for shift in (1, 2, 4, 8, 16):
         smeared |= smeared >> np.uint32(shift)
@@ -246,7 +244,7 @@ def _clusters(
         world: (N, 3) metres.
         kind: (N,) points of different kinds are not grouped.
         moved: (N,) points at places that were free most of the time.
-        left: (N,) points at places that were free before or after only. Cells need a good share of them, because a thin surface may
+        left: (N,) points at places that were free before or after only. A cell needs a large share of them, because a thin surface may
             be invisible from one side.
         static: (N,) points at places that were occupied at other times.
 
@@ -288,12 +286,12 @@ def _clusters(
 def _count_around(
     world: NDArray[np.float64], groups: list[NDArray[np.int64]], static: NDArray[np.bool_]
 ) -> tuple[int, ...]:
-    """Return how many static points, of (N, 3) points in metres, are around each group: in its cells or those beside them, at its height."""
+    """Return the number of static points, of (N, 3) points in metres, around each group: in its cells or beside them, at its height."""
     cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
     key = (cell[:, 0] << 21) | cell[:, 1]
-    standing = np.flatnonzero(static)
-    standing = standing[np.argsort(key[standing], kind="stable")]
-    keys, heights = key[standing], world[standing, 2]
+    rows = np.flatnonzero(static)
+    rows = rows[np.argsort(key[rows], kind="stable")]
+    keys, heights = key[rows], world[rows, 2]
     steps = np.array([(row << 21) + column for row in (-1, 0, 1) for column in (-1, 0, 1)])
     counts = []
     for group in groups:
@@ -301,14 +299,14 @@ def _count_around(
         begin, end = np.searchsorted(keys, cells), np.searchsorted(keys, cells, side="right")
         lower, upper = world[group, 2].min() - _BAND_M, world[group, 2].max() + _BAND_M
         near = np.concatenate([heights[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)])
-        # those that are in the group themselves are at places that were occupied at other times, which counts as well
+        # static points of the group itself count too
         counts.append(int(((near >= lower) & (near <= upper)).sum()))
     return tuple(counts)
 
 
 @cached
 def _join(keys: NDArray[np.int64], seeds: NDArray[np.bool_], width: int) -> NDArray[np.int64]:
-    """Return the component of each cell: seeds that touch are one, and other cells belong to a seed they touch; -1 if there is none.
+    """Return the component of each cell: seeds that touch are one component, and other cells belong to a seed beside them; -1 without one.
 
     Args:
         keys: (C,) row times width plus column of each cell, increasing.

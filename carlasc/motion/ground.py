@@ -1,8 +1,8 @@
-"""Ground without labels: the points of a scan that lie on the surface that the vehicle stands on.
+"""Ground without labels: the points of a scan on the road and on other ground.
 
 The area around the sensor is divided into sectors and rings. A plane through the lowest points nearby gives the height of the ground below the
 sensor, and its slope, or the tilt of the sensor. In each sector the ground is then followed outwards over the lowest points: the next ring
-belongs to it if the step up or down from this slope is one that a road or a kerb can have. Elsewhere the ground is interpolated.
+is ground if the step from this slope is possible for a road or a kerb. Elsewhere the ground is interpolated.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from carlasc.core.scans import finite
 from carlasc.motion.solving import least_squares
 
 _SECTORS, _RINGS, _RING_M = 120, 160, 0.5
-_BLIND_M = 1.0  # nearer points are on the vehicle
+_BLIND_M = 1.0  # nearer points are on the recording vehicle
 # Greatest step between rings, and its growth with their distance up to a limit.
 _STEP_M, _SLOPE, _FAR_M = 0.12, 0.08, 3.0
-_TREND_M = 8.0  # the slope of the ground so far is that over this distance
+_TREND_M = 8.0  # the slope of the ground is measured over this distance
 _KERB_M = 0.2  # highest step within a cell
 _ABOVE_M, _BELOW_M = 0.12, 0.5  # points at most this far above or below the ground belong to it
 
-_PLANE_RINGS = slice(4, 30)  # the plane is that of the lowest points at 2 to 15 m
-_TRIALS, _STEEPEST = 300, 0.25  # planes that are tried, and the greatest slope of one
-_ON_PLANE_M = 0.1  # points of a plane are this near to it
-_NEAR_M = 6.0  # those farther from the sensor count less
-_MIN_CELLS, _MIN_SHARE = 20, 0.2  # a plane has so many cells, and this share of those with points
+_PLANE_RINGS = slice(4, 30)  # the plane is fitted to the lowest points at 2 to 15 m
+_TRIALS, _STEEPEST = 300, 0.25  # number of trial planes, and greatest slope
+_ON_PLANE_M = 0.1  # greatest distance of a point of the plane
+_NEAR_M = 6.0  # farther points have less weight
+_MIN_CELLS, _MIN_SHARE = 20, 0.2  # least number of cells on the plane, and their least share
 
 
 def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return which points of a scan lie on the ground.
 
-    Points more than half a metre below the ground, which are returns of mirror images, are not among them, nor are points that are not
-    finite. If no plane is found below the sensor, as in a scan of few points, no point is.
+    Points more than half a metre below the ground (returns of mirror images) and points that are not finite are not ground. Without a plane
+    below the sensor, as in a scan of few points, no point is ground.
 
     Args:
         points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first.
@@ -60,12 +60,12 @@ def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 def ground_height(points: NDArray[np.floating]) -> float:
     """Return z of the ground below the sensor: minus the height of the sensor, in the sensor's own frame.
 
-    It is that of the plane which most of the lowest points at 2 to 15 m have in common, so a tilted sensor, a slope, and points below the
-    ground do not change it. On a curved road it is off by the curve within some 10 m.
+    It is the height of the plane through most of the lowest points at 2 to 15 m, so a tilted sensor, a slope, and points below the ground
+    do not change it. On a curved road, its error is the curve within some 10 m.
 
     Args:
-        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first. Those that are
-            not finite do not count.
+        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first. Points
+            that are not finite are ignored.
 
     Returns:
         Metres; NaN if no plane is found.
@@ -77,14 +77,14 @@ def ground_height(points: NDArray[np.floating]) -> float:
 
 @cached
 def _lowest(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """Return (N,) the sector and the ring of each point, and (S, R) the lowest point of each cell, -1 where there is none."""
+    """Return the (N,) sector and the (N,) ring of each point, and the (S, R) index of the lowest point of each cell, -1 without one."""
     lowest = np.full((_SECTORS, _RINGS), -1, np.int64)
     sector, ring = np.empty(len(points), np.int32), np.empty(len(points), np.int32)
     for i in range(len(points)):
         x, y = float(points[i, 0]), float(points[i, 1])
         flat = math.sqrt(x * x + y * y)
         s = int((fast_azimuth(x, y) + math.pi) * (_SECTORS / (2 * math.pi))) % _SECTORS if flat > 0 else 0
-        r = int(min(flat / _RING_M, _RINGS - 1.0))  # in this order: a far point's ring may be no int
+        r = int(min(flat / _RING_M, _RINGS - 1.0))  # minimum first: the ring of a far point may exceed an int
         sector[i], ring[i] = s, r
         if flat > _BLIND_M and (lowest[s, r] < 0 or points[i, 2] < points[lowest[s, r], 2]):
             lowest[s, r] = i
@@ -92,17 +92,15 @@ def _lowest(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.
 
 
 def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Return (slope along x, slope along y, z at the sensor) of the plane that most of the lowest points nearby have in common."""
+    """Return (slope along x, slope along y, z at the sensor) of the plane through most of the lowest points nearby; None without one."""
     near = lowest[:, _PLANE_RINGS]
     chosen = points[near[near >= 0]].astype(np.float64)
     if len(chosen) < _MIN_CELLS:
         return None
     rows = np.column_stack([chosen[:, :2], np.ones(len(chosen))])
     samples = np.random.default_rng(0).integers(0, len(chosen), (_TRIALS, 3))
-    x, y, z = np.moveaxis(
-        chosen[samples[:, 1:]] - chosen[samples[:, :1]], 2, 0
-    )  # of the other two points, from the first
-    area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]  # twice that of the triangle, in square metres
+    x, y, z = np.moveaxis(chosen[samples[:, 1:]] - chosen[samples[:, :1]], 2, 0)  # from the first point to the others
+    area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]  # twice the area of the triangle, square metres
     wide = np.abs(area) > 1.0
     x, y, z, area, corner = x[wide], y[wide], z[wide], area[wide], chosen[samples[wide, 0]]
     along_x = (z[:, 0] * y[:, 1] - z[:, 1] * y[:, 0]) / area
@@ -124,7 +122,7 @@ def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np
 def _support(
     planes: NDArray[np.float64], points: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return (P,) the sum of the weights, (N,), of those of (N, 3) points that are on each of (P, 3) planes."""
+    """Return, for each of (P, 3) planes, the sum of the (N,) weights of the (N, 3) points that are on it."""
     support = np.zeros(len(planes))
     for p in range(len(planes)):
         for i in range(len(points)):
@@ -151,10 +149,10 @@ def _ground(
     ground = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         s, r = sector[i], ring[i]
-        # A neighbour corrects a sector that went astray below or beside an object.
+        # The median with the neighbours corrects a sector that was followed onto an object.
         a, b, c = heights[s - 1, r], heights[s, r], heights[(s + 1) % _SECTORS, r]
         middle = max(min(a, b), min(max(a, b), c))
-        # The cell of a kerb holds points of the road, whose height it has, and of the pavement, which the next ring is on.
+        # The cell of a kerb has the height of the road, and holds points of the pavement too, which has the height of the next ring.
         step = min(max(heights[s, r - 1] if r else b, b, heights[s, min(r + 1, _RINGS - 1)]) - b, _KERB_M)
         ground[i] = -_BELOW_M < _above(points[i], plane) - middle < _ABOVE_M + step
     return ground
@@ -162,7 +160,7 @@ def _ground(
 
 @cached
 def _above(point: NDArray[np.float32], plane: NDArray[np.float64]) -> float:
-    """Return how far a point is above a plane, in metres along z."""
+    """Return the height of a point above a plane, metres along z."""
     return float(point[2] - (plane[0] * point[0] + plane[1] * point[1] + plane[2]))
 
 
@@ -177,7 +175,7 @@ def _follow(lowest: NDArray[np.float64], heights: NDArray[np.float64]) -> None:
         reached = min(distance, _FAR_M)
         step = lowest[r] - at
         limit = _STEP_M + _SLOPE * reached + (_ABOVE_M if last < 0 else 0.0)
-        # a road that rises goes on rising
+        # the slope of a road continues
         if abs(step) > limit and abs(step - slope * distance) > limit:
             continue
         for k in range(last + 1, r + 1):

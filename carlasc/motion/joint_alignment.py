@@ -1,13 +1,13 @@
-"""Joint alignment: the poses of many scans at once, so that what each scan saw of a surface lies on one plane.
+"""Joint alignment: the poses of many scans, estimated at once, so that the points of all scans on a surface lie on one plane.
 
-The points of each scan are grouped into the cells of a grid in the world. A group is a cluster: the sums of its points are all that is needed
-of them. The clusters that several scans have in one cell give a plane, if they are flat together. The poses then move so that the clusters
-come nearer to these planes, all poses in one linear system from which the places of the planes are eliminated. This is repeated, first with
-large cells and then with small ones. (Liu et al., "Efficient and Consistent Bundle Adjustment on Lidar Point Clouds", T-RO 2023, do it with
-the second derivative; with fixed normals the first one is enough, and the errors here are small.)
+The points of each scan are grouped into the cells of a grid in the world. A group is a cluster, and is kept as the sums of its points. The
+clusters of several scans in one cell give a plane if they are flat together. The poses then move the clusters towards these planes: all
+poses are in one linear system, from which the positions of the planes are eliminated. This is repeated, first with large cells, then with
+small ones. (Liu et al., "Efficient and Consistent Bundle Adjustment on Lidar Point Clouds", T-RO 2023, use the second derivative. With
+fixed normals the first one is enough, as the errors here are small.)
 
-A plane is made of the scans of one block, 60 after each other, and blocks overlap by half. So scans that are farther apart in time, and
-may have drifted, are not drawn to each other.
+A plane is made of the scans of one block, which are 60 consecutive ones, and blocks overlap by half. Scans that are farther apart in time,
+and may have drifted, are therefore not aligned to each other.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from carlasc.core.compiling import cached, jit
 from carlasc.motion.solving import principal_axes, solve_positive
 
 HALF_BLOCK = 30
-"""Half of the number of scans that planes are made of: all scans that are no farther apart are compared."""
+"""Half of the number of scans in a block. Scans that are at most so far apart are always compared."""
 
-_MIN_SCANS, _MIN_POINTS = 3, 8  # a plane has so many
-_WIDE_M2 = 0.02  # variance of a plane along its second axis: narrower things are lines
+_MIN_SCANS, _MIN_POINTS = 3, 8  # least numbers of a plane
+_WIDE_M2 = 0.02  # least variance of a plane along its second axis: narrower clusters are lines
 POINT_M = 0.03  # error of a point
-_EQUAL = 4  # points of a cluster beyond this number tell nothing new
+_EQUAL = 4  # greatest number of points of a cluster that count
 _INDEPENDENT = 0.1  # share of the clusters whose errors are independent
-_OUTLIER = 9.0  # squared distance to a plane, in standard deviations, from which a cluster counts less
-_DETERMINED = 0.003  # share of the planes, by weight, that must lie across a direction
+_OUTLIER = 9.0  # squared distance to a plane, in standard deviations, above which a cluster has less weight
+_DETERMINED = 0.003  # least share of the planes, by weight, that determine a direction
 _STEEP, _SLANTED = 0.8, 0.3  # |z| of the normals of ground, and of slopes
-_PER_DIRECTION = 300  # planes of each direction that are used: more of one add little
+_PER_DIRECTION = 300  # greatest number of planes per direction: more add little
 _SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
 _SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 _MIX = np.int64(-7046029254386353131)  # spreads the keys of cells over a hash table
-_BITS = 21  # of the number of a cell along an axis: cells that are so many apart have one key
+_BITS = 21  # of the index of a cell along an axis; indices that differ by 2^21 share a key
 
 
 class Pull(NamedTuple):
-    """How firmly poses are held to others: standard deviations of three metres and three radians.
+    """The prior of poses: standard deviations of a position, metres, and of a rotation, radians.
 
     Attributes:
-        to_given: of a pose about the given one.
-        to_neighbour: of the change of a pose about the change of the one before it.
+        to_given: of a pose about the given pose.
+        to_neighbour: of the change of a pose about the change of the previous one.
     """
 
     to_given: tuple[float, float] = (2.0, math.radians(4.0))
@@ -58,8 +58,8 @@ class Pass(NamedTuple):
     Attributes:
         cell_m: size of a cell.
         repeats: number of steps.
-        thick_m: greatest standard deviation of a plane across.
-        flat: greatest variance of a plane across, as a share of the one along its second axis.
+        thick_m: greatest standard deviation of a plane along its normal.
+        flat: greatest variance of a plane along its normal, as a share of the variance along its second axis.
     """
 
     cell_m: float
@@ -72,12 +72,12 @@ PASSES = (Pass(2.0, 5, 0.35, 0.1), Pass(1.0, 6, 0.12, 0.03))
 
 
 class Clusters(NamedTuple):
-    """What the scans of a block saw in each cell, sorted by cell.
+    """The clusters of the scans of a block, sorted by cell.
 
     Attributes:
         start: (G + 1,) the first cluster of each cell.
-        scan: (C,) the scan of each cluster, as its row in the poses.
-        sums: (C, 10) of its points, seen from its sensor, on the axes of the world.
+        scan: (C,) row in the poses of the scan of each cluster.
+        sums: (C, 10) sums of the points of each cluster, metres, from its sensor, on the axes of the world.
     """
 
     start: NDArray[np.int64]
@@ -92,14 +92,14 @@ def align(
     fixed: int = 0,
     pull: Pull = Pull(),  # noqa: B008 (a tuple)
 ) -> NDArray[np.float64]:
-    """Return the poses under which scans agree.
+    """Return the poses under which scans agree best.
 
     Args:
         points: (N, 3) of each scan, metres, frame of the sensor.
-        start: (F, 4, 4) world_T_sensor of the scans, in order of time, from which the poses are found: right within decimetres.
-        given: (F, 4, 4) what holds the poses where the scans do not determine them.
+        start: (F, 4, 4) initial world_T_sensor of the scans, in order of time, with errors of at most some decimetres.
+        given: (F, 4, 4) poses of the prior, which hold where the scans do not determine a pose.
         fixed: number of scans at the beginning whose poses stay.
-        pull: how firmly the given poses hold.
+        pull: the standard deviations of the prior.
 
     Returns:
         (F, 4, 4) world_T_sensor.
@@ -123,7 +123,7 @@ def align(
 def blocks(
     points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64], cell_m: float, shift: float
 ) -> list[Clusters]:
-    """Return the clusters of each block of scans, in cells that are shifted by a share of their size."""
+    """Return the clusters of each block of scans; `shift` moves the cells by a share of their size."""
     per_scan = [clusters(own, pose, cell_m, shift) for own, pose in zip(points, poses, strict=True)]
     found = []
     for first in range(0, max(len(points) - HALF_BLOCK, 1), HALF_BLOCK):
@@ -138,7 +138,7 @@ def blocks(
 
 
 def _choose(normals: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the planes that are used: of each of six directions about the same number, spread over the place."""
+    """Return the planes that are used: about the same number for each of six directions, spread over the scene."""
     found = np.flatnonzero(thickness >= 0)
     x, y, upright = normals[found, 0], normals[found, 1], np.abs(normals[found, 2])
     wall = 2 + 2 * (np.abs(x) > np.abs(y)) + (x * y > 0)
@@ -153,7 +153,7 @@ def _choose(normals: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDA
 def _determined(
     normals: NDArray[np.float64], thickness: NDArray[np.float64], chosen: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the normals without their parts along directions that the chosen planes do not determine, as along a tunnel."""
+    """Return the normals without their components along undetermined directions, as along a tunnel."""
     own = normals[chosen]
     weights = 1.0 / (POINT_M**2 + thickness[chosen])
     spread = (weights[:, None, None] * own[:, :, None] * own[:, None, :]).sum(axis=0)
@@ -167,7 +167,7 @@ def _determined(
 
 @jit
 def cell_key(x: float, y: float, z: float) -> int:
-    """Return a number for the cell that has a place, in sizes of a cell."""
+    """Return the key of the cell of a position, which is given in sizes of a cell."""
     low = (1 << _BITS) - 1
     return (math.floor(x) & low) << 2 * _BITS | (math.floor(y) & low) << _BITS | math.floor(z) & low
 
@@ -176,7 +176,7 @@ def cell_key(x: float, y: float, z: float) -> int:
 def clusters(
     points: NDArray[np.float32], pose: NDArray[np.float64], cell_m: float, shift: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return (C,) the keys of the cells in which a scan has points, and (C, 10) the sums of these points."""
+    """Return the (C,) keys of the cells in which a scan has points, and the (C, 10) sums of these points."""
     size = 16
     while size < 2 * len(points):
         size *= 2
@@ -201,7 +201,7 @@ def clusters(
 
 
 def planes(found: Clusters, poses: NDArray[np.float64], how: Pass) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (G, 3) the normals of the planes in cells, and (G,) their variances across, metres squared, -1 where there is no plane."""
+    """Return the (G, 3) normals of the planes in cells, and their (G,) variances along the normals, metres squared; -1 without a plane."""
     enough, covariances = spread_of(found, poses, _MIN_SCANS)
     values, vectors = principal_axes(covariances)
     flat = enough & (values[:, 0] < how.thick_m**2) & (values[:, 0] < how.flat * values[:, 1])
@@ -211,7 +211,7 @@ def planes(found: Clusters, poses: NDArray[np.float64], how: Pass) -> tuple[NDAr
 
 @cached
 def spread_of(found: Clusters, poses: NDArray[np.float64], scans: int) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return (G,) whether a cell has points of so many scans, and (G, 3, 3) the covariance of its points; a scan counts for some points only."""
+    """Return (G,) whether a cell has points of enough scans, and the (G, 3, 3) covariances of its points. The weight of a scan is limited."""
     start, scan, sums = found
     cells = len(start) - 1
     enough, covariances = np.zeros(cells, np.bool_), np.zeros((cells, 3, 3))
@@ -220,7 +220,7 @@ def spread_of(found: Clusters, poses: NDArray[np.float64], scans: int) -> tuple[
         first = start[g]
         if start[g + 1] - first < scans:
             continue
-        for a in range(3):  # sums from nearby, so that rounding is small
+        for a in range(3):  # sums are relative to a nearby centre, so that rounding is small
             center[a] = poses[scan[first], a, 3] + sums[first, 1 + a] / sums[first, 0]
         total[:] = 0.0
         for r in range(first, start[g + 1]):
@@ -250,7 +250,7 @@ def to_plane(
     normal: NDArray[np.float64],
     variance: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (C,) the distances of clusters from their plane, along its normal, and (C,) their weights, less for outliers."""
+    """Return the (C,) distances of clusters from their plane, along its normal, and their (C,) weights; outliers have less."""
     off, weight = np.empty(len(scan)), np.empty(len(scan))
     for i in range(len(scan)):
         off[i] = 0.0
@@ -280,9 +280,9 @@ def add_planes(
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
-    """Add what the chosen planes say about the poses of the scans from `fixed` on to the normal equations, their lower half.
+    """Add the chosen planes to the normal equations of the poses from `fixed` on: `right`, and the lower half of `matrix`.
 
-    `slopes` are the normals as far as motions along them are determined.
+    `slopes` are the normals without their undetermined components: see `_determined`.
     """
     for g in chosen:
         first, last, normal = found.start[g], found.start[g + 1], slopes[g]
@@ -315,7 +315,7 @@ def add_planes(
 
 @jit
 def _turn_between(one: NDArray[np.float64], other: NDArray[np.float64], axis: int) -> float:
-    """Return a number of the small rotation vector from the rotation of one pose to that of another, on the axes of the world."""
+    """Return one component of the small rotation vector between the rotations of two poses, on the axes of the world."""
     low, high = (axis + 1) % 3, (axis + 2) % 3
     value = 0.0
     for k in range(3):
@@ -332,7 +332,7 @@ def add_given(
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
-    """Add what the given poses say: each holds its own, and the change of one that of the next."""
+    """Add the prior to the normal equations: each pose is near the given one, and its change near the change of the previous one."""
     count = len(poses)
     change = np.empty((count, 6))
     for i in range(count):

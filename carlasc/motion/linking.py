@@ -1,6 +1,6 @@
-"""The segments of one actor, linked from scan to scan into chains.
+"""Linking: the segments of each actor, linked from scan to scan into chains.
 
-Scans are added to a `Linker` one after the other, and a chain ends when its actor was not seen for a while: memory does not grow with the
+Scans are added to a `Linker` in order of time. A chain ends when its actor was not seen for some time, so memory does not grow with the
 length of a drive.
 """
 
@@ -14,19 +14,19 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.motion.segments import LINKED_M_S, Segment, Standing
+from carlasc.motion.segments import LINKED_M_S, Segment, StaticPoints
 
 _MAX_GAP_S = 1.55  # an actor may be hidden for this time
 _NUMBERED_GAP_S = 10.0  # a numbered actor is the same after this time
-_BACKWARDS_S = 12.0  # an actor that starts is looked for in the scans of this time before
+_BACKWARDS_S = 12.0  # an actor that starts is searched for in the scans of this time before
 _FARTHEST_M, _MAX_SPEED_M_S = 15.0, 40.0  # fast first test: no actor is longer or faster
 _GATE_M = 1.5  # maximum distance of a segment from the prediction of its track
-_NUMBERED_GATE_M = 6.0  # the same for a numbered actor, of which another part may be seen
-_OTHER_CLASS = 1.0  # cost of a class that is not that of the sighting before: its label may be wrong
-_OTHER_NUMBER = 2.0  # cost of another number
+_NUMBERED_GATE_M = 6.0  # the same for a numbered actor, of which another part may be visible
+_OTHER_CLASS = 1.0  # cost of a change of class: labels may be wrong
+_OTHER_NUMBER = 2.0  # cost of a change of number
 _SOON_S = 1.0  # after more than this, a numbered actor may be anywhere
 _HISTORY_S = 0.3  # a velocity is estimated over at least this time, if the scans have no flow
-_STOPPING_M_S = 1.5  # slower actors may be standing in the next scan, or in the previous one
+_STOPPING_M_S = 1.5  # slower actors may be static in the next scan, or in the previous one
 
 _UNKNOWN = np.full(3, np.nan)  # a velocity
 
@@ -36,18 +36,18 @@ Chain = list[Segment]
 class Linker:
     """Links segments, scan by scan.
 
-    Numbered actors are linked by their numbers, where they can be, others by prediction: a segment continues the chain whose predicted
-    position is nearest to it, one of its class rather than another, also after the actor was hidden for some time.
+    Numbered actors are linked by their numbers where possible, and all other actors by prediction: a segment continues the chain whose
+    predicted position is nearest, also after the actor was hidden for some time. Chains of its class come first.
     """
 
     def __init__(self) -> None:
         self._chains: list[Chain] = []
         self._numbered: list[Chain] = []
-        self._seconds: dict[int, float] = {}  # of the frames that live chains may have
-        self._standing: deque[tuple[float, Standing]] = deque()
+        self._seconds: dict[int, float] = {}  # of the frames of open chains
+        self._static: deque[tuple[float, StaticPoints]] = deque()
 
     def add(
-        self, frame: int, seconds: float, segments: Sequence[Segment], standing: Standing | None = None
+        self, frame: int, seconds: float, segments: Sequence[Segment], static: StaticPoints | None = None
     ) -> list[Chain]:
         """Add the segments of the next scan, and return the chains that ended.
 
@@ -55,7 +55,7 @@ class Linker:
             frame: frame number.
             seconds: time of the scan.
             segments: the actors of the scan.
-            standing: its standing points, in which an actor that stops, for example at a crossing, is found until it continues.
+            static: its static points. An actor that stops, as at a crossing, is found in them until it continues.
         """
         self._seconds[frame] = seconds
         ended = self._end(seconds)
@@ -66,15 +66,15 @@ class Linker:
                 self._chains.append([*self._before(segment), segment])
             else:
                 chain.append(segment)
-        if standing is not None:
+        if static is not None:
             for chain in alive:  # a slow actor that was not found may have stopped
                 if chain[-1].frame < frame and _is_slow(chain[-1]):
-                    rest = standing.segment_at(chain[-1])
+                    rest = static.segment_at(chain[-1])
                     if rest is not None:
                         chain.append(rest)
-            self._standing.append((seconds, standing))
-            while self._standing[0][0] < seconds - _BACKWARDS_S:
-                self._standing.popleft()
+            self._static.append((seconds, static))
+            while self._static[0][0] < seconds - _BACKWARDS_S:
+                self._static.popleft()
         return ended
 
     def finish(self) -> list[Chain]:
@@ -84,7 +84,7 @@ class Linker:
         return rest
 
     def _end(self, seconds: float) -> list[Chain]:
-        """Remove and return the chains whose actors were not seen for too long."""
+        """Remove and return the chains whose actors were not seen for the maximum gap."""
         since = {frame: seconds - then for frame, then in self._seconds.items()}
         over = [chain for chain in self._chains if since[chain[-1].frame] > _MAX_GAP_S]
         over += [chain for chain in self._numbered if since[chain[-1].frame] > _NUMBERED_GAP_S]
@@ -95,7 +95,7 @@ class Linker:
         return over
 
     def _link_numbers(self, segments: list[Segment], seconds: float) -> None:
-        """Continue the chains of numbered actors: with their numbers where they can be, otherwise with what is where they should be."""
+        """Continue the chains of numbered actors: by number where possible, otherwise by predicted position."""
         linked: dict[int, int] = {}
         for i, j, is_other in self._candidates(segments, seconds) if segments and self._numbered else ():
             if i not in linked and not (is_other and j in linked.values()):
@@ -107,13 +107,13 @@ class Linker:
         self._numbered += [[segment] for i, segment in enumerate(segments) if i not in linked]
 
     def _candidates(self, segments: list[Segment], seconds: float) -> list[tuple[int, int, bool]]:
-        """Return which segment may continue which chain of a numbered actor, and whether it has another number; the best come first."""
+        """Return (segment, chain, whether the number changes) of the possible links of numbered actors, the best first."""
         elapsed = np.array([seconds - self._seconds[chain[-1].frame] for chain in self._numbered])
         velocity = np.stack([self._velocity(chain) for chain in self._numbered])
         velocity[elapsed > _SOON_S] = np.nan
         is_lost = np.isnan(velocity[:, 0])
-        way = np.where(is_lost, 0.0, velocity.T * elapsed).T
-        gap = _gaps(segments, [chain[-1] for chain in self._numbered], way)
+        shift = np.where(is_lost, 0.0, velocity.T * elapsed).T
+        gap = _gaps(segments, [chain[-1] for chain in self._numbered], shift)
         change = np.nan_to_num(_lengths(_velocities(segments)[:, None] - velocity))
         numbers = np.array([segment.instance for segment in segments])
         is_other = numbers[:, None] != np.array([chain[0].instance for chain in self._numbered])
@@ -124,7 +124,7 @@ class Linker:
         return [(i, j, bool(is_other[i, j])) for _, i, j in found]
 
     def _velocity(self, chain: Chain) -> NDArray[np.float64]:
-        """Return how fast an actor moved when it was seen last, (3,) m/s; NaN if that is not known."""
+        """Return the (3,) velocity, m/s, of an actor in its last segment; NaN if it is unknown."""
         last = chain[-1]
         if last.velocity is not None:
             return last.velocity
@@ -137,10 +137,10 @@ class Linker:
         return _UNKNOWN
 
     def _before(self, segment: Segment) -> Chain:
-        """Return segments from the scans in which the actor of a new chain was standing where the chain starts."""
+        """Return the segments of earlier scans in which the actor of a new chain was static at the start of the chain."""
         found: Chain = []
-        for _, standing in reversed(self._standing):
-            rest = standing.segment_at(segment) if _is_slow(segment) else None
+        for _, static in reversed(self._static):
+            rest = static.segment_at(segment) if _is_slow(segment) else None
             if rest is None:
                 break
             segment = rest
@@ -148,7 +148,7 @@ class Linker:
         return found[::-1]
 
     def _match(self, found: list[Segment], alive: list[Chain]) -> list[tuple[Segment, Chain | None]]:
-        """Pair the segments of one scan with the chains that they continue: nearest prediction first, each chain once."""
+        """Pair the segments of one scan with the chains that they continue: the nearest prediction first, each chain once."""
         if not found or not alive:
             return [(segment, None) for segment in found]
         last = [chain[-1] for chain in alive]
@@ -158,10 +158,10 @@ class Linker:
             _velocities(found)[:, None],
             _velocities(last),
         )
-        way = (before + velocity) / 2 * elapsed[:, None]
-        # The visible part of an actor changes, so the gap between boxes is compared first, and their centres have little weight.
-        gap, change = _gaps(found, last, way), _lengths(velocity - before)
-        offset = _lengths(np.stack([end.points.mean(axis=0) for end in last]) + way - centers)
+        shift = (before + velocity) / 2 * elapsed[:, None]
+        # The visible part of an actor changes: the gap between boxes counts most, and their centres have little weight.
+        gap, change = _gaps(found, last, shift), _lengths(velocity - before)
+        offset = _lengths(np.stack([end.points.mean(axis=0) for end in last]) + shift - centers)
         is_other = np.array([s.label for s in found])[:, None] != np.array([end.label for end in last])
         reach = _FARTHEST_M + _MAX_SPEED_M_S * elapsed
         possible = (gap <= _GATE_M) & (change <= LINKED_M_S)
@@ -173,7 +173,7 @@ class Linker:
 
 
 def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
-    """Return the second number of each first one that is paired: the cheapest (cost, first, second) come first, and each number has one partner."""
+    """Pair first and second numbers by (cost, first, second), the lowest cost first, each number once; return the second by the first."""
     taken: dict[int, int] = {}
     for _, i, j in sorted(costs):
         if i not in taken and j not in taken.values():
@@ -182,12 +182,12 @@ def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
 
 
 def _velocities(segments: list[Segment]) -> NDArray[np.float64]:
-    """Return (S, 3) the velocities of segments, m/s; NaN where the scan has no flow."""
+    """Return the (S, 3) velocities of segments, m/s, world; NaN where the scan has no flow."""
     return np.stack([_UNKNOWN if segment.velocity is None else segment.velocity for segment in segments])
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    lengths: NDArray[np.float64] = np.linalg.norm(vectors, axis=-1)  # by its axis: the same sum on every processor
+    lengths: NDArray[np.float64] = np.linalg.norm(vectors, axis=-1)  # the same sum on every processor
     return lengths
 
 
@@ -195,14 +195,14 @@ def _is_slow(segment: Segment) -> bool:
     return segment.velocity is not None and float(np.square(segment.velocity).sum()) < _STOPPING_M_S**2
 
 
-def _gaps(segments: list[Segment], ends: list[Segment], ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (S, C) the distances in metres between the bounding boxes of segments and of others, which move by (C, 3) or (S, C, 3); 0 if they overlap."""
+def _gaps(segments: list[Segment], ends: list[Segment], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (S, C) gaps, metres, between the bounding boxes of segments and of `ends` moved by (C, 3) or (S, C, 3); 0 if they overlap."""
     lower, upper = (np.stack([bound(s.points, axis=0) for s in segments])[:, None] for bound in (np.min, np.max))
-    lowest, highest = (np.stack([bound(s.points, axis=0) for s in ends]) + ways for bound in (np.min, np.max))
+    lowest, highest = (np.stack([bound(s.points, axis=0) for s in ends]) + shifts for bound in (np.min, np.max))
     return _lengths(np.maximum(np.maximum(lowest - upper, lower - highest), 0.0))
 
 
 def _together(parts: list[Segment]) -> Segment:
-    """Return the segment of all points of several segments of one actor in one scan; the first one says what it is."""
+    """Join several segments of one actor in one scan; label, number and velocity are those of the first."""
     members = np.concatenate([part.members for part in parts])
     return replace(parts[0], members=members, points=np.concatenate([part.points for part in parts]))

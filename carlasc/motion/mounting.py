@@ -1,9 +1,9 @@
-"""Where the sensor is in the frame whose poses are given, and how late these poses are: found by comparing motions.
+"""Mounting: the pose of the sensor in the frame of the given poses, and the delay of these poses, estimated from motions.
 
-Poses of an IMU, a camera or the rear axle move differently from those of the sensor in turns, and late poses while the speed or the rate of
-turning changes. The motions that the scans show (`joint_alignment`) are explained by one constant transform and one constant delay, by
-least squares, and each number gets a standard error. What a drive does not show has a large one: the height of the sensor on a flat road,
-every part of the arm on a straight one.
+In turns, poses of an IMU, a camera or the rear axle move differently from those of the sensor. Late poses differ while the speed or the turn
+rate changes. One constant transform and one constant delay are fitted to the motions of the aligned scans (`joint_alignment`) by least
+squares, with a standard error for each number. It is large for what a drive does not determine: the height of the sensor on a flat road,
+and its whole position on a straight road.
 """
 
 from __future__ import annotations
@@ -17,18 +17,16 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, multiply, rotations_of, slerp, small_motions
 from carlasc.motion.solving import solve_positive
 
-_LAGS = (2, 5, 10, 20)  # scans between the ends of the motions that are compared
+_LAGS = (2, 5, 10, 20)  # scans between the start and the end of a compared motion
 _ROUNDS = 8
-_ROBUST = 4.0  # squared residual, in standard deviations, from which a motion counts less
-_SAME = 12.0  # so many motions have about the same errors: those of one scan are in two for each lag, and neighbours are alike
-_LEAST = np.array(
-    [0.003, 0.003, 0.003, 2e-4, 2e-4, 2e-4]
-)  # standard deviation of a motion that scans show, metres and radians
-_STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # by which derivatives are computed
-_DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])  # greatest standard error of a known number
+_ROBUST = 4.0  # squared residual, in standard deviations, above which a motion has less weight
+_SAME = 12.0  # number of motions with about the same errors: a scan is in two per lag, and neighbours are similar
+_LEAST = np.array([0.003, 0.003, 0.003, 2e-4, 2e-4, 2e-4])  # least deviation of a motion: metres, radians
+_STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # steps of the numerical derivatives
+_DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])  # greatest error of a known value
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])  # smaller values need no correction
-_CERTAIN = 4.0  # nor do values of fewer standard errors
-_LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # of values
+_CERTAIN = 4.0  # values of fewer standard errors need none either
+_LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values
 _NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "late")
 
 
@@ -37,9 +35,9 @@ class Mounting:
     """The pose of the sensor in the frame whose poses are given, and the delay of these poses.
 
     Attributes:
-        values: (7,) x, y, z of the sensor in metres, its rotation vector in radians, and how late the poses are in seconds: a scan has the pose
-            that the file gives for a later time. Exact poses of the sensor have zeros.
-        errors: (7,) standard errors, infinite where nothing tells.
+        values: (7,) x, y, z of the sensor in metres, its rotation vector in radians, and the delay of the poses in seconds: a scan has the
+            pose that the file gives for a later time. Exact poses of the sensor have zeros.
+        errors: (7,) standard errors, infinite where a value is not determined.
     """
 
     values: NDArray[np.float64]
@@ -47,16 +45,16 @@ class Mounting:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """(7,) which values the drive shows."""
+        """(7,) bool: which values the drive determines."""
         return np.asarray(self.errors < _DETERMINED)
 
     @property
     def wrong(self) -> NDArray[np.bool_]:
-        """(7,) which values are certainly not zero, and large enough to matter."""
+        """(7,) bool: which values are certainly not zero, and large enough to matter."""
         return self.determined & (np.abs(self.values) > np.maximum(_RELEVANT, _CERTAIN * self.errors))
 
     def correct(self, poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (F, 4, 4) poses of the sensor from given ones and their times: by the values that are wrong. The first pose stays."""
+        """Return the (F, 4, 4) poses of the sensor from given poses and their (F,) times: the wrong values are applied. The first pose stays."""
         values = np.where(self.wrong, self.values, 0.0)
         moved = slerp(poses, seconds, seconds + values[6]) if values[6] else poses
         sensor = multiply(moved, _transform(values))
@@ -77,12 +75,12 @@ class Mounting:
 def find_mounting(
     poses: NDArray[np.float64], seconds: NDArray[np.float64], runs: Sequence[tuple[int, NDArray[np.float64]]]
 ) -> Mounting | None:
-    """Find what explains the motions that scans show; None if there are too few.
+    """Fit the mounting to the motions of aligned scans; None if there are too few motions.
 
     Args:
         poses: (F, 4, 4) given poses of all scans.
         seconds: (F,) their times, increasing.
-        runs: the poses that scans show, in any frame: the row of the first scan, and (K, 4, 4) the poses of this scan and those after it.
+        runs: the aligned poses, in any frame: the row of the first scan, and the (K, 4, 4) poses of this scan and the following ones.
     """
     parts = [_Motions.of(poses, seconds, first, found) for first, found in runs]
     if sum(len(part.given) for part in parts) < 2 * len(_LEAST) * len(_LAGS):
@@ -95,7 +93,7 @@ def find_mounting(
         scaled, slope = off / scale, slope / scale[:, None]
         weights = 1.0 / (1.0 + np.square(scaled) / _ROBUST)
         information = (weights[:, :, None, None] * slope[:, :, :, None] * slope[:, :, None, :]).sum(axis=(0, 1))
-        information += np.diag((10.0 * _DETERMINED) ** -2.0)  # what nothing tells stays zero
+        information += np.diag((10.0 * _DETERMINED) ** -2.0)  # values that are not determined stay zero
         right = -(weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=(0, 1))
         step = solve_positive(information.copy(), right)
         values = np.clip(values + step, -_LIMITS, _LIMITS)
@@ -105,13 +103,13 @@ def find_mounting(
 
 @dataclass(frozen=True)
 class _Motions:
-    """The given motions between scans of a run, and the poses that these scans show.
+    """The given motions between scans of a run, and the aligned poses of these scans.
 
     Attributes:
         given: (P, 4, 4) motions.
-        found: (K, 4, 4) poses that the scans show.
+        found: (K, 4, 4) aligned poses.
         seconds: (K,) times of these scans.
-        at: (P, 2) times of the ends of the motions.
+        at: (P, 2) times of the start and the end of each motion.
     """
 
     given: NDArray[np.float64]
@@ -137,10 +135,10 @@ class _Motions:
 
 
 def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (P, 6) the small motions from those that are expected of the sensor to those that scans show: metres, and rotation vectors.
+    """Return the (P, 6) differences from the expected motions of the sensor to the aligned ones: metres, and rotation vectors.
 
-    What scans show is taken at the times of the given poses, and not the other way around: it is smooth, and errors of the given poses
-    would become smaller between two of them.
+    The aligned poses are interpolated at the times of the given poses, not the reverse: they are smooth, and interpolation would reduce
+    the errors of the given poses.
     """
     mounted, between = _transform(values), []
     for part in parts:
@@ -150,7 +148,7 @@ def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArra
 
 
 def _transform(values: NDArray[np.float64]) -> Transform:
-    """Return the (4, 4) pose of the sensor that the first six values give."""
+    """Return the (4, 4) pose of the sensor from the first six values."""
     mounted = np.eye(4)
     x, y, z = values[3:6]
     angle = float(np.sqrt(x * x + y * y + z * z))

@@ -1,6 +1,6 @@
-"""Odometry: the poses of scans, estimated by KISS-ICP (Vizzo et al., RA-L 2023) through its Python API, and the points of a sweep.
+"""Odometry: the poses of scans, estimated by KISS-ICP (Vizzo et al., RA-L 2023) through its Python API, and deskewing.
 
-The points of a sweep are taken one after the other, by a sensor that moves meanwhile.
+The points of a scan are measured one after the other, while the sensor moves.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_points
 
 MIN_POINTS = 100  # scans with fewer points do not determine the motion
-_NEAR_M = 8.0  # ground farther away is left out
-_START = 10  # scans from which the motion at the start is found
+_NEAR_M = 8.0  # farther ground is left out
+_START = 10  # scans from which the motion at the start is estimated
 _PERIOD_S = 0.1  # between scans whose times are not known
 
 UsableScan = tuple[NDArray[np.floating], NDArray[np.floating] | None]
-"""(N, 3) points that `usable_points` chose, metres, and the (N,) time of each after the time of its frame, or None."""
+"""(N, 3) points that `usable_points` chose, metres, sensor frame, and the (N,) seconds of each after the time of its frame, or None."""
 
 
 def estimate_poses(
@@ -39,7 +39,7 @@ def estimate_poses(
     total: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
-    """Estimate the pose of every scan of a drive from its usable points, in the way that `follow_scans` describes.
+    """Estimate the pose of every scan of a drive from its usable points, with the method of `follow_scans`.
 
     Args:
         scans: (N, 3) points of each scan, metres, sensor frame, right-handed or left-handed; the poses are in the same frame.
@@ -75,22 +75,22 @@ def follow_scans(
     min_range_m: float = 0.0,
     voxel_size_m: float | None = None,
 ) -> Iterator[Transform]:
-    """Yield the pose of every scan of a drive, in order, as soon as it is known: that of the first when ten scans were read.
+    """Yield the pose of every scan of a drive, in order, as soon as it is known. The first one needs ten scans.
 
-    With the times of points, each scan is deskewed to the time of its frame by the motion between the two scans before it, and the poses
-    are those at the times of the frames. (KISS-ICP's own deskewing gives poses at the end of each scan, and is not used.) Without, scans
-    are taken to be instantaneous, as CarlaSC's are, or deskewed already, as SemanticKITTI's are. On simulated scans of a circle of 12 m at
-    8 m/s, 0.1 s each, the position after 15 m is off by 0.27 m without the times of points and by 0.05 m with them; on straight drives at
-    a steady speed they make no difference to the poses.
+    With the times of points, each scan is deskewed to the time of its frame by the motion between the two previous scans, and the poses are
+    for the times of the frames. (KISS-ICP's own deskewing gives poses at the end of each scan, and is not used.) Without them, scans count
+    as instantaneous (CarlaSC) or as deskewed (SemanticKITTI). On simulated scans of a circle of 12 m at 8 m/s, 0.1 s each, the error of the
+    position after 15 m is 0.27 m without the times of points and 0.05 m with them; on straight drives at a steady speed they do not change
+    the poses.
 
-    Far ground is left out, because its rings move with the sensor and hide the motion at the start of a drive. For the same reason the
-    first scans are registered forwards, then backwards, and then forwards again, with the motion that was found: a drive may start at any speed.
-    On a straight street without structure the distance driven is not determined, and the estimate is too short.
+    Far ground is left out: its rings move with the sensor and hide the motion at the start of a drive. For the same reason the first scans
+    are registered forwards, backwards, and forwards again with the estimated motion: a drive may start at any speed. On a straight street
+    without structure the driven distance is not determined, and the estimate is too short.
 
     Args:
         scans: the usable points of each scan, sensor frame, right-handed or left-handed; the poses are in the same frame.
         times: (F,) seconds, increasing: the time of each frame, needed with the times of points; None for frames at 10 Hz. A list may
-            grow while scans are taken, if it has the time of each scan by then.
+            grow during the run, if it has the time of a scan before the scan is read.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
         voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
@@ -105,12 +105,14 @@ def follow_scans(
     config: Any = import_extra("kiss_icp.config", "kitti").KISSConfig()
     config.data.deskew = False
     config.data.max_range, config.data.min_range = max_range_m, min_range_m
-    config.registration.max_num_threads = 1  # several add in another order each time, which changes the last digits
+    config.registration.max_num_threads = (
+        1  # several threads sum in a different order each time, which changes the last digits
+    )
     config.mapping.voxel_size = voxel_size_m if voxel_size_m is not None else max_range_m / 100.0
     scans = iter(scans)
     start = list(islice(scans, _START))
     motion = np.eye(4)
-    for back in (False, True):  # the motion at the start is found when the scans were followed to the end and back
+    for back in (False, True):  # forwards and backwards over the first scans
         odometry = pipeline.KissICP(config)
         for number in reversed(range(len(start))) if back else range(len(start)):
             motion = _register(odometry, start[number], motion, _elapsed(times, number), back=back)
@@ -125,7 +127,7 @@ def follow_scans(
 
 
 def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return (N,) which points of a scan odometry uses: those that are finite, and not far away on the ground."""
+    """Return (N,) bool, which (N, 3 or more) points of a scan odometry uses: finite ones that are not on far ground."""
     with np.errstate(invalid="ignore"):
         used = ~ground_points(points) | (np.hypot(points[:, 0], points[:, 1]) < _NEAR_M)
         return used & finite(points[:, :3])
@@ -134,12 +136,12 @@ def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 def _usable(
     scans: Iterable[NDArray[np.floating]], seconds: Iterable[NDArray[np.floating]] | None
 ) -> Iterator[UsableScan]:
-    """Yield the points of each scan that are used, and their seconds."""
+    """Yield the used points of each scan, and their seconds."""
     per_point = None if seconds is None else iter(seconds)
     sizes: list[int] = []
     for number, points in enumerate(scans):
         sizes.append(len(points))
-        if number and min(sizes) < MIN_POINTS:  # a single scan has not moved, however few points it has
+        if number and min(sizes) < MIN_POINTS:  # a single scan needs no points
             raise ArgumentError(
                 "scans",
                 expected=f"at least {MIN_POINTS} points in every scan",
@@ -156,17 +158,17 @@ def _usable(
 
 
 def _register(odometry: Any, scan: UsableScan, motion: Transform, elapsed_s: float, *, back: bool = False) -> Transform:
-    """Register a scan, with the motion since the scan before as its prediction.
+    """Register a scan; the previous motion is the prediction.
 
     Args:
         odometry: the pipeline.
         scan: points, and seconds.
-        motion: before_T_scan, as it was for the scan before.
+        motion: before_T_scan of the previous scan.
         elapsed_s: seconds between two scans.
-        back: whether scans are registered in reverse order, so that `motion` is that of later points to earlier ones.
+        back: whether scans are registered in reverse order, with `motion` from later points to earlier ones.
 
     Returns:
-        before_T_scan, as it is now.
+        before_T_scan of this scan.
     """
     points, seconds = scan
     if seconds is not None:
@@ -181,18 +183,18 @@ def _register(odometry: Any, scan: UsableScan, motion: Transform, elapsed_s: flo
 
 
 def _elapsed(times: Sequence[float] | NDArray[np.floating] | None, number: int) -> float:
-    """Return the seconds between a frame and the one before it; of the first frame, to the one after it."""
+    """Return the seconds from the previous frame to a frame; for the first frame, to the next one."""
     if times is None or len(times) < 2:
         return _PERIOD_S
     number = max(1, min(number, len(times) - 1))
     return float(times[number] - times[number - 1])
 
 
-_TICK_S = 1e-4  # points of so short a time have the same pose: at 30 m/s this is 3 mm
+_TICK_S = 1e-4  # points within this time share a pose: 3 mm at 30 m/s
 
 
 def ticks_of(seconds: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the (T,) different times among those of (N,) points, in seconds, rounded and increasing, and the (N,) place of each point's among them."""
+    """Return the (T,) distinct rounded times of (N,) points, seconds, increasing, and the (N,) index of the time of each point."""
     ticks, tick_of = distinct(np.round(np.asarray(seconds, np.float64) / _TICK_S).astype(np.int64))
     return np.asarray(ticks * _TICK_S, np.float64), tick_of
 
@@ -204,9 +206,9 @@ def move_each(
     """Move each point by the transform of its time.
 
     Args:
-        points: (N, 3 or more) metres, in the frame of the sensor at the time of each.
+        points: (N, 3 or more) metres, in the frame of the sensor at the time of each point.
         dst_T_then: (T, 4, 4) transforms.
-        tick_of: (N,) which of them is that of each point.
+        tick_of: (N,) index of the transform of each point.
 
     Returns:
         (N, 3) metres.

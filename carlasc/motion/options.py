@@ -1,4 +1,4 @@
-"""Where poses come from, and what tells which points move: the options that grids and conversions share."""
+"""The options of poses and of motion, which grids and conversions share."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class PoseOptions:
     """Where the poses of scans come from.
 
     Attributes:
-        source: "file": those of the data; "kiss-icp": estimated from the scans (needs the extra `kitti`); "auto": those of the data
-            where they exist, otherwise estimated. Estimated poses are written only where the sequence has none.
-        refine: whether poses are changed so that neighbouring scans agree. "auto": where scans come clearly nearer to each other by it,
-            which is measured in places that take no part; "always": also where they do not; "never". The given poses are not overwritten.
+        source: "file": the poses of the data; "kiss-icp": estimated from the scans (needs the extra `kitti`); "auto": the poses of the
+            data where they exist, otherwise estimated. Estimated poses are written only where the sequence has none.
+        refine: whether poses are changed so that neighbouring scans agree. "auto": where scans agree clearly better afterwards, measured
+            in places that take no part; "always": also where they do not; "never". The given poses are not overwritten.
         force: accept poses that are farther apart than a vehicle can move or turn, or under which scans do not overlap.
 
     Raises:
@@ -38,12 +38,12 @@ class PoseOptions:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """What tells which points move, and how.
+    """How moving points are found.
 
     Attributes:
         source: "boxes", "instances", "flow": the field of the sequence; "evidence": free space: a point moves if rays of other scans
-            passed through its place; "none": nothing is known to move, unless its class says so; "auto": the best of these fields that
-            exists, and "evidence" for what it misses, unless every point has flow.
+            passed through its place; "none": only points of moving classes move; "auto": the best of these fields that exists, and
+            "evidence" for what it misses, unless every point has flow.
         min_speed_m_s: slower actors count as static, in metres per second.
 
     Raises:

@@ -1,11 +1,11 @@
 """Paths: the positions and velocities of an actor, estimated from its points alone, for scans that number actors and have no flow.
 
-A sighting is the set of an actor's points in one scan. A passing car shows only its side for a long time, and registration of points to points
-slides along it. So a rigid actor is followed from scan to scan: its position is predicted from its motion so far, and then corrected by
-registering its points to the planes of everything that was seen of it before. The planes correct the prediction only in the directions that
-they determine: across a side, and along the path if the front or the back is visible.
+An observation is the set of an actor's points in one scan. A rigid actor is followed from scan to scan: its position is predicted from its
+motion so far, and corrected by registering its points to the planes of its earlier observations. The planes correct the prediction only in
+the directions that they determine: across a side, and along the path if the front or the back is visible. Registration of points to points
+would drift along the side of a passing car.
 
-Paths are smoothed, because an actor's acceleration is limited, while the error of a measured position is not.
+Paths are smoothed: the acceleration of an actor is limited, and the error of a measured position is not.
 """
 
 from __future__ import annotations
@@ -19,51 +19,51 @@ from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_
 from carlasc.motion.planes import Planes, nearest_points, pose_of, register
 from carlasc.motion.solving import fast_rows, headings_of, resample, smooth, smooth_at
 
-MIN_POINTS = 10  # sightings with fewer points are interpolated from the others
+MIN_POINTS = 10  # observations with fewer points are interpolated from the others
 _MAX_ACCELERATION_M_S2 = 6.0  # hard braking, a sharp bend
 _WALK_S = 0.6  # half width of the window in which a person walks with constant acceleration
 _DRIVE_S = 0.5  # the same for a vehicle
-_POINTS = 200  # number of points of a sighting that are compared
-_PAIRS, _APART_S = 12, 1.0  # pairs of sightings that are compared, and their distance in time
+_POINTS = 200  # number of points of an observation that are compared
+_PAIRS, _APART_S = 12, 1.0  # pairs of observations that are compared, and their distance in time
 _MAX_DISTANCE_M, _DOUBT_M = 0.5, 0.02
-_STANDING_M = 0.38  # sightings of a standing actor are closer to each other, although they show different sides of it
+_STATIC_M = 0.38  # observations of a static actor are closer to each other, although they show different sides
 _TURN_S = 1.0  # half width of the window in which directions correct registered turns
-_MIN_TURNS = 4  # the fewest directions that do
+_MIN_TURNS = 4  # least number of such directions
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
-_REGISTERED = 300  # number of points of a sighting that are registered to the model
-_SIDE_M = 0.14  # standard deviation, across a side, of points of this side alone
+_REGISTERED = 300  # number of points of an observation that are registered to the model
+_SIDE_M = 0.14  # standard deviation of the points of one side, across it
 # Error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in radians.
 _PREDICTED = np.array([0.2, 0.2, 0.01, 0.02])
 _UNKNOWN = 5.0  # factor of this error while the motion is not known yet
-_SLOW_M_S, _END_POINTS = 1.0, 20  # the ends of slower actors, and of sightings with fewer points, are not compared
+_SLOW_M_S, _END_POINTS = 1.0, 20  # slower actors and observations with fewer points are not compared by their ends
 _SAME_WIDTH_M = 0.12  # greatest difference of the widths of the same ends
-_GAIN = 0.3  # weight of the last correction in the motion
+_GAIN = 0.3  # weight of the last correction in the estimate of the motion
 
 
 def estimate_path(
-    sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], *, rigid: bool
+    observations: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], *, rigid: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Estimate the position, the velocity and the heading of an actor at each of its sightings.
+    """Estimate the position, the velocity and the heading of an actor at each of its observations.
 
-    Rigid actors are registered, so that it does not matter which side of them is seen. For people, who change their shape as they walk, the
-    centre of the points is followed. Sightings with too few points are interpolated. An actor that was seen once has velocity zero.
+    Rigid actors are registered, so the result does not depend on the side that is visible. People change their shape as they walk, so the
+    centre of their points is followed. Observations with too few points are interpolated. An actor with one observation has velocity zero.
 
     Args:
-        sightings: (M, 3) points of the actor at each time, metres, world.
+        observations: (M, 3) points of the actor at each time, metres, world.
         seconds: (F,) times, increasing.
         rigid: whether the actor keeps its shape.
 
     Returns:
         (F, 3) centre of the actor, metres, world, its (F, 3) velocity, m/s, world, and its (F,) heading, radians, unwrapped.
     """
-    counts = np.array([len(points) for points in sightings])
+    counts = np.array([len(points) for points in observations])
     enough = np.flatnonzero(counts >= max(1, min(MIN_POINTS, counts.max(initial=0))))
-    chosen, at, weights = [sightings[i] for i in enough.tolist()], seconds[enough], np.minimum(counts[enough], 200.0)
+    chosen, at, weights = [observations[i] for i in enough.tolist()], seconds[enough], np.minimum(counts[enough], 200.0)
     if len(enough) < 2:
         middle = np.mean(chosen[0], axis=0) if chosen else np.zeros(3)
         return np.tile(middle, (len(seconds), 1)), np.zeros((len(seconds), 3)), np.zeros(len(seconds))
-    best = best_sighting(chosen)
+    best = best_observation(chosen)
     path, turns = follow(chosen, at, best) if rigid else (middles_of(chosen), None)
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
     positions, velocities = resample(seconds, at, positions, _limit_acceleration(velocities, at, best))
@@ -72,56 +72,56 @@ def estimate_path(
     return positions, velocities, headings_by_turns(velocities, np.interp(seconds, at, turns), seconds)
 
 
-def is_standing(
-    sightings: Sequence[NDArray[np.float64]],
+def is_static(
+    observations: Sequence[NDArray[np.float64]],
     positions: NDArray[np.float64],
     headings: NDArray[np.float64],
     seconds: NDArray[np.float64],
 ) -> bool:
-    """Return whether sightings overlap as well without any motion as with the estimated motion; the arguments are those of `overlay`."""
-    still, moved = overlay(sightings, positions, headings, seconds)  # with a wrong path, they overlap badly too
-    return bool(np.isnan(still) or still < min(moved + _DOUBT_M, _STANDING_M))
+    """Return whether observations align as well without motion as with the estimated motion; the arguments are those of `misalignment`."""
+    still, moved = misalignment(observations, positions, headings, seconds)  # a wrong path aligns them badly too
+    return bool(np.isnan(still) or still < min(moved + _DOUBT_M, _STATIC_M))
 
 
-def overlay(
-    sightings: Sequence[NDArray[np.float64]],
+def misalignment(
+    observations: Sequence[NDArray[np.float64]],
     positions: NDArray[np.float64],
     headings: NDArray[np.float64],
     seconds: NDArray[np.float64],
-    slides_m: Sequence[float] = (0.0,),
+    shifts_m: Sequence[float] = (0.0,),
 ) -> tuple[float, ...]:
-    """Return how well the sightings of an actor overlay, about a second apart: the mean distance to the nearest point of another, in metres.
+    """Return how well observations of an actor, about a second apart, align: the mean distance to the nearest point of the other, metres.
 
     Args:
-        sightings: (M, 3) points of the actor at each time, metres, world.
+        observations: (M, 3) points of the actor at each time, metres, world.
         positions: (F, 3) estimated positions of the actor, metres, world.
         headings: (F,) estimated headings, radians.
         seconds: (F,) times, increasing.
-        slides_m: how far the sightings are slid along the heading, beside the estimated motion.
+        shifts_m: shifts along the heading that are added to the estimated motion, metres.
 
     Returns:
-        The distance without any motion, and that with the estimated motion and each slide. All are NaN for a single sighting.
+        The distance without motion, and the distance with the estimated motion and each shift. All are NaN for a single observation.
     """
-    thinned = [thin(points, _POINTS) for points in sightings]
+    thinned = [thin(points, _POINTS) for points in observations]
     body = [multiply(points - positions[i], rotation_z(headings[i])[:3, :3]) for i, points in enumerate(thinned)]
     found = []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:
-            slid = [_mean_distance(body[i] + np.array([slide, 0.0, 0.0]), body[j]) for slide in slides_m]
-            found.append([_mean_distance(thinned[i], thinned[j]), *slid])
-    return tuple(np.mean(found, axis=0).tolist()) if found else (np.nan,) * (1 + len(slides_m))
+            shifted = [_mean_distance(body[i] + np.array([shift, 0.0, 0.0]), body[j]) for shift in shifts_m]
+            found.append([_mean_distance(thinned[i], thinned[j]), *shifted])
+    return tuple(np.mean(found, axis=0).tolist()) if found else (np.nan,) * (1 + len(shifts_m))
 
 
 def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Return the mean distance of points to the nearest of others, in metres; distances above `_MAX_DISTANCE_M` count as this value."""
+    """Return the mean distance of points to the nearest of other points, metres. Each distance is at most `_MAX_DISTANCE_M`."""
     return float(np.minimum(np.sqrt(nearest_points(points, others)[1]), _MAX_DISTANCE_M).mean())
 
 
 def _limit_acceleration(
     velocities: NDArray[np.float64], seconds: NDArray[np.float64], best: int
 ) -> NDArray[np.float64]:
-    """Limit the change of (F, 3) velocities to what an actor can do, starting at the index `best` and going outwards."""
+    """Limit the change of (F, 3) velocities to the acceleration of an actor, from the index `best` outwards."""
     bounded = velocities.copy()
     for step, stop in ((1, len(seconds)), (-1, -1)):
         for index in range(best + step, stop, step):
@@ -136,17 +136,17 @@ def _limit_acceleration(
 def headings_by_turns(
     velocities: NDArray[np.float64], turns: NDArray[np.float64], seconds: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return headings that turn as registration shows, and are the direction of motion over a second or two.
+    """Return headings: registered turns, corrected by the directions of motion over a second or two.
 
-    A vehicle that enters a bend does not move where it points, so directions alone are wrong there; registered turns alone drift.
+    Directions of motion alone are wrong where a vehicle enters a bend, as it does not move where it points. Registered turns alone drift.
 
     Args:
         velocities: (F, 3) m/s.
-        turns: (F,) headings but for a constant, radians, as registration shows them.
+        turns: (F,) registered headings, except for a constant, radians.
         seconds: (F,) times, rising.
 
     Returns:
-        (F,) radians, unwrapped; those of `headings_of` if the actor is fast too seldom.
+        (F,) radians, unwrapped; those of `headings_of` if few velocities are fast enough.
     """
     fast, directions = fast_rows(velocities), headings_of(velocities)
     if len(fast) < _MIN_TURNS:
@@ -156,26 +156,26 @@ def headings_by_turns(
 
 
 def follow(
-    sightings: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], best: int
+    observations: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], best: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Register the sightings of a rigid, upright actor, starting with the best sighting and going outwards.
+    """Register the observations of a rigid, upright actor, from the best observation outwards.
 
     Args:
-        sightings: (M, 3) points of the actor at each time, metres, world.
+        observations: (M, 3) points of the actor at each time, metres, world.
         seconds: (F,) times, increasing.
-        best: index of the sighting to start with: see `best_sighting`.
+        best: index of the observation to start with: see `best_observation`.
 
     Returns:
-        (F, 3) centre of the actor, metres, world, and its (F,) heading, radians, 0 in the best sighting.
+        (F, 3) centre of the actor, metres, world, and its (F,) heading, radians, 0 in the best observation.
     """
-    counts = np.array([len(points) for points in sightings])
-    middles = middles_of(sightings)
+    counts = np.array([len(points) for points in observations])
+    middles = middles_of(observations)
     states = np.zeros((len(counts), 4))  # x, y, z, yaw of the actor at each time
     states[best, :3] = middles[best]
     initial = smooth_at(best, middles, seconds, np.minimum(counts, 200.0), _INITIAL_S)[1]
     motion = np.append(initial, 0.0)  # of x, y, z and yaw per second
     model = Planes()
-    model.add(sightings[best] - middles[best])
+    model.add(observations[best] - middles[best])
     seen = 0
     for step, stop in ((1, len(counts)), (-1, -1)):
         velocity, previous = motion, best
@@ -183,8 +183,8 @@ def follow(
             elapsed = seconds[index] - seconds[previous]
             predicted = states[previous] + velocity * elapsed
             error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
-            points = thin(sightings[index], _REGISTERED)
-            shifts = _shift_of_ends(sightings[previous], sightings[index], velocity[:3])
+            points = thin(observations[index], _REGISTERED)
+            shifts = _shift_of_ends(observations[previous], observations[index], velocity[:3])
             states[index] = register(points, model, predicted, error, states[previous, :3], shifts)
             velocity = velocity + max(_GAIN, 1 / (2 + seen)) * (states[index] - predicted) / elapsed
             if seen < _UNKNOWN and step == 1:
@@ -196,41 +196,41 @@ def follow(
 
 
 def corrections(
-    sightings: Sequence[NDArray[np.float64]],
+    observations: Sequence[NDArray[np.float64]],
     seconds: NDArray[np.float64],
     states: NDArray[np.float64],
     error: NDArray[np.float64],
     best: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return how the path of a rigid, upright actor has to change so that its sightings fit each other. The change is smooth.
+    """Return the smooth change of the path of a rigid, upright actor with which its observations align.
 
     Args:
-        sightings: (M, 3) points of the actor at each time, metres, world.
+        observations: (M, 3) points of the actor at each time, metres, world.
         seconds: (F,) times, increasing.
-        states: (F, 4) x, y, z in metres, and yaw in radians, world, as they are known so far.
+        states: (F, 4) x, y, z in metres, and yaw in radians, world, before the change.
         error: (4,) their standard deviation.
-        best: index of the sighting to start with: see `best_sighting`.
+        best: index of the observation to start with: see `best_observation`.
 
     Returns:
-        (F, 4) what is to be added to the states, and (F, 4) its change per second.
+        (F, 4) the change, to be added to the states, and (F, 4) its derivative per second.
     """
     laid, model = states.copy(), Planes()
     for index in [best, *range(best + 1, len(states)), *range(best - 1, -1, -1)]:
-        points = thin(sightings[index], _REGISTERED)
+        points = thin(observations[index], _REGISTERED)
         if index != best:
             laid[index] = register(points, model, states[index], error, states[index, :3], np.empty((0, 4)))
         model.add(transform_points(invert(pose_of(laid[index])), points))
-    counts = np.array([min(len(points), _REGISTERED) for points in sightings], np.float64)
+    counts = np.array([min(len(points), _REGISTERED) for points in observations], np.float64)
     return smooth(laid - states, seconds, counts, _DRIVE_S)
 
 
 def _shift_of_ends(
     before: NDArray[np.float64], now: NDArray[np.float64], velocity: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return (K, 4) the directions, world, in which two sightings show the same ends of an actor, and the shift of these ends, in metres.
+    """Return (K, 4) directions, world, in which two observations show the same ends of an actor, and the displacement of these ends, metres.
 
-    A flat face determines no motion along it, but its ends do: the rear of a car that drives ahead shows where the car is across the
-    street. If what is seen has the same width in both sightings, its ends are taken for the same.
+    A flat face determines no motion along it, but its ends do: the ends of the rear of a car ahead show its position across the street.
+    The ends are taken as the same if the visible part has the same width in both observations.
     """
     speed = float(np.hypot(velocity[0], velocity[1]))
     if speed < _SLOW_M_S or min(len(before), len(now)) < _END_POINTS:
@@ -245,7 +245,7 @@ def _shift_of_ends(
 
 
 def ends(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the 2 % and 98 % quantiles of (N,) values, as `np.quantile` does in ten times the time."""
+    """Return the 2 % and 98 % quantiles of (N,) values. `np.quantile` returns the same and takes ten times as long."""
     places = [(len(values) - 1) * quantile for quantile in (0.02, 0.98)]
     after = [min(int(place) + 1, len(values) - 1) for place in places]
     ranked = np.partition(values, [int(places[0]), after[0], int(places[1]), after[1]])
@@ -260,16 +260,16 @@ def _between(low: float, high: float, share: float) -> float:
     return low + (high - low) * share if share < 0.5 else high - (high - low) * (1 - share)
 
 
-def middles_of(sightings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return (F, 3) the middle of the bounds of the (M, 3) points of each sighting."""
-    return np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in sightings])
+def middles_of(observations: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return (F, 3) the middle of the bounds of the (M, 3) points of each observation."""
+    return np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in observations])
 
 
-def best_sighting(sightings: Sequence[NDArray[np.float64]]) -> int:
-    """Return the index of the sighting to start with: one with many points, more than one side, and not at an end of the track."""
-    counts = np.array([len(points) for points in sightings])
-    across = [_least_variance(points[:, :2]) if len(points) > 2 else 0.0 for points in sightings]
-    inner = np.arange(len(sightings))
+def best_observation(observations: Sequence[NDArray[np.float64]]) -> int:
+    """Return the index of the observation to start with: it has many points, shows more than one side, and is not at an end of the track."""
+    counts = np.array([len(points) for points in observations])
+    across = [_least_variance(points[:, :2]) if len(points) > 2 else 0.0 for points in observations]
+    inner = np.arange(len(observations))
     amid = np.minimum(np.minimum(inner, inner[::-1]) + 1, 5)
     return int(np.argmax(counts * np.clip(np.array(across) / _SIDE_M**2, 1e-6, 1.0) * amid))
 

@@ -1,10 +1,9 @@
-"""What was seen of a rigid actor so far: points with the planes around them, to which a sighting is registered.
+"""The model of a rigid actor: its points so far with the planes around them, and the registration of an observation to these planes.
 
-Registration finds the position and the turn of an upright actor at which its points lie on these planes.
+Registration finds the position and the yaw of an upright actor at which its points lie on the planes.
 
-The model grows with each sighting, and only what is new is computed then. The sums that give a plane are kept for each point, and new
-points enter the sums of their neighbours in the order in which a sum over all points takes them. So the planes have the same bits as
-if they were computed anew.
+The model grows with each observation, and only the new part is computed. Each point keeps the sums that give its plane. New points are
+added to the sums of their neighbours in the order of a sum over all points, so the planes have the same bits as if computed again.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotation_z, thin
 from carlasc.motion.solving import principal_axes, solve_positive
 
-_CELL_M, _POINTS = 0.15, 1200  # a model has one point per cell, and at most so many
+_CELL_M, _POINTS = 0.15, 1200  # a model has one point per cell, and at most this number of points
 _PLANE_M = 0.5  # radius of the neighbourhood in which planes are estimated
-_LINE_M = 0.06  # points with a smaller standard deviation across form a line, which has no plane
+_LINE_M = 0.06  # points with a smaller standard deviation across are a line and have no plane
 _SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
-_SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])  # where the last six are in a (3, 3) matrix
+_SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])  # positions of the last six in a (3, 3) matrix
 
 
 class Planes:
-    """The points of an actor that were seen so far, and the planes around them.
+    """The points of an actor so far, and the planes around them.
 
     Attributes:
         points: (M, 3) metres, actor frame.
@@ -36,11 +35,11 @@ class Planes:
     """
 
     def __init__(self) -> None:
-        """Start without points: some have to be added before others are paired with them."""
+        """Start without points: add some before the first registration."""
         self.points, self.normals, self._sums = np.empty((0, 3)), np.empty((0, 3)), np.empty((0, _SUMS))
 
     def add(self, points: NDArray[np.float64]) -> None:
-        """Add those of (N, 3) points, metres, actor frame, that are in cells without a point."""
+        """Add the (N, 3) points, metres, actor frame, that are in cells without a point."""
         joined, known = np.concatenate([self.points, points]), len(self.points)
         joined = joined[first_of_cells(np.floor(joined / _CELL_M).astype(np.int64))]
         if len(joined) > _POINTS:
@@ -58,12 +57,12 @@ class Planes:
 
     @property
     def in_order(self) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
-        """(M, 3) points, sorted along the axis on which they are spread most, the (M,) index of each in `points`, and this axis."""
+        """(M, 3) points, sorted along the axis of their largest extent, the (M,) index of each in `points`, and this axis."""
         return self._sorted, self._order, self._widest
 
 
 def covariances(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (N, 3, 3) covariances of the points whose (N, 10) sums `extend_sums` made."""
+    """Return the (N, 3, 3) covariances of points from their (N, 10) sums: see `extend_sums`."""
     counts, totals = sums[:, 0, None, None], sums[:, 1:4]
     return sums[:, _SQUARES] / counts - totals[:, :, None] * totals[:, None, :] / (counts * counts)
 
@@ -82,9 +81,9 @@ def extend_sums(model: NDArray[np.float64], known: int, radius: float, sums: NDA
 
     Args:
         model: (M, 3) points.
-        known: number of the first of them that are already in the sums of each other.
+        known: number of points, from the first, whose sums hold each other already.
         radius: of the neighbourhood.
-        sums: (M, 10) over the neighbours of each point, of the offsets from it: 1, x, y, z, xx, xy, xz, yy, yz and zz. Is changed.
+        sums: (M, 10) sums over the neighbours of each point, of the offsets from it: 1, x, y, z, xx, xy, xz, yy, yz, zz. Is changed.
 
     Returns:
         (M,) whether the sums of a point changed.
@@ -118,20 +117,20 @@ def nearest_within(
     axis: int,
     squared: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair points with the nearest points of a model that are sorted along an axis: those that are nearer than a distance.
+    """Pair each point with the nearest point of a model within a distance; the model is sorted along an axis.
 
-    The search goes from the place of a point on the axis outwards, until all others are farther away along this axis alone.
+    The search starts at the position of a point on the axis and goes outwards, until all other points are too far along this axis alone.
 
     Args:
         points: (N, 3) points.
-        pose: (4, 4) from the frame of the model to that of the points, rigid.
+        pose: (4, 4) from the frame of the model to the frame of the points, rigid.
         model: (M, 3) points, sorted.
-        order: (M,) index of each of them before it was sorted.
-        axis: along which they are sorted.
-        squared: the square of the distance that pairs must be nearer than.
+        order: (M,) index of each point of the model before sorting.
+        axis: the axis of sorting.
+        squared: square of the greatest distance of a pair.
 
     Returns:
-        (P,) indices of points that have a pair, increasing, and (P,) indices of the points of the model, the lowest of several.
+        (P,) indices of points that have a pair, increasing, and (P,) indices of their points of the model; the lowest index of equally near ones.
     """
     rows, nearest, moved = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(3)
     place, count, last = np.empty(3), 0, len(model) - 1
@@ -171,7 +170,7 @@ def nearest_within(
 def nearest_points(
     points: NDArray[np.float64], model: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the index of the model point nearest to each point, and the squared distance, by comparing all pairs."""
+    """Return (N,) the index of the model point nearest to each point, and (N,) the squared distance, by comparing all pairs."""
     index, squared = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
     for i in range(len(points)):
         for j in range(len(model)):
@@ -184,12 +183,12 @@ def nearest_points(
 
 _ITERATIONS = 8
 _FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # maximum distance of paired points; it decreases with each iteration
-_DEVIATIONS = 2.0  # the first reach is at least so many standard deviations of the prediction
+_DEVIATIONS = 2.0  # least first reach, in standard deviations of the prediction
 _POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and the number of points with independent errors
 _VARIANCE_M2 = _POINT_M**2
 _ROBUST = 0.3  # fraction of the reach; pairs farther from their plane get less weight
-_ENDS_M = 0.12  # error of the shift of the ends of what is seen
-_FEWEST = 3  # pairs that count
+_ENDS_M = 0.12  # error of the displacement of the ends of the visible part
+_FEWEST = 3  # least number of pairs that count
 
 
 def pose_of(state: NDArray[np.float64]) -> Transform:
@@ -210,12 +209,12 @@ def register(
     """Return the state, near the predicted one, that registers points to the planes of the model.
 
     Args:
-        points: (N, 3) points of the sighting, metres, world.
-        model: what was seen of the actor so far.
+        points: (N, 3) points of the observation, metres, world.
+        model: the points of the actor so far, and their planes.
         predicted: (4,) predicted state: x, y, z in metres, and yaw in radians.
         error: (4,) standard deviation of the prediction.
-        previous: (3,) position at the sighting before, metres, world.
-        shifts: (K, 4) directions in which the ends of what is seen moved since then, and how far, in metres.
+        previous: (3,) position at the previous observation, metres, world.
+        shifts: (K, 4) directions in which the ends of the visible part moved since then, and their displacement, metres.
     """
     state: NDArray[np.float64] = _register(
         points, *model.in_order, model.points, model.normals, predicted, error, previous, shifts
@@ -236,7 +235,7 @@ def _register(
     previous: NDArray[np.float64],
     shifts: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """As `register`, with the model's (M, 3) points and normals, and what `Planes.in_order` gives."""
+    """As `register`, with the (M, 3) points and normals of the model, and the results of `Planes.in_order`."""
     state, prior = predicted.copy(), 1 / (error * error)
     first_reach = max(_FIRST_REACH_M, _DEVIATIONS * max(error[0], error[1]))
     pose, slope = np.eye(4), np.empty(4)
@@ -246,14 +245,14 @@ def _register(
         pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1] = cos, -sin, sin, cos
         pose[:3, 3] = state[:3]
         information, pull = np.diag(prior), prior * (predicted - state)
-        for way in shifts:  # the ends of what is seen are measured as well
-            left = way[3]
+        for shift in shifts:  # the ends of the visible part are measured too
+            left = shift[3]
             for a in range(3):
-                left += way[a] * (previous[a] - state[a])
+                left += shift[a] * (previous[a] - state[a])
             for a in range(3):
-                pull[a] += way[a] * left / _ENDS_M**2
+                pull[a] += shift[a] * left / _ENDS_M**2
                 for b in range(3):
-                    information[a, b] += way[a] * way[b] / _ENDS_M**2
+                    information[a, b] += shift[a] * shift[b] / _ENDS_M**2
         rows, nearest = nearest_within(points, pose, ordered, order, axis, reach * reach)
         scale, share = max(2 * _POINT_M, _ROBUST * reach), min(1.0, _INDEPENDENT / max(len(rows), 1))
         for p in range(len(rows) if len(rows) >= _FEWEST else 0):

@@ -1,9 +1,9 @@
 """Refined poses: the given poses of a drive, changed so that scans within some seconds of each other agree.
 
-Scans come in order and only some hundred are kept. A stretch of them is aligned together (`joint_alignment`), with the end of the stretch
-before it, whose poses are final, and the beginning of the one after it. A quarter of the places that the scans saw takes no part in this:
-there it is measured how far neighbouring scans are from each other's surfaces, before and after. A stretch in which that does not become
-clearly less keeps the motion that was given. Over longer times than a stretch the given poses hold, weakly.
+Scans are read in order, and some hundred are kept. A stretch of scans is aligned together (`joint_alignment`), with the end of the previous
+stretch, whose poses are final, and the beginning of the next one. A quarter of the places takes no part in the alignment. There, the
+distance of each scan from the surfaces of its neighbours is measured, before and after. A stretch keeps its given motion unless this
+distance decreases clearly. Over longer times than a stretch, the given poses have a weak weight.
 """
 
 from __future__ import annotations
@@ -48,30 +48,30 @@ _FORMATS = {
     "fits": ArrayFormat(("|b1",), (None,)),
 }
 _STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
-_THIN_M = 0.3  # one point is used of each cell of this size
-_PLACE_M, _PLACES = 2.0, 4  # one of so many cells of this size takes no part, and is measured
-_MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that do not fit are thick
-_FAR_M = 1e5  # points that are farther away are no returns
+_THIN_M = 0.3  # one point per cell of this size is used
+_PLACE_M, _PLACES = 2.0, 4  # size of places, and one of so many is measured instead of aligned
+_MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that disagree are thick
+_FAR_M = 1e5  # farther points are no returns
 
-# Scans must come nearer to each other by a factor and a distance, or by less if it is so many standard errors; so many scans have one error.
+# The distance must decrease by a factor and a length, or by less if the gain is so many standard errors; so many scans share an error.
 _BETTER, _NEARER_M = 0.9, 0.003
 _SURE, _SURELY_M, _ERRORS, _ALIKE = 0.95, 0.0005, 2.5, 5
-# A greater change of the motion from one scan to the next, or over some scans, is no refinement: such poses are of another drive.
+# Greatest change of the motion from one scan to the next, and over some scans: poses of another drive need more.
 _FARTHEST_M, _FARTHEST_RAD = 0.7, np.deg2rad(3.0)
 _SPAN, _OFF_M, _OFF_RAD = 10, 1.0, np.deg2rad(5.0)
-# Nor do poses fit under which too few of the walls that single scans see are flat with what others saw there.
+# Poses fit if enough walls of single scans are flat together with the points of other scans there.
 _WALL_M, _WALL_POINTS = 2.0, 12  # size of the cells, and the fewest points of a wall
-_TALL_M2, _WIDE_M2 = 0.08, 0.04  # its variances upwards, and along its second axis
-_FEW_WALLS, _COMMON = 7, 0.4  # fewer walls per scan tell nothing; and the share of them
+_TALL_M2, _WIDE_M2 = 0.08, 0.04  # least variances of a wall upwards, and along its second axis
+_FEW_WALLS, _COMMON = 7, 0.4  # with fewer walls per scan, poses fit; and the least share of common walls
 
 
 @dataclass(frozen=True)
 class ThinnedScan:
-    """The points of one scan that poses are refined with.
+    """The points of one scan for the refinement of poses.
 
     Attributes:
-        used: (N, 3) float32, metres, frame of the sensor: those that are aligned.
-        measured: (M, 3) float32: those in places that take no part.
+        used: (N, 3) float32, metres, sensor frame: points that are aligned.
+        measured: (M, 3) float32, metres, sensor frame: points in places that take no part.
     """
 
     used: NDArray[np.float32]
@@ -79,7 +79,7 @@ class ThinnedScan:
 
     @classmethod
     def of(cls, points: NDArray[np.float32], world_T_sensor: NDArray[np.float64]) -> Self:
-        """Choose from the (N, 3) points of a scan, metres, those that are static as far as anybody knows."""
+        """Choose from the (N, 3) points of a scan, metres, sensor frame, which should be static."""
         near = points[(np.abs(points) < _FAR_M).all(axis=1)]
         chosen = near[first_of_cells(np.floor(near / np.float32(_THIN_M)).astype(np.int64))]
         x, y, z = np.floor(transform_points(world_T_sensor, chosen) / _PLACE_M).astype(np.int64).T
@@ -94,11 +94,11 @@ class RefinedPoses:
     Attributes:
         given: (F, 4, 4) float64 world_T_sensor of each scan before.
         poses: (F, 4, 4) float64 world_T_sensor of each scan.
-        before_m: (F,) how far each scan is from the surfaces that its neighbours saw, under the given poses, in metres; NaN where nothing tells.
+        before_m: (F,) distance of each scan from the surfaces of its neighbours, under the given poses, metres; NaN where it is unknown.
         after_m: (F,) the same under the refined poses.
-        refined: (F,) bool, the scans whose motion is not the given one.
-        fits: (F,) bool, whether walls that one scan saw are walls together with the other scans, or nothing tells; where they are not,
-            the poses are of another drive, or of other frames, and are not refined.
+        refined: (F,) bool, the scans with a changed motion.
+        fits: (F,) bool, False where walls of one scan are not flat together with the other scans: such poses belong to another drive or
+            to other frames, and are not refined.
     """
 
     given: NDArray[np.float64]
@@ -109,37 +109,37 @@ class RefinedPoses:
     fits: NDArray[np.bool_]
 
     def changes(self) -> NDArray[np.float64]:
-        """Return (F - 1, 6) by how much the motion from each scan to the next one differs from the given one: metres, then radians, frame of the sensor."""
+        """Return the (F - 1, 6) changes of the motions from each scan to the next one: metres, then radians, sensor frame."""
         return _changes(self.given, self.poses)
 
     @property
     def disagreements_m(self) -> tuple[float | None, float | None]:
-        """The means of `before_m` and `after_m`; None where nothing tells."""
+        """The means of `before_m` and `after_m`; None where they are unknown."""
         before, after = (None if math.isnan(m := finite_mean(v)) else m for v in (self.before_m, self.after_m))
         return before, after
 
     def left(self, frames: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
-        """Return the first and the last frame of each stretch that was not refined; `frames` are the numbers of the scans."""
+        """Return the first and the last frame of each stretch that was not refined; `frames` are the (F,) numbers of the scans."""
         return tuple((int(frames[a]), int(frames[b])) for a, b, changed in self.stretches() if not changed)
 
     def stretches(self) -> Iterator[tuple[int, int, bool]]:
-        """Yield (first, last, whether refined) of runs of scans, as rows."""
+        """Yield (first row, last row, whether refined) of each run of scans."""
         bounds = [0, *(np.flatnonzero(np.diff(self.refined)) + 1).tolist(), len(self.refined)]
         for first, end in pairwise(bounds):
             yield first, end - 1, bool(self.refined[first])
 
     def to_bytes(self, key: str) -> bytes:
-        """Return all of it as an `.npz` file; `key` says what it was made from."""
+        """Return the content of an `.npz` file with all of it. `key` is a digest of its source."""
         file = io.BytesIO()
         np.savez(file, key=np.frombuffer(key.encode(), np.uint8), **vars(self))
         return file.getvalue()
 
     @classmethod
     def from_bytes(cls, data: bytes, where: str) -> tuple[Self, str]:
-        """Return what a file holds, and the key of what it was made from.
+        """Return the poses of a file, and the key of their source.
 
         Raises:
-            FormatError: it is no such file; the message starts with `where`.
+            FormatError: the file is not valid; the message starts with `where`.
         """
         with open_npz(data, where) as file:
             key = file.read("key", ArrayFormat(("u1",), (None,))).tobytes()
@@ -159,14 +159,14 @@ def refine_poses(
 ) -> RefinedPoses:
     """Refine the poses of a drive.
 
-    Where scans do not determine a direction, as along a tunnel, the given poses hold in this direction. Movers among the points do little
-    harm: what passes through a cell is no plane.
+    In directions that the scans do not determine, as along a tunnel, the given poses hold. Moving actors among the points do little harm:
+    their points in a cell form no plane.
 
     Args:
-        scans: the scans, in order of time; they are taken as they are needed.
-        given: (F, 4, 4) float64 world_T_sensor of each of them.
-        always: whether stretches are refined in which scans do not come nearer to each other, too.
-        steps: called with the number of scans that were taken since the last call.
+        scans: the scans, in order of time; read one after the other.
+        given: (F, 4, 4) float64 world_T_sensor of the scans.
+        always: whether stretches are also refined where scans do not agree better afterwards.
+        steps: called with the number of scans that were read since the last call.
     """
     count, poses = len(given), given.copy()
     before, after, refined = np.full(count, np.nan), np.full(count, np.nan), np.zeros(count, np.bool_)
@@ -183,7 +183,7 @@ def refine_poses(
                 steps(1)
         first = start
         near, rows = slice(start, last), slice(begin - start, end - start)
-        if refined.any():  # the correction of the scan before goes on
+        if refined.any():  # start with the correction of the previous scan
             poses[begin:last] = multiply(poses[begin - 1], invert(given[begin - 1]), given[begin:last])
         held = poses[near].copy()
         found = align([scan.used for scan in kept], held, given[near], begin - start)
@@ -210,7 +210,7 @@ def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
 
 
 def _fit(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> bool:
-    """Return whether most walls that single scans see are flat together with what the other scans saw there, or there are few walls."""
+    """Return whether enough walls of single scans are flat together with the other scans there; True if there are few walls."""
     walls = common = 0
     for found in blocks(points, poses, _WALL_M, shift=0.0):
         alone = Clusters(np.arange(len(found.scan) + 1), found.scan, found.sums)
@@ -235,10 +235,10 @@ def _changes(given: NDArray[np.float64], found: NDArray[np.float64], span: int =
 
 
 def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
-    """Return whether no motion changed by more than the poses of a drive can be wrong."""
+    """Return whether no motion changed by more than the greatest error of the poses of a drive."""
     off = found[:, :3, 3] - held[:, :3, 3]
     for span, most_m, most_rad in ((1, _FARTHEST_M, _FARTHEST_RAD), (_SPAN, _OFF_M, _OFF_RAD)):
-        moved = np.sqrt(np.square(off[span:] - off[:-span]).sum(axis=1))  # in the world: a turn moves nothing
+        moved = np.sqrt(np.square(off[span:] - off[:-span]).sum(axis=1))  # in the world
         turned = np.sqrt(np.square(_changes(held, found, span)[:, 3:]).sum(axis=1))
         if (moved > most_m).any() or (turned > most_rad).any():
             return False
@@ -246,16 +246,16 @@ def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
 
 
 def finite_mean(values: NDArray[np.float64]) -> float:
-    """Return the mean of the values that are finite; NaN if none is."""
+    """Return the mean of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else math.nan
 
 
 def disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F,) how far each scan is from the planes of the others, metres, root mean square; NaN where nothing tells.
+    """Return the (F,) root mean square distances of each scan from the planes of the others, metres; NaN where there are none.
 
     Args:
-        points: (N, 3) of each scan, metres, frame of the sensor.
+        points: (N, 3) of each scan, metres, sensor frame.
         poses: (F, 4, 4) world_T_sensor.
     """
     sums = np.zeros((len(points), 2))
@@ -274,7 +274,7 @@ def _add_distances(
     thickness: NDArray[np.float64],
     result: NDArray[np.float64],
 ) -> None:
-    """Add (F, 2) the squared distances of the clusters of each scan to the planes of the others, and their number."""
+    """Add to `result`, (F, 2), the squared distances of the clusters of each scan from the planes of the others, and their number."""
     for g in range(len(thickness)):
         if thickness[g] < 0:
             continue

@@ -1,4 +1,4 @@
-"""Segments: the points of one actor in one scan, separated by flow or by instance numbers."""
+"""Segments: the points of one actor in one scan, grouped by flow or by instance numbers."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.core.scans import Scan
 
-MIN_SPEED_M_S = 0.3  # slower points count as standing, because estimated flow is never exactly zero
+MIN_SPEED_M_S = 0.3  # slower points count as static: estimated flow is never exactly zero
 _CELL_M = 0.4  # size of the cells in which moving points are grouped
-# Cells of one actor are closer than this along its motion, so that a pole in front does not split a vehicle. So are points with one number.
+# Cells of one actor, and points with one number, are closer than this along its motion: a pole in front does not split a vehicle.
 _REACH_M = 2.0
-_BESIDE_M = 1.0  # and closer than this across: vehicles in the next lane often have the same velocity
-_SAME_VELOCITY_M_S = 0.5  # flow differs by less within one rigid actor
+_BESIDE_M = (
+    1.0  # cells of one actor are closer than this across: vehicles in the next lane often have the same velocity
+)
+_SAME_VELOCITY_M_S = 0.5  # greatest difference of flow within one rigid actor
 
 LINKED_M_S = 2.0  # maximum change of an actor's velocity between two segments
 
@@ -27,12 +29,12 @@ class Segment:
 
     Attributes:
         frame: frame number.
-        label: class of the actor, which is that of most of its points.
+        label: most frequent class of its points.
         members: (M,) int64 indices of the points in the scan.
         points: (M, 3) float64 metres, world.
         velocity: (3,) m/s, world; None if the scan has no flow.
         instance: number of the actor; 0 if actors are not numbered.
-        origin: (3,) metres, world: the sensor that saw the points.
+        origin: (3,) position of the sensor, metres, world.
     """
 
     frame: int
@@ -51,7 +53,7 @@ class Segment:
 
 
 def is_fast(flow: NDArray[np.floating], min_speed_m_s: float = MIN_SPEED_M_S) -> NDArray[np.bool_]:
-    """Return which of (N, 3) velocities, m/s, are faster than a speed. A velocity that is not finite is not."""
+    """Return (N,) bool, which of (N, 3) velocities, m/s, are finite and faster than a speed."""
     speed2 = np.square(np.asarray(flow, np.float64)).sum(axis=1)
     return np.isfinite(speed2) & (speed2 > min_speed_m_s**2)
 
@@ -59,16 +61,16 @@ def is_fast(flow: NDArray[np.floating], min_speed_m_s: float = MIN_SPEED_M_S) ->
 def segment_by_flow(
     frame: int, scan: Scan, world_T_sensor: Transform, *, min_speed_m_s: float = MIN_SPEED_M_S
 ) -> list[Segment]:
-    """Group the moving points of a scan into actors: points that are close together and have one velocity.
+    """Group the moving points of a scan into actors: the points of one actor are close together and have one velocity.
 
-    Two actors side by side with the same velocity may become one segment, which moves in the same way. Classes do not separate actors,
+    Two actors side by side with the same velocity may become one segment, which has their velocity. Classes do not separate actors,
     because labels may be wrong.
 
     Args:
         frame: frame number.
-        scan: points with labels and flow, m/s over ground; points whose flow is not finite count as standing.
+        scan: points with labels and flow, m/s over ground; points whose flow is not finite count as static.
         world_T_sensor: (4, 4) pose of the scan.
-        min_speed_m_s: slower points count as standing.
+        min_speed_m_s: slower points count as static.
 
     Returns:
         Segments in the order of their first point.
@@ -98,19 +100,19 @@ def segment_by_flow(
 def segment_by_instances(
     frame: int, scan: Scan, world_T_sensor: Transform, *, ground: Collection[int] = ()
 ) -> list[Segment]:
-    """Return the numbered actors of a scan, moving or not. Their tracks show which of them move.
+    """Return the numbered actors of a scan, moving or not. Their tracks decide which of them move.
 
-    A number that is in several places, metres apart, or moves in several ways, has a segment for each: one of them may be another actor
-    with a wrong number.
+    A number at several places, metres apart, or with several velocities, has a segment for each: one of them may be another actor with a
+    wrong number.
 
     Args:
         frame: frame number.
         scan: points with labels and instances.
         world_T_sensor: (4, 4) pose of the scan.
-        ground: ids of the ground classes; their points belong to no actor, whatever their number.
+        ground: ids of the ground classes. Their points belong to no actor, even with a number.
 
     Returns:
-        Segments in the order of their numbers' first points.
+        Segments in the order of the first point of each number.
     """
     if scan.instances is None or scan.labels is None:
         return []
@@ -130,15 +132,15 @@ def segment_by_instances(
 
 
 @dataclass(frozen=True)
-class Standing:
-    """The standing points of a scan that may belong to an actor that moves at other times.
+class StaticPoints:
+    """The static points of a scan that may belong to an actor that moves at other times.
 
     Attributes:
         frame: frame number.
         members: (M,) int64 indices of the points in the scan.
         labels: (M,) their classes.
         points: (M, 3) float64 metres, world.
-        origin: (3,) metres, world: the sensor that saw the points.
+        origin: (3,) position of the sensor, metres, world.
     """
 
     frame: int
@@ -148,12 +150,12 @@ class Standing:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
-    def empty(cls, frame: int) -> Standing:
+    def empty(cls, frame: int) -> StaticPoints:
         """Return an object without points."""
         return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
 
     def segment_at(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
-        """Return the standing points of a segment's class at its place; None if there are much fewer than in the segment."""
+        """Return the static points of a segment's class at its position; None if the segment has far more points."""
         lower, upper = segment.points.min(axis=0) - margin_m, segment.points.max(axis=0) + margin_m
         own = np.flatnonzero(
             (self.labels == segment.label) & ((self.points > lower) & (self.points < upper)).all(axis=1)
@@ -163,27 +165,27 @@ class Standing:
         return Segment(self.frame, segment.label, self.members[own], self.points[own], np.zeros(3), origin=self.origin)
 
 
-def standing_points(
+def static_actor_points(
     frame: int, scan: Scan, world_T_sensor: Transform, labels: Collection[int], *, min_speed_m_s: float = MIN_SPEED_M_S
-) -> Standing:
-    """Return the points of a scan that stand although they are of classes that may move; none without flow and labels.
+) -> StaticPoints:
+    """Return the static points of a scan that are of movable classes; none without flow and labels.
 
     Args:
         frame: frame number.
         scan: points, with labels and flow.
         world_T_sensor: (4, 4) pose of the scan.
-        labels: ids of the classes that may move.
-        min_speed_m_s: slower points stand.
+        labels: ids of the movable classes.
+        min_speed_m_s: slower points are static.
     """
     if scan.flow is None or scan.labels is None:
-        return Standing.empty(frame)
+        return StaticPoints.empty(frame)
     members = np.flatnonzero(~is_fast(scan.flow, min_speed_m_s) & np.isin(scan.labels, sorted(labels)))
     points = transform_points(world_T_sensor, scan.points[members])
-    return Standing(frame, members, scan.labels[members].astype(np.int64), points, world_T_sensor[:3, 3])
+    return StaticPoints(frame, members, scan.labels[members].astype(np.int64), points, world_T_sensor[:3, 3])
 
 
 def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return the indices of each value of `key`, in order of the values' first occurrence."""
+    """Return the indices of each value of `key`, in the order in which the values occur first."""
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(inverse))[:-1])
@@ -191,7 +193,7 @@ def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 
 
 def _places(spread: NDArray[np.float64], own: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return the parts of some points, indices `own` of (N, K) features, that a gap above 1 in one of these separates."""
+    """Split points, indices `own` of (N, K) features, at each gap above 1 in one of the features."""
     for column in range(spread.shape[1]):
         values = spread[own, column]
         if np.ptp(values) > 1:
@@ -218,7 +220,7 @@ def _join(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray
     near = (along2 < _REACH_M**2) & (across2 < _BESIDE_M**2)
     joined = (near | near.T) & (np.square(speed[:, None] - speed[None]).sum(axis=2) < _SAME_VELOCITY_M_S**2)
     component = np.arange(len(count))
-    while True:  # each cell takes the lowest number among those it is joined with, until nothing changes
+    while True:  # each cell takes the lowest number of its joined cells, until nothing changes
         lowest = np.where(joined, component[None], len(count)).min(axis=1)
         lowest = lowest[lowest]
         if (lowest == component).all():

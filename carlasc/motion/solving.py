@@ -1,6 +1,6 @@
-"""Small linear problems, solved with the same bits on every processor: LAPACK, behind `np.linalg`, rounds differently on different ones.
+"""Small linear problems, solved with the same bits on every processor; smoothing and resampling over time; headings.
 
-And what they are solved for: values over time that change as the motion of an actor does, the same at other times, and headings.
+`np.linalg` is not used: LAPACK rounds differently on different processors.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from carlasc.core.compiling import cached
 from carlasc.core.geometry import multiply
 
 _HEADING_SPEED_M_S = 1.0  # above it, the heading is the direction of motion
-_SWEEPS = 12  # of Jacobi's method, which takes about five
+_SWEEPS = 12  # greatest number for Jacobi's method, which takes about five
 
 
 @cached(error_model="python")
 def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (K, D) parameters x for which `design @ x` is nearest to the values, by orthogonalising the columns one after the other.
+    """Return the (K, D) parameters x for which `design @ x` is nearest to the values; the columns are orthogonalised one after the other.
 
     Args:
-        design: (N, K), N >= 1. The parameter of a column that depends on those before it is 0.
+        design: (N, K), N >= 1. The parameter of a column that depends on earlier columns is 0.
         values: (N, D).
     """
     count, columns, wide = design.shape[0], design.shape[1], values.shape[1]
@@ -30,7 +30,7 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
         whole = 0.0
         for i in range(count):
             whole += basis[i, k] * basis[i, k]
-        for _ in range(2):  # the second time removes what rounding left
+        for _ in range(2):  # the second pass removes the rounding errors of the first
             for j in range(k):
                 along = 0.0
                 for i in range(count):
@@ -66,10 +66,10 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
 
 @cached
 def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N,) the solution of a positive definite system, by Cholesky's method.
+    """Return the (N,) solution of a positive definite system, by Cholesky's method.
 
     Args:
-        matrix: (N, N), of which the lower half is read. Is changed.
+        matrix: (N, N); its lower half is read, and overwritten.
         right: (N,).
     """
     count = len(right)
@@ -101,7 +101,7 @@ def principal_axes(covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64
         covariances: (N, 3, 3).
 
     Returns:
-        (N, 3) eigenvalues and (N, 3, 3) unit eigenvectors in columns. Which of its two signs a vector has is fixed, but not by a rule.
+        (N, 3) eigenvalues and (N, 3, 3) unit eigenvectors in columns. The sign of a vector is reproducible, but follows no rule.
     """
     values, vectors = np.empty((len(covariances), 3)), np.empty((len(covariances), 3, 3))
     for n in range(len(covariances)):
@@ -135,7 +135,7 @@ def principal_axes(covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64
 def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (3, 3) rotation nearest to a (3, 3) mean of rotations; the identity if these have no mean direction."""
     rotation = matrix
-    for _ in range(30):  # Newton's method for the polar decomposition: four or five times where rotations are alike
+    for _ in range(30):  # Newton's method for the polar decomposition: four or five steps for similar rotations
         rows = np.cross(rotation[[1, 2, 0]], rotation[[2, 0, 1]])
         volume = float((rotation[0] * rows[0]).sum())
         if volume < 1e-12:
@@ -171,7 +171,7 @@ def smooth_at(
     weights: NDArray[np.float64],
     half_s: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what `smooth` returns for the time of one index alone: (D,) and (D,)."""
+    """Return the (D,) value and the (D,) derivative of `smooth` at one index."""
     distance = np.abs(seconds - seconds[index])
     near = np.flatnonzero(distance <= half_s + 1e-9)
     if len(near) < 4:

@@ -1,4 +1,4 @@
-"""Tracks: the motion of one actor, its pose at each frame, and its body; the tracks of a whole sequence, and the file that keeps them."""
+"""Tracks: the motion, the poses and the body of one actor over time; the tracks of a sequence, and the file that keeps them."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
-from carlasc.motion.paths import estimate_path, is_standing
+from carlasc.motion.paths import estimate_path, is_static
 from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.solving import headings_of, resample
 from carlasc.storage.arrays import ArrayFormat, open_npz
 from carlasc.storage.files import parse_json
 
-_EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last segment
-_STANDING_M = 0.5  # the visible part of a standing actor may seem to move this far
-LONGEST_M = 30.0  # no actor is longer or wider: other points have its number
+_EXTRAPOLATE_S = 0.5  # a track extends beyond its first and its last segment by this time
+_STATIC_M = 0.5  # the visible part of a static actor may seem to move this far
+LONGEST_M = 30.0  # no actor is longer or wider: a larger one has points of other things
 _SURE = 0.8  # actors with less confidence are doubtful
-FIRST_MOVER = 1 << 33  # actors that no field shows are numbered from here, above all instances
+FIRST_FOUND = 1 << 33  # found actors are numbered from here, above all instances
 _FORMATS = {
     "members": ArrayFormat(("<i4",), (None,)),
     "frames": ArrayFormat(("<i8",), (None, 3)),
@@ -44,18 +44,18 @@ class Track:
     """One actor over time.
 
     Attributes:
-        label: class of the actor, which is that of most of its points.
+        label: most frequent class of its points.
         instance: number of the actor; 0 if actors are not numbered.
-        members: (M,) indices of the actor's points in each scan that saw it, by frame.
+        members: (M,) indices of the points of the actor in each scan that sees it, by frame.
         first: frame of `world_T_actor[0]`.
         world_T_actor: (F, 4, 4) pose at each frame from `first` on; x is forward, and the origin is the centre of its body.
         velocity: (F, 3) m/s, world, at the same frames.
         lower: (3,) metres, lower corner of the actor's whole body, actor frame.
         upper: (3,) metres, upper corner.
-        extent: what was seen of the body.
+        extent: the visible part of the body.
         rigid: whether it keeps its shape, as vehicles do.
-        surface: (P, 3) float32, points of its surface, metres, actor frame: of one that was seen well; of every vehicle once bodies are complete.
-        confidence: that it is real, from 0 to 1; 1 if the data say so.
+        surface: (P, 3) float32, points of its surface, metres, actor frame. Before bodies are completed, exemplary actors alone have them.
+        confidence: probability that it is real, from 0 to 1; 1 for an actor of the data.
     """
 
     label: int
@@ -82,7 +82,7 @@ class Track:
         return self.velocity[row] if 0 <= row < len(self.velocity) else None
 
     def between(self, first: int, last: int) -> Track:
-        """Return the track at the frames from `first` to `last` only: small enough to be sent to a worker."""
+        """Return the track at the frames from `first` to `last` only, which is small enough to send to a worker."""
         start = max(self.first, first)
         rows = slice(start - self.first, max(last + 1 - self.first, start - self.first))
         members = {frame: own for frame, own in self.members.items() if first <= frame <= last}
@@ -96,10 +96,10 @@ class Track:
 
     @property
     def moves(self) -> bool:
-        """Whether the actor moves faster and farther at some time than a standing actor seems to, and is one thing."""
+        """Whether the actor moves faster and farther than a static actor may seem to, and is not too large for one actor."""
         fast = (np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any()
         return bool(
-            self.size.max() < LONGEST_M and fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STANDING_M
+            self.size.max() < LONGEST_M and fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STATIC_M
         )
 
 
@@ -117,16 +117,16 @@ def make_track(
         chain: the segments of one actor, in order of time.
         times: seconds by frame.
         deformable: classes whose actors change their shape.
-        rigid: whether this one keeps its shape; None: unless it is of one of these classes.
-        confidence: that the actor is real.
+        rigid: whether this actor keeps its shape; None: its class decides.
+        confidence: probability that the actor is real.
     """
     seconds = np.array([times[segment.frame] for segment in chain])
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
     keeps_shape = label not in deformable if rigid is None else rigid
     if any(segment.velocity is None for segment in chain):
-        sightings = [segment.points for segment in chain]
-        positions, velocities, headings = estimate_path(sightings, seconds, rigid=keeps_shape)
-        if is_standing(sightings, positions, headings, seconds):
+        observations = [segment.points for segment in chain]
+        positions, velocities, headings = estimate_path(observations, seconds, rigid=keeps_shape)
+        if is_static(observations, positions, headings, seconds):
             positions, velocities, headings = (np.zeros_like(values) for values in (positions, velocities, headings))
     else:
         velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
@@ -144,14 +144,14 @@ def make_track(
 
 
 def complete_bodies(tracks: Sequence[Track]) -> list[Track]:
-    """Return tracks in order of their first segment, each with a body as large as similar actors', and not only as what was seen of it."""
+    """Return tracks in order of their first segment, with bodies that similar actors complete where they were not seen."""
     sizes = Sizes([(track.label, track.extent, track.surface) for track in tracks if track.rigid])
     whole = [_with_body(track, sizes) if track.rigid else track for track in tracks]
     return sorted(whole, key=lambda track: (track.first, track.instance, track.label, *track.world_T_actor[0, :3, 3]))
 
 
 def with_surfaces(tracks: Sequence[Track]) -> list[Track]:
-    """Return tracks whose bodies are known, as those of boxes, with surfaces like those of the actors among them that were seen well."""
+    """Return tracks of known bodies, such as boxes, with surfaces that the exemplary actors among them complete."""
     sizes = Sizes([(track.label, track.extent, track.surface) for track in tracks if track.rigid])
     shapes = (sizes.surface(t.label, t.lower + BODY_MARGIN_M, t.upper - BODY_MARGIN_M, t.extent) for t in tracks)
     return [replace(track, surface=surface) for track, surface in zip(tracks, shapes, strict=True)]
@@ -186,10 +186,10 @@ def _integrate(
 def _fit_box(
     chain: Sequence[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], Extent, NDArray[np.float64]]:
-    """Move the path to the centre of what was seen of the actor, and return it with the extent of its points around it, and these.
+    """Move the path to the centre of the visible part of the actor; return it, the extent, and the points in the actor frame.
 
     The path is known except for a constant offset in the world. If the actor turns, the segments overlap only with the correct
-    offset, which is the one that moves the origin to their centre.
+    offset, which moves the origin to their centre.
     """
     best = int(np.argmax([len(segment.members) for segment in chain]))
     for _ in range(3):
@@ -223,14 +223,14 @@ def _frames_around(first: int, last: int, times: Mapping[int, float]) -> tuple[N
 
 @dataclass(frozen=True)
 class MovingActors:
-    """What moves in a sequence.
+    """The moving actors of a sequence, and the moving points of no track.
 
     Attributes:
         tracks: the actors that move, by number.
-        moving: (M,) indices of the points of a scan that move and belong to no track, by frame.
-        summary: what was found of every actor, standing ones too, as plain values.
-        own: (6,) lower and upper corners, metres, sensor frame, of the places of points that move with the sensor: the recording vehicle.
-        numbers: number of each actor over the whole sequence, by the number of its track; empty if they are not needed.
+        moving: (M,) indices of the points that move and belong to no track, by frame.
+        summary: the facts of every actor, static ones too, as plain values.
+        own: (6,) lower and upper corners, metres, sensor frame, of boxes around points that move with the sensor: the recording vehicle.
+        numbers: number of each actor over the whole sequence, by the number of its track; empty if not needed.
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
@@ -246,7 +246,7 @@ class MovingActors:
         moving: Mapping[int, NDArray[np.integer]] | None = None,
         own: Sequence[NDArray[np.float64]] = (),
     ) -> Self:
-        """Return the actors of tracks: those that move are kept whole, of the others only a summary."""
+        """Return the actors of tracks: moving ones with their tracks, static ones in the summary only."""
         return cls(
             {number: track for number, track in enumerate(tracks) if track.moves},
             moving or {},
@@ -255,7 +255,7 @@ class MovingActors:
         )
 
     def between(self, first: int, last: int) -> MovingActors:
-        """Return what concerns the frames from `first` to `last`: small enough to be sent to a worker with every frame."""
+        """Return the part for the frames from `first` to `last`, which is small enough to send to a worker with each frame."""
         near = {number: track.between(first, last) for number, track in self.tracks.items()}
         tracks = {number: track for number, track in near.items() if track.members or len(track.world_T_actor)}
         moving = {frame: members for frame, members in self.moving.items() if first <= frame <= last}
@@ -270,7 +270,7 @@ class MovingActors:
         return found
 
     def to_bytes(self, key: str) -> bytes:
-        """Return the content of a file for these actors. `key` says what they were made from."""
+        """Return the content of a file with these actors. `key` is a digest of their source."""
         table, poses, velocities, bounds, members, frames, surfaces = [], [], [], [], [], [], []
         for number, track in self.tracks.items():
             table.append(
@@ -313,10 +313,10 @@ class MovingActors:
 
     @classmethod
     def from_bytes(cls, data: bytes, where: str) -> tuple[Self, str]:
-        """Return the actors of a file, and the key of what they were made from.
+        """Return the actors of a file, and the key of their source.
 
         Raises:
-            FormatError: it is no such file; the message starts with `where`.
+            FormatError: the file is not valid; the message starts with `where`.
         """
         with open_npz(data, where) as file:
             arrays = {name: file.read(name, expected) for name, expected in _FORMATS.items()}
@@ -330,7 +330,7 @@ class MovingActors:
 
 
 def is_doubtful(confidence: float) -> bool:
-    """Return whether an actor with a confidence may be none."""
+    """Return whether an actor with this confidence may be a false one."""
     return confidence < _SURE
 
 
@@ -367,13 +367,13 @@ def _summarize(track: Track) -> dict[str, Any]:
     speed = np.linalg.norm(track.velocity, axis=1)
     return {
         "label": track.label,
-        "instance": track.instance if track.instance < FIRST_MOVER else 0,  # a number that the data do not have
+        "instance": track.instance if track.instance < FIRST_FOUND else 0,  # found actors have no number in the data
         "first": int(min(track.members, default=track.first)),
         "last": int(max(track.members, default=track.first)),
         "scans": len(track.members),
         "points": sum(len(own) for own in track.members.values()),
         "moves": track.moves,
-        "confidence": int(1000 * track.confidence) / 1000,  # never 1 for an actor that the data do not name
+        "confidence": int(1000 * track.confidence) / 1000,  # never 1 for a found actor
         "speed_m_s": round(float(np.median(speed)), 3),
         "size_m": [round(float(value), 3) for value in track.size],
         "seen_m": [round(float(value), 3) for value in track.extent.size],

@@ -1,9 +1,8 @@
-"""Visibility: what another scan saw at the place of a point: free space, a surface, or nothing that tells.
+"""Visibility: whether another scan saw the place of a point free, occupied, or not at all.
 
 A scan is kept as columns of azimuth, each sorted by elevation. A point of another scan is looked up by its direction. If the rays around
-this direction ended well beyond the point, its place was free at that time; if they ended there, it was occupied; if they ended before, it was
-hidden. Rays are looked up, not walked along, so the cost does not depend on their length, and LiDARs with few channels tell between their
-channels too.
+this direction end well beyond the point, its place is free in that scan. If they end at the point, it is occupied; if they end before it, it
+is hidden. No ray is traversed, so the cost does not depend on the length of rays, and places between the channels of a LiDAR are decided too.
 """
 
 from __future__ import annotations
@@ -21,12 +20,9 @@ _COLUMNS = 1024
 _PER_RAD = _COLUMNS / (2 * math.pi)
 _MIN_RANGE_M = 1.0  # nearer returns are of the vehicle itself, or invalid
 _SIDE_M, _SIDE_RAD = 0.12, 0.003  # half width of the window around a direction: size of surfaces, and errors of poses
-_DEPTH_M, _DEPTH_SHARE = (
-    0.25,
-    0.003,
-)  # a return within this distance, and share of the range, of a point is of the same surface
-SAME_PLACE_M = 0.3  # rays that began within this distance of each other began at one place
-_GAP_M = 0.8  # maximum distance between two rays, one above the other, between which space is as free as along them
+_DEPTH_M, _DEPTH_SHARE = 0.25, 0.003  # a return within this distance, and share of the range, is of the same surface
+SAME_PLACE_M = 0.3  # origins of rays within this distance count as one place
+_GAP_M = 0.8  # maximum distance between two rays, one above the other, with free space between them
 
 FREE, HIT = 1, 2
 
@@ -37,8 +33,8 @@ class SortedReturns(NamedTuple):
     Attributes:
         start: (C + 1,) int32, first return of each column of azimuth.
         slope: (N,) float32 height over horizontal distance of each return, increasing within a column.
-        distance: (N,) float32 metres from where its ray began.
-        origin: (C, 3) float32 where the rays of each column began, metres, in the frame of the scan.
+        distance: (N,) float32 metres from the origin of its ray.
+        origin: (C, 3) float32 origin of the rays of each column, metres, in the frame of the scan.
     """
 
     start: NDArray[np.int32]
@@ -50,11 +46,11 @@ class SortedReturns(NamedTuple):
     def of(cls, points: NDArray[np.float32], origins: NDArray[np.float32] | None = None) -> SortedReturns:
         """Sort the points of a scan by the directions of their rays.
 
-        A column holds rays of one place. Where the first and the last rays of a turn overlap, a moving sensor was at two: the fewer are left out.
+        A column holds rays with one origin. Where the first and the last rays of a turn of a moving sensor overlap, the fewer are left out.
 
         Args:
-            points: (N, 3) metres.
-            origins: (N, 3) where the ray of each point began; None: at (0, 0, 0).
+            points: (N, 3) metres, sensor frame.
+            origins: (N, 3) origins of the rays, metres, sensor frame; None: (0, 0, 0).
         """
         began = np.zeros_like(points[:, :3]) if origins is None else origins
         column, slope, distance = _directions(np.ascontiguousarray(points[:, :3] - began, np.float32))
@@ -64,7 +60,7 @@ class SortedReturns(NamedTuple):
 
 @cached
 def _directions(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the column of each point, seen from where its ray began; -1 if it is too near; its slope and its distance."""
+    """Return the column of each point, seen from (0, 0, 0), or -1 if it is too near; its slope; and its distance."""
     n = len(points)
     column, slope, distance = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
     for i in range(n):
@@ -82,7 +78,7 @@ def _directions(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray
 def _by_column(
     column: NDArray[np.int32], slope: NDArray[np.float32], began: NDArray[np.float32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-    """Return `start`, the points in the order of columns and slopes, and `origin`: see `SortedReturns`."""
+    """Return `start`, the indices of the points in the order of columns and slopes, and `origin`: see `SortedReturns`."""
     begin = np.zeros(_COLUMNS + 1, np.int64)
     for i in range(len(column)):
         begin[column[i] + 1] += column[i] >= 0
@@ -105,7 +101,7 @@ def _by_column(
                     order[count] = own[k]
                     count += 1
         start[c + 1] = count
-    for c in range(2 * _COLUMNS):  # columns without rays: where those before them began
+    for c in range(2 * _COLUMNS):  # columns without rays get the origin of the column before
         if begin[c % _COLUMNS] == begin[c % _COLUMNS + 1]:
             origin[c % _COLUMNS] = origin[(c - 1) % _COLUMNS]
     return start, order[:count], origin
@@ -126,16 +122,16 @@ def look_up(
     free: NDArray[np.uint32],
     hit: NDArray[np.uint32],
 ) -> None:
-    """Set one bit of each point that another scan saw through, or saw a surface at.
+    """Set one bit of each point whose place another scan saw free or occupied.
 
     Args:
         points: (M, 3) metres.
-        asked: (A,) indices of those points that are looked up.
-        pose: from the points' frame to that of the other scan.
+        asked: (A,) indices of the points that are looked up.
+        pose: from the frame of the points to the frame of the other scan.
         view: the returns of the other scan.
-        bit: number of the bit that is set.
-        free: (M,) gets the bit where the place of the point was free.
-        hit: (M,) gets the bit where it was occupied.
+        bit: number of the bit to set.
+        free: (M,) gets the bit where the place of the point is free.
+        hit: (M,) gets the bit where it is occupied.
     """
     flag = np.uint32(1) << np.uint32(bit)
     start, slope, distance, origin = view
@@ -144,7 +140,7 @@ def look_up(
         x, y, z = transform(pose, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
         if (
             moved and x * x + y * y > 0
-        ):  # seen from there, it is in a column near this one, whose rays began at nearly the same place
+        ):  # from there, the point is in a column near this one, with nearly the same origin
             place = origin[_column(fast_azimuth(x, y))]
             x, y, z = x - place[0], y - place[1], z - place[2]
         else:
@@ -176,14 +172,14 @@ def undecided(
     left: tuple[int, int],
     least: tuple[int, int],
 ) -> NDArray[np.int32]:
-    """Return those points about which the scans that are left may still change the answer.
+    """Return the points whose result the remaining scans may still change.
 
     Args:
         asked: (A,) indices of points.
-        free: (2, M) bits of the scans before, and of those after, that saw through the place of a point. Higher bits are farther away.
-        hit: (2, M) those that saw it occupied.
-        left: number of scans before and after that are not looked up yet, all nearer than the others.
-        least: number of scans that must see through the place of what moved, and number of scans in a row if it is free on one side only.
+        free: (2, M) bits of the scans before and after that saw the place of a point free. Higher bits are farther in time.
+        hit: (2, M) bits of the scans that saw it occupied.
+        left: number of scans before and after that are not looked up yet, all nearer in time than the others.
+        least: least number of scans that see the place of a moved point free, and of scans in a row if it is free on one side only.
     """
     kept = np.empty_like(asked)
     count, rest = 0, left[0] + left[1]
@@ -192,7 +188,7 @@ def undecided(
         occupied = _count(np.int64(hit[0, i])) + _count(np.int64(hit[1, i]))
         moves = passed >= least[0] and passed > occupied + rest
         may_change = passed + rest >= occupied
-        for side in range(2):  # those in a row end at the first that saw it occupied
+        for side in range(2):  # a row ends at the first scan that saw it occupied
             h = np.int64(hit[side, i])
             for shift in (1, 2, 4, 8, 16):
                 h |= h >> shift
@@ -206,7 +202,7 @@ def undecided(
 
 @inlined
 def _first_above(least, lo, hi, slope):  # type: ignore[no-untyped-def]
-    """Return the first return from `lo` to `hi` whose slope is not below `least`; `hi` if there is none."""
+    """Return the index of the first return from `lo` to `hi` with a slope of at least `least`; `hi` without one."""
     while lo < hi:
         mid = (lo + hi) >> 1
         if slope[mid] < least:
@@ -218,11 +214,11 @@ def _first_above(least, lo, hi, slope):  # type: ignore[no-untyped-def]
 
 @inlined
 def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no-untyped-def]
-    """Return FREE, HIT or 0 for a direction and a distance."""
+    """Return FREE, HIT or 0 (unknown) for a direction and a distance."""
     half = _SIDE_M / flat + _SIDE_RAD
     high = half * (1 + steep * steep)
     near, beyond = far - _DEPTH_M - _DEPTH_SHARE * far, far + _DEPTH_M + _DEPTH_SHARE * far
-    # Most places are occupied, and most of them show it in the middle: this column is looked at first.
+    # Most places are occupied, and the middle column usually shows it: it comes first.
     middle = math.floor((azimuth + math.pi) * _PER_RAD) % _COLUMNS
     lo, end = _first_above(steep - high, start[middle], start[middle + 1], slope), start[middle + 1]
     while lo < end and slope[lo] <= steep + high:

@@ -20,7 +20,7 @@ VELOCITY_DTYPE = np.dtype([("voxel", "<i4"), ("velocity", "<f2", (3,))])
 _VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
 _MOST_CLASSES = 256
 
-Per = Literal["point", "voxel", "vote", "mover", "box", "scan"]
+Per = Literal["point", "voxel", "vote", "moving voxel", "box", "scan"]
 Kind = Literal[
     "position",
     "vector",
@@ -49,7 +49,7 @@ class Field:
         folder: folder under `<coordinates>/`.
         suffix: ending of the file name.
         per: what one row of the file belongs to: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
-            "vote" (one row per vote), "mover" (one row per voxel that moves), "box" (one row per box), or "scan" (the whole file belongs to the scan).
+            "vote" (one row per vote), "moving voxel" (one row per voxel that moves), "box" (one row per box), or "scan" (the whole file belongs to the scan).
         kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (of a class
             and its probability), "id" (unsigned whole numbers, such as actors), "value" (any number), "count", "probability" (0 to 1),
             "flags" (bits), "votes", "velocities" and "boxes" (tables), "picture" (the bytes of a file).

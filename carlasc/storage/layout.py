@@ -139,7 +139,7 @@ _GRID_FIELDS: dict[str, Field] = {
             meaning="actor that the voxel belongs to, 0 none, consistent over a sequence", published=False,
         ),
         Field(
-            name="velocity", folder="", suffix=".velocity.npz", per="mover", kind="velocities",
+            name="velocity", folder="", suffix=".velocity.npz", per="moving voxel", kind="velocities",
             dtype="", names=("voxel", "velocity"), unit="m/s",
             meaning="velocity of each voxel that moves: voxel (flat index), velocity; sensor frame, ego motion removed",
             published=False,

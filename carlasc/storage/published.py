@@ -139,7 +139,7 @@ class PublishedSequence(Sequence):
         return self._listing[field]
 
     def _shape(self, entry: field_files.Field) -> tuple[int, int, int] | None:
-        return self.grids[entry.folder].size if entry.per in ("voxel", "vote", "mover") else None
+        return self.grids[entry.folder].size if entry.per in ("voxel", "vote", "moving voxel") else None
 
     def documents(self) -> tuple[str, ...]:
         """Return the names of the text files."""

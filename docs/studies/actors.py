@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from carlasc.groundtruth import FromScans
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.motion import MotionOptions, movers
+from carlasc.motion import MotionOptions, found_actors
 from carlasc.motion.tracks import Track, is_doubtful
 from carlasc.storage import Sequence
 
@@ -129,13 +129,13 @@ def drives(given: Namespace) -> Iterator[tuple[str, int, Recorded]]:
 
 def main() -> None:
     """Find the actors of all drives, and print the tables."""
-    least = movers._LEAST_CONFIDENCE
+    least = found_actors._LEAST_CONFIDENCE
     rows: dict[tuple[str, int, str], Counts] = {}
     with study.begin(study.options(__doc__, SEEDS)) as given:
         for world, channels, drive in drives(given):
             truth = Truth.of(drive.sequence)
             for rule, confidence in (("", least), (", no confidence", 0.0)):
-                movers._LEAST_CONFIDENCE = confidence
+                found_actors._LEAST_CONFIDENCE = confidence
                 for name, errors in POSES.items():
                     counts = truth.judge(find(drive, errors))
                     key = (world, channels, f"{name}{rule}")

@@ -8,6 +8,8 @@ exact poses. Voxels known to both count. WORK keeps the drives; the default is a
   not know as free.
 - one number: of the movers that half of all scans or more see with 50 points or more, the share that has one number in all of these scans.
 - velocity: mean length of the difference over the voxels that move in both, m/s; beside it the share of the moving voxels that have one.
+
+The tables are means over the drives of each world, with 95 % intervals by the bootstrap over them.
 """
 
 from __future__ import annotations
@@ -57,7 +59,7 @@ def merged_from(drive: Recorded, row: str) -> tuple[Sequence, FromScans]:
 
 @dataclass
 class Scores:
-    """What is added up over frames and drives."""
+    """What is added up over the frames of a drive."""
 
     both: PanopticQuality = field(default_factory=lambda: PanopticQuality(CARLA.num_channels, THINGS))
     truth: PanopticQuality = field(default_factory=lambda: PanopticQuality(CARLA.num_channels, THINGS))
@@ -83,20 +85,19 @@ class Scores:
         self.moving += len(voxels)
         self.errors.append(errors[~np.isnan(errors)])
 
-    def row(self, name: str) -> str:
-        """Return a row of the table."""
+    def figures(self) -> tuple[float, ...]:
+        """Return the cells of a row of the table."""
         ids = sorted(THINGS)
         pq, whole = (score.compute().pq[ids] for score in (self.both, self.truth))
         errors = np.concatenate(self.errors)
-        cells = [
-            np.nanmean(pq),
-            *pq,
-            np.nanmean(whole),
-            np.mean(self.one),
-            errors.mean(),
-            len(errors) / self.moving,
-        ]
-        return f"| {name} | {' | '.join(f'{cell:.2f}' for cell in cells)} |"
+        return (
+            float(np.nanmean(pq)),
+            *pq.tolist(),
+            float(np.nanmean(whole)),
+            float(np.mean(self.one)) if self.one else float("nan"),
+            float(errors.mean()) if len(errors) else float("nan"),
+            len(errors) / max(self.moving, 1),
+        )
 
 
 @dataclass(frozen=True)
@@ -157,36 +158,45 @@ def numbers_seen(drive: Recorded, actors: MovingActors) -> list[bool]:
     ]
 
 
+def score_row(
+    drive: Recorded, row: str, seen: Mapping[int, Reference], truths: Mapping[int, Truth]
+) -> tuple[float, ...]:
+    """Make the judged frames of a drive by a row, and return their figures."""
+    sequence, observe = merged_from(drive, row)
+    feed = ScanFeed(sequence, observe)
+    plan = GridPlan(GRIDS["coarse"], "grid", observe, Voting(keep_actors=True), FrameRange())
+    actors = with_numbers(find_actors(feed), feed)
+    score = Scores(one=numbers_seen(drive, actors))
+    for frame, truth in truths.items():
+        merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
+        labels = merged.grid.labels
+        if row.endswith("no labels"):  # the class is not known: that of the truth, where both are occupied
+            own = np.isin(seen[frame].labels, sorted(THINGS)) | (labels == 0)
+            labels = np.where(labels > 0, np.where(own, seen[frame].labels, min(THINGS)), 0)
+        score.add((labels, merged.grid.known, merged.actors), seen[frame], truth)
+    return score.figures()
+
+
 def main() -> None:
-    """Print the table."""
+    """Print a table for each world."""
     parser = study.options(__doc__, SEEDS)
     parser.add_argument("--rows", nargs="*", default=ROWS)
     with study.begin(parser) as given:
-        scores = {row: Scores() for row in given.rows}
+        found: dict[str, dict[str, list[tuple[float, ...]]]] = {}
         for kind, seed in study.drives(given, SEEDS):
             (drive,) = record(kind, seed, [32], given.work)
             seen = {frame: one for (grid, frame), one in reference(kind, seed, given.work).items() if grid == "coarse"}
             truths = {frame: Truth.of(drive, frame) for frame in seen}
-            for row, score in scores.items():
-                sequence, observe = merged_from(drive, row)
-                feed = ScanFeed(sequence, observe)
-                plan = GridPlan(GRIDS["coarse"], "grid", observe, Voting(keep_actors=True), FrameRange())
-                actors = with_numbers(find_actors(feed), feed)
-                score.one += numbers_seen(drive, actors)
-                for frame, truth in truths.items():
-                    merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
-                    labels = merged.grid.labels
-                    if row.endswith("no labels"):  # the class is not known: that of the truth, where both are occupied
-                        own = np.isin(seen[frame].labels, sorted(THINGS)) | (labels == 0)
-                        usual = np.where(own, seen[frame].labels, min(THINGS))
-                        labels = np.where(labels > 0, usual, 0)
-                    score.add((labels, merged.grid.known, merged.actors), seen[frame], truth)
-                print(kind, seed, score.row(row), flush=True)
-    print(
-        "\n| from | PQ | people | vehicles | PQ of the truth | one number | velocity, m/s | with velocity |\n|---|---:|---:|---:|---:|---:|---:|---:|"
-    )
-    for row, score in scores.items():
-        print(score.row(row))
+            for row in given.rows:
+                figures = score_row(drive, row, seen, truths)
+                found.setdefault(kind, {}).setdefault(row, []).append(figures)
+                print(kind, seed, row, *(f"{value:.2f}" for value in figures), flush=True)
+    for kind, rows in found.items():
+        print(
+            f"\n{kind}:\n\n| from | PQ | people | vehicles | PQ of the truth | one number | velocity, m/s | with velocity |\n|---|---:|---:|---:|---:|---:|---:|---:|"
+        )
+        for row, drives in rows.items():
+            print(f"| {row} | {' | '.join(study.interval(values) for values in zip(*drives, strict=True))} |")
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ _NEAR = Lidar(channels=32, points=32_000, range_m=30.0)
 SIZES = {
     "tiny": Size(Scenes((1, 1, 2), 3, 1, 2, Lidar(channels=16, points=6_000, range_m=20.0), 6.4, (16, 16, 8)), 1, 1, 1),
     "small": Size(Scenes((6, 2, 4), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 3, 1, 1, batch_size=2),
-    "medium": Size(Scenes((10, 3, 8), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 3, 1, 1, batch_size=2, seeds=3),
+    "medium": Size(Scenes((10, 3, 8), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 18, 6, 6, batch_size=2, seeds=3),
     "long": Size(Scenes((20, 4, 12), 21, 15, 12, _NEAR, 6.4, (32, 32, 8)), 10, 3, 3, seeds=3),
     "full": Size(Scenes((24, 3, 6), 100, 30, 20, Lidar(), 25.6, (128, 128, 8)), 10, 3, 10, 8, seeds=3, workers=8),
 }

@@ -80,6 +80,6 @@ def test_bench_velocities(benchmark):
     rng = np.random.default_rng(0)
     body = rng.uniform(0, 1, (300, 3)) * (4.4, 1.8, 1.5)
     body[:150, 1] = 0  # a flank
-    sightings = [body + (0.8 * i, 0, 0) + rng.uniform(-0.02, 0.02, body.shape) for i in range(20)]
-    _, velocities, _ = benchmark(estimate_path, sightings, np.arange(20) * 0.1, rigid=True)
+    observations = [body + (0.8 * i, 0, 0) + rng.uniform(-0.02, 0.02, body.shape) for i in range(20)]
+    _, velocities, _ = benchmark(estimate_path, observations, np.arange(20) * 0.1, rigid=True)
     assert np.abs(velocities - (8, 0, 0)).max() < 0.5

@@ -107,7 +107,7 @@ def test_people_are_followed_by_their_centre_and_vehicles_by_their_planes(label,
     assert rigid == [label == MOVING_CAR]
 
 
-def test_long_sightings_are_estimated_in_pieces_and_every_frame_has_a_velocity(monkeypatch):
+def test_long_observations_are_estimated_in_pieces_and_every_frame_has_a_velocity(monkeypatch):
     from carlasc.converting import actors
 
     lengths = []

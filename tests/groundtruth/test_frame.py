@@ -91,7 +91,7 @@ class TestWhereTrafficPasses:
         assert VoxelFlag.CONTESTED not in flags
 
 
-class TestTheFramesOwnMover:
+class TestTheFramesOwnActor:
     """A point moves, and only the frame itself sees it; all other scans see through its place."""
 
     def make(self, folder, dynamic, actors=None):

@@ -74,7 +74,7 @@ def test_the_exporter_of_kitti_makes_the_classes_that_move_of_it(numbered):
 def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_files_of_kitti(numbered, tmp_path):
     """SemanticKITTI's: the passing car becomes 252, the parked one stays 10; the number that it gets is nobody else's in a file either."""
     folder, result = numbered
-    assert any("the classes carla do not tell what moves" in note for note in result.notes)
+    assert any("the classes carla do not separate moving" in note for note in result.notes)
     given = the_sequence(folder / "in")
     writer = FolderSink(tmp_path / "in").sequence("Val/Street/cartesian")
     writer.write_document("carlasc.json", to_json({"classes": "semantickitti", "axes": "right"}))

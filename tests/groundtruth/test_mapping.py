@@ -84,7 +84,7 @@ def test_a_map_is_what_plain_python_makes(drive, tmp_path):
 
 
 def test_what_moves_leaves_no_trace_and_what_stands_stays(drive, tmp_path):
-    result = make(drive, tmp_path / "map.npz", motion=FLOW, movers=True)
+    result = make(drive, tmp_path / "map.npz", motion=FLOW, actors=True)
     points = np.load(tmp_path / "map.npz")["points"]
     worlds = [world_points(frame) for frame in range(FRAMES)]
     car = np.concatenate([points[moving] for points, _, moving in worlds])
@@ -95,11 +95,11 @@ def test_what_moves_leaves_no_trace_and_what_stands_stays(drive, tmp_path):
     assert len(trace) > 1000 and np.mean(trace) < 0.01
     assert np.mean(kept) > 0.99
 
-    actor, *parts = json.loads((tmp_path / "map_movers" / "actors.json").read_text())
+    actor, *parts = json.loads((tmp_path / "map_actors" / "actors.json").read_text())
     assert result.actors == 1 + len(parts) and actor["class"] == "Vehicle" and actor["frames"] == list(range(FRAMES))
     places = np.array(actor["map_T_actor"]).reshape(-1, 3, 4)[:, :, 3]
     assert_allclose(np.diff(places[:, 0]), SPEED_M_S * 0.1, atol=0.1)
-    with np.load(tmp_path / "map_movers" / actor["file"]) as body:
+    with np.load(tmp_path / "map_actors" / actor["file"]) as body:
         spread = np.ptp(body["points"], axis=0)
     assert spread[0] == pytest.approx(CAR[0], abs=0.4) and spread[1] < CAR[1] + 0.3
     again = np.concatenate(
@@ -172,7 +172,7 @@ def test_wrong_arguments_are_refused_before_anything_is_written(drive, tmp_path,
         "out: expected a file to write": {"out": None},
         "cell_m: expected 0.001 metres or more, found nan": {"cell_m": float("nan")},
         "distance: expected the `grid`": {"distance": tmp_path / "far.npz"},
-        "movers: expected a file of points of a drive": {"movers": True, "grid": GRID},
+        "actors: expected a file of points of a drive": {"actors": True, "grid": GRID},
         "mesh: expected files of different names": {"mesh": out},
         "part: expected none": {"run": Run(part=carlasc.running.Part(1, 2))},
     }.items():
@@ -208,13 +208,13 @@ def test_several_sequences_have_no_one_frame(tmp_path):
 
 def test_what_exists_stays_unless_it_is_to_be_replaced(drive, tmp_path):
     out = tmp_path / "map.npz"
-    make(drive, out, frames="0:1", movers=True)
+    make(drive, out, frames="0:1", actors=True)
     before = out.read_bytes()
     with pytest.raises(ConflictError, match="expected nothing, found a file: give `overwrite=True`"):
         make(drive, out, frames="0:2")
     assert out.read_bytes() == before
-    make(drive, out, frames="0:2", movers=True, overwrite=True)
-    assert out.read_bytes() != before and sorted(path.name for path in tmp_path.iterdir()) == ["map.npz", "map_movers"]
+    make(drive, out, frames="0:2", actors=True, overwrite=True)
+    assert out.read_bytes() != before and sorted(path.name for path in tmp_path.iterdir()) == ["map.npz", "map_actors"]
 
 
 @pytest.mark.parametrize("steps", [0, 1, 2])

@@ -178,7 +178,7 @@ def test_too_few_scans_are_left_alone_and_sequences_without_scans_are_left_out(e
     writer.write_document("poses.txt", layout.encode_poses(whole.poses[:2]))
     result = carlasc.refine(tmp_path / "few", tmp_path / "out", run=ALONE)
     assert result.notes == [
-        "Val/Few/cartesian: poses left as they are: nothing tells how far neighbouring scans disagree"
+        "Val/Few/cartesian: poses left as they are: the distance between neighbouring scans is unknown"
     ]
     for path in (tmp_path / "few/Val/Few/cartesian/velodyne").iterdir():
         path.unlink()

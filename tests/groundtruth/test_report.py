@@ -76,9 +76,9 @@ def test_a_report_says_what_the_grids_hold(made):
 def test_a_report_lists_the_actor_that_moves_and_how_well_it_is_tracked(made):
     (car,) = report_in(made).actors
     assert car.label == "Vehicle"
-    assert car.sightings == car.last - car.first + 1 == FRAMES
+    assert car.observations == car.last - car.first + 1 == FRAMES
     assert car.speed_m_s == pytest.approx(10.0, abs=0.2)
-    assert car.residual_m < car.residual_standing_m
+    assert car.residual_m < car.residual_static_m
 
 
 def test_digests_are_those_of_the_published_files(made):
@@ -245,28 +245,28 @@ def test_the_inferred_share_needs_every_frame_to_say_it():
 
 
 def residual_of(actor, frame):
-    """Compare the sightings of an actor in two frames, with the sensor at the origin of the world."""
+    """Compare the observations of an actor in two frames, with the sensor at the origin of the world."""
     one, other = (scan_of([actor], number).points for number in (frame, frame + 1))
     return Residual.between(one, other, actor.pose(0.1 * frame), actor.pose(0.1 * (frame + 1)))
 
 
-def test_a_true_motion_overlays_sightings_better_than_standing():
+def test_a_true_motion_overlays_observations_better_than_no_motion():
     moving, parked = (residual_of(MovingBox((5.0, 2.0, 0.0), speed=speed), 3) for speed in (8.0, 0.0))
     assert moving.count == parked.count > 50
     assert moving.moving_m / moving.count < 0.15
-    assert moving.standing_m > 1.3 * moving.moving_m
-    assert parked.standing_m == pytest.approx(parked.moving_m)
+    assert moving.static_m > 1.3 * moving.moving_m
+    assert parked.static_m == pytest.approx(parked.moving_m)
 
 
-def test_residuals_are_means_over_the_sightings_of_each_actor_that_moves():
+def test_residuals_are_means_over_the_observations_of_each_actor_that_moves():
     about = {"label": 10, "instance": 0, "scans": 3, "points": 50, "speed_m_s": 5.0, "faces": 2, "confidence": 0.7}
     about |= {"first": 1, "last": 3, "size_m": [4.0, 2.0, 1.5], "seen_m": [3.0, 1.0, 1.5]}
     summaries = [about | {"moves": False}, about | {"moves": True}, about | {"moves": True, "first": 0, "label": 4}]
     frames = [{1: Residual(1.0, 4.0, 10), 0: Residual(9.0, 9.0, 1)}, {1: Residual(5.0, 6.0, 20)}]
     person, car = actors_of(summaries, frames, CARLA)
-    assert (person.label, person.residual_m, person.residual_standing_m) == ("Pedestrian", None, None)
-    assert (car.label, car.residual_m, car.residual_standing_m) == ("Vehicle", 0.2, round(1 / 3, 4))
-    assert (car.size_m, car.seen_m, car.faces, car.sightings) == ((4.0, 2.0, 1.5), (3.0, 1.0, 1.5), 2, 3)
+    assert (person.label, person.residual_m, person.residual_static_m) == ("Pedestrian", None, None)
+    assert (car.label, car.residual_m, car.residual_static_m) == ("Vehicle", 0.2, round(1 / 3, 4))
+    assert (car.size_m, car.seen_m, car.faces, car.observations) == ((4.0, 2.0, 1.5), (3.0, 1.0, 1.5), 2, 3)
     assert car.confidence == 0.7
 
 

@@ -91,7 +91,7 @@ def test_alignment_completes_the_car_that_one_scan_sees_in_part(street, truth, s
     assert seen["align"] > 0.95 * real
 
 
-def test_what_stands_is_the_same_whatever_becomes_of_movers(street, scores):
+def test_static_voxels_are_the_same_whatever_becomes_of_moving_actors(street, scores):
     grids = [grid_of(street, name) for name in ("align", "current", "drop")]
     left = slice(0, 128), slice(0, 60)  # nothing moves there
     for grid in grids[1:]:
@@ -294,16 +294,16 @@ class TestBadInput:
         street = passing_car.write_sequence(tmp_path, ("labels",), frames=20)
         (note,) = make(street, "x", frames=(10, 11)).notes
         assert "cartesian: free space shows 1 actors that move" in note
-        assert ", although nothing else says so" in note
+        assert ", although no field of the data shows it" in note
         (note,) = make(street, "y", frames=(10, 11), settings={"motion": MotionOptions("none")}).notes
-        assert "cartesian: nothing shows what moves: everything was treated as static" in note
+        assert "cartesian: no field shows motion: all points were treated as static" in note
         assert make(street, "z", frames=(10, 11), settings={"dynamic": "tube"}).notes == ()
 
     def test_a_window_larger_than_the_sequence_is_fine(self, tmp_path):
         street = passing_car.write_sequence(tmp_path, frames=3)
         assert make(street, "x", frames=None, settings={"window": (-500, 500)}).made == 3
 
-    def test_flow_that_is_no_number_counts_as_standing(self, tmp_path):
+    def test_flow_that_is_no_number_counts_as_static(self, tmp_path):
         street = passing_car.write_sequence(tmp_path, frames=3)
         writer = FolderSink(tmp_path).sequence("Val/Street/cartesian")
         flow = next(iter(carlasc.open(street).sequences().values())).read("flow", 1).copy()

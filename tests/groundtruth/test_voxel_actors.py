@@ -23,7 +23,7 @@ from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.voxel_actors import ActorPoints, centers_of, number_actors
 from carlasc.motion import Extent, MotionOptions, Track
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors
 from carlasc.storage import FolderSink, FolderSource, field_files
 
 NOW = 7
@@ -303,7 +303,7 @@ def one_track(first, frames, *, x=0.0, instance=0, label=CAR, rigid=True, half=(
 def test_numbers_of_the_data_are_kept_and_others_are_new_and_above_them():
     tracks = {
         3: one_track(0, 9, instance=7),
-        4: one_track(0, 9, x=50, instance=FIRST_MOVER + 2),
+        4: one_track(0, 9, x=50, instance=FIRST_FOUND + 2),
         8: one_track(2, 9, x=-50),
         9: one_track(1, 9, x=90),
     }

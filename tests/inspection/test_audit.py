@@ -132,7 +132,7 @@ SOURCES = {  # what shows motion -> how the recording is copied
 @pytest.mark.parametrize("name", SOURCES)
 def test_an_actor_without_voxels_and_its_trail_are_found_by_whatever_shows_motion(town, tmp_path, name):
     scans, actor = SOURCES[name](town, tmp_path / "scans"), planted.fastest(planted.sequence_of(town))
-    named = {"boxes": f"actor {actor} "}.get(name, "actor mover 0, first seen in scan ")
+    named = {"boxes": f"actor {actor} "}.get(name, "actor of track 0, first seen in scan ")
     assert planted.sequence_of(scans).fields() & {"instances", "flow", "boxes"} == {name} & {"flow", "boxes"}
     for fault, check in ((None, None), (planted.erased, "erased actors"), (planted.trail, "ghost trails")):
         out = tmp_path / f"{check}"

@@ -302,7 +302,7 @@ def test_boxes_follow_points_also_where_times_do_not_rise(seconds):
     assert np.isfinite(after.world_T_actor).all() and np.isfinite(after.velocity).all()
 
 
-def test_two_sightings_in_one_scan_give_a_finite_track():
+def test_two_observations_in_one_scan_give_a_finite_track():
     """Boxes of one number that jump give two tracks, which both extend to some frames."""
     track, _, segments = drawn(CAR)
     after = register_boxes(track, [s for segment in segments for s in (segment, segment)], TIMES)

@@ -6,24 +6,24 @@ from helpers.scenes.moving_scenes import CAR, GROUND, PERSON, WALL, WALLS, car, 
 
 from carlasc.captures.settings import Lidar
 from carlasc.errors import FormatError
-from carlasc.motion.evidence import HORIZON_S, Sighting, find_evidence
+from carlasc.motion.evidence import HORIZON_S, EvidenceScan, find_evidence
 
 
 def shares(filmed, first=0, last=10**9):
     """Return the share of moved points of each class over frames, without those on the ground."""
-    sightings, classes = zip(*filmed, strict=True)
+    scans, classes = zip(*filmed, strict=True)
     counts, moved = np.zeros(20), np.zeros(20)
-    for sighting, labels, evidence in zip(sightings, classes, find_evidence(sightings), strict=True):
-        assert evidence.frame == sighting.frame and evidence.count == len(sighting.points)
-        if first <= sighting.frame <= last:
-            high = place_height(sighting) > 0.25
+    for scan, labels, evidence in zip(scans, classes, find_evidence(scans), strict=True):
+        assert evidence.frame == scan.frame and evidence.count == len(scan.points)
+        if first <= scan.frame <= last:
+            high = place_height(scan) > 0.25
             counts += np.bincount(labels[high], minlength=20)
             moved += np.bincount(labels[high], evidence.moved[high], minlength=20)
     return moved / np.maximum(counts, 1)
 
 
-def place_height(sighting):
-    return sighting.points[:, 2] + 1.8
+def place_height(scan):
+    return scan.points[:, 2] + 1.8
 
 
 def passing(seconds):
@@ -33,8 +33,8 @@ def passing(seconds):
 @pytest.mark.parametrize("channels", [16, 32, 64])
 def test_a_passing_car_is_found_and_a_parked_one_is_not(channels):
     lidar = Lidar(channels=channels, points=channels * 900, noise_m=0.0)
-    sightings = [(sighting, labels) for sighting, labels in film(passing, lidar=lidar)]
-    parked = [(s, np.where((labels == CAR) & (s.points[:, 1] < 0), 11, labels)) for s, labels in sightings]
+    scans = [(scan, labels) for scan, labels in film(passing, lidar=lidar)]
+    parked = [(s, np.where((labels == CAR) & (s.points[:, 1] < 0), 11, labels)) for s, labels in scans]
     share = shares(parked)
     assert share[CAR] > 0.95
     assert share[11] < 0.01
@@ -72,16 +72,14 @@ def test_a_car_that_stops_is_whole_while_it_stands():
 def test_nothing_moves_on_empty_ground_or_in_a_single_scan():
     assert not shares(film(lambda _: [])).any()
     assert not shares(film(passing, 1)).any()
-    empty = Sighting(0, np.empty((0, 3), np.float32), np.eye(4), 0.0)
+    empty = EvidenceScan(0, np.empty((0, 3), np.float32), np.eye(4), 0.0)
     (evidence,) = find_evidence([empty])
     assert evidence.clusters == () and evidence.moved.shape == (0,)
 
 
 def test_explained_points_are_no_evidence():
-    def without(sighting, labels):
-        return Sighting(
-            sighting.frame, sighting.points, sighting.world_T_sensor, sighting.seconds, None, None, labels == CAR
-        )
+    def without(scan, labels):
+        return EvidenceScan(scan.frame, scan.points, scan.world_T_sensor, scan.seconds, None, None, labels == CAR)
 
     filmed = [(without(*pair), pair[1]) for pair in film(passing)]
     assert shares(filmed)[CAR] == 0
@@ -91,36 +89,36 @@ def test_labels_name_clusters_and_keep_them_apart():
     def together(seconds):
         return [*WALLS, car(-12.0 + 6.0 * seconds, 6.0), person(-9.6 + 6.0 * seconds, 6.0)]
 
-    sightings = [sighting for sighting, _ in film(together, labels=True)]
-    found = list(find_evidence(sightings, movable={CAR, PERSON}))[20]
+    scans = [scan for scan, _ in film(together, labels=True)]
+    found = list(find_evidence(scans, movable={CAR, PERSON}))[20]
     assert sorted(found.labels) == [PERSON, CAR]
     for members, label in zip(found.clusters, found.labels, strict=True):
-        assert (sightings[20].labels[members] == label).all()
-    assert not any((sightings[20].labels[members] == GROUND).any() for members in found.clusters)
+        assert (scans[20].labels[members] == label).all()
+    assert not any((scans[20].labels[members] == GROUND).any() for members in found.clusters)
 
 
 def test_scans_are_given_back_after_the_horizon():
     read = []
 
     def reading():
-        for sighting, _ in film(passing, 80):
-            read.append(sighting.frame)
-            yield sighting
+        for scan, _ in film(passing, 80):
+            read.append(scan.frame)
+            yield scan
 
     for evidence in find_evidence(reading()):
         assert read[-1] <= evidence.frame + round(HORIZON_S / 0.1) + 1
 
 
 def test_times_that_do_not_rise_are_replaced():
-    wrong = [(Sighting(s.frame, s.points, s.world_T_sensor, 3.0), labels) for s, labels in film(passing)]
+    wrong = [(EvidenceScan(s.frame, s.points, s.world_T_sensor, 3.0), labels) for s, labels in film(passing)]
     assert shares(wrong)[CAR] == pytest.approx(shares(film(passing))[CAR], abs=0.02)
 
 
 def test_points_that_are_not_finite_are_left_out():
-    def broken(sighting):
-        points = sighting.points.copy()
+    def broken(scan):
+        points = scan.points.copy()
         points[::50] = np.nan
-        return Sighting(sighting.frame, points, sighting.world_T_sensor, sighting.seconds)
+        return EvidenceScan(scan.frame, points, scan.world_T_sensor, scan.seconds)
 
     filmed = [(broken(s), labels) for s, labels in film(passing)]
     assert shares(filmed)[CAR] > 0.3
@@ -128,6 +126,6 @@ def test_points_that_are_not_finite_are_left_out():
 
 def test_shapes_are_checked():
     with pytest.raises(FormatError, match=r"expected shape \(N, 3\), found \(5, 4\)"):
-        Sighting(0, np.zeros((5, 4), np.float32), np.eye(4), 0.0)
+        EvidenceScan(0, np.zeros((5, 4), np.float32), np.eye(4), 0.0)
     with pytest.raises(FormatError, match=r"ground: expected shape \(5,\), found \(4,\)"):
-        Sighting(0, np.zeros((5, 3), np.float32), np.eye(4), 0.0, np.zeros(4, bool))
+        EvidenceScan(0, np.zeros((5, 3), np.float32), np.eye(4), 0.0, np.zeros(4, bool))

@@ -6,7 +6,7 @@ from helpers.references.whole_drives import link_segments
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, scan_of
 
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
-from carlasc.motion import segment_by_flow, segment_by_instances, standing_points
+from carlasc.motion import segment_by_flow, segment_by_instances, static_actor_points
 
 FRAMES = range(30)
 TIMES = {frame: frame * PERIOD_S for frame in range(60)}
@@ -17,13 +17,13 @@ def sensor_pose(frame):
 
 
 def tracks_by_flow(actors, frames=FRAMES, hidden=(), **options):
-    segments, standing = [], {}
+    segments, static = [], {}
     for frame in frames:
         if frame not in hidden:
             scan = scan_of(actors, frame, sensor_pose(frame), **options)
             segments += segment_by_flow(frame, scan, sensor_pose(frame))
-            standing[frame] = standing_points(frame, scan, sensor_pose(frame), {10})
-    return link_segments(segments, TIMES, standing)
+            static[frame] = static_actor_points(frame, scan, sensor_pose(frame), {10})
+    return link_segments(segments, TIMES, static)
 
 
 def carried_error(track, actor, frames):

@@ -5,13 +5,13 @@ import pytest
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, box_surface, scan_of
 
 from carlasc.motion.paths import (
-    best_sighting,
+    best_observation,
     corrections,
     ends,
     estimate_path,
     follow,
     headings_by_turns,
-    is_standing,
+    is_static,
 )
 from carlasc.motion.solving import headings_of
 
@@ -19,7 +19,7 @@ FRAMES = range(25)
 SECONDS = np.array(FRAMES) * PERIOD_S
 
 
-def sightings_of(actor, view=None, count=400):
+def observations_of(actor, view=None, count=400):
     return [scan_of([actor], frame, count=count, view_from=view).points.astype(np.float64) for frame in FRAMES]
 
 
@@ -32,30 +32,30 @@ def truth(actor):
 @pytest.mark.parametrize("speed", [5.0, 12.0])
 def test_a_vehicle_is_as_fast_as_it_is_whichever_side_is_seen(view, yaw_rate, speed):
     actor = MovingBox((10, 6, 0), heading=0.4, yaw_rate=yaw_rate, speed=speed)
-    errors = np.linalg.norm(estimate_path(sightings_of(actor, view), SECONDS, rigid=True)[1] - truth(actor), axis=1)
+    errors = np.linalg.norm(estimate_path(observations_of(actor, view), SECONDS, rigid=True)[1] - truth(actor), axis=1)
     assert np.median(errors) < 0.15
 
 
 def test_a_vehicle_that_brakes_is_followed():
     actor = MovingBox((10, 6, 0), speed=lambda time: max(0.0, 8 - 4 * time))
-    errors = np.linalg.norm(estimate_path(sightings_of(actor), SECONDS, rigid=True)[1] - truth(actor), axis=1)
+    errors = np.linalg.norm(estimate_path(observations_of(actor), SECONDS, rigid=True)[1] - truth(actor), axis=1)
     assert np.median(errors) < 0.3
     assert errors[-1] < 0.5
 
 
-def test_sightings_of_few_points_inherit_from_their_track():
+def test_observations_of_few_points_inherit_from_their_track():
     actor = MovingBox((10, 6, 0), speed=8.0)
-    sightings = sightings_of(actor)
+    observations = observations_of(actor)
     for frame in (9, 10, 24):
-        sightings[frame] = np.full((2, 3), 1000.0)  # two stray points far away
-    velocities = estimate_path(sightings, SECONDS, rigid=True)[1]
+        observations[frame] = np.full((2, 3), 1000.0)  # two stray points far away
+    velocities = estimate_path(observations, SECONDS, rigid=True)[1]
     assert np.abs(velocities[[9, 10, 24]] - (8, 0, 0)).max() < 0.5
 
 
 def test_people_are_followed_by_their_middle():
     rng = np.random.default_rng(0)
-    sightings = [rng.uniform(-0.3, 0.3, (80, 3)) * (1, 1, 3) + (1.4 * time, 0, 1) for time in SECONDS]
-    velocities = estimate_path(sightings, SECONDS, rigid=False)[1]
+    observations = [rng.uniform(-0.3, 0.3, (80, 3)) * (1, 1, 3) + (1.4 * time, 0, 1) for time in SECONDS]
+    velocities = estimate_path(observations, SECONDS, rigid=False)[1]
     assert np.abs(np.median(velocities, axis=0) - (1.4, 0, 0)).max() < 0.1
 
 
@@ -71,17 +71,17 @@ def people(rng, count=80):
 
 def test_nine_points_are_too_few_to_follow_and_ten_are_enough():
     for count, used in ((9, False), (10, True)):
-        sightings = people(np.random.default_rng(1))
+        observations = people(np.random.default_rng(1))
         for frame in range(4):
-            sightings[frame] = sightings[frame][:count] + (4.0, 0, 0)
-        velocity = estimate_path(sightings, SECONDS, rigid=False)[1][4]
+            observations[frame] = observations[frame][:count] + (4.0, 0, 0)
+        velocity = estimate_path(observations, SECONDS, rigid=False)[1][4]
         assert (abs(velocity[0] - 1.4) > 0.8) == used
 
 
 def test_a_velocity_changes_by_no_more_than_six_metres_per_second_squared():
-    sightings = people(np.random.default_rng(2))
-    sightings[-2:] = [points + (3.0, 0, 0) for points in sightings[-2:]]
-    changes = np.linalg.norm(np.diff(estimate_path(sightings, SECONDS, rigid=False)[1], axis=0), axis=1)
+    observations = people(np.random.default_rng(2))
+    observations[-2:] = [points + (3.0, 0, 0) for points in observations[-2:]]
+    changes = np.linalg.norm(np.diff(estimate_path(observations, SECONDS, rigid=False)[1], axis=0), axis=1)
     assert changes.max() == pytest.approx(6.0 * PERIOD_S)
 
 
@@ -104,7 +104,7 @@ def test_a_vehicle_in_a_bend_points_where_registration_says():
     assert np.abs(by_turns[:12]).max() < 0.6 * np.abs(by_motion[:12]).max()
 
 
-def test_sightings_are_laid_on_each_other_near_what_is_known():
+def test_observations_are_laid_on_each_other_near_what_is_known():
     actor = MovingBox((10, 6, 0), speed=8.0, yaw_rate=0.2)
     poses = [actor.pose(time) for time in SECONDS]
     true = np.array([[*pose[:3, 3], np.arctan2(pose[1, 0], pose[0, 0])] for pose in poses])
@@ -112,37 +112,37 @@ def test_sightings_are_laid_on_each_other_near_what_is_known():
     waves = np.sin(np.add.outer(SECONDS * np.pi, [0.0, 1.0, 2.0, 3.0]))
     wrong = true + waves * (0.12, 0.12, 0.0, 0.015)
     error = np.array([0.08, 0.08, 0.02, 0.01])
-    laid = wrong + corrections(sightings_of(actor), SECONDS, wrong, error, 12)[0]
+    laid = wrong + corrections(observations_of(actor), SECONDS, wrong, error, 12)[0]
     shape = lambda states: np.std(states - true, axis=0)  # noqa: E731 (a common error of all blurs nothing)
     assert (shape(laid)[:2] < 0.5 * shape(wrong)[:2]).all()
-    few = [points[:2] for points in sightings_of(actor)]
+    few = [points[:2] for points in observations_of(actor)]
     assert np.allclose(wrong + corrections(few, SECONDS, wrong, error, 12)[0], wrong)
 
 
-class TestStanding:
-    def standing(self, sightings, velocity=(0.0, 0.0, 0.0)):
+class TestStatic:
+    def static(self, observations, velocity=(0.0, 0.0, 0.0)):
         positions = np.outer(SECONDS, velocity) + (10, 0, 0)
-        return is_standing(sightings, positions, np.zeros(len(SECONDS)), SECONDS)
+        return is_static(observations, positions, np.zeros(len(SECONDS)), SECONDS)
 
-    def test_sightings_at_one_place_are_of_a_standing_actor(self):
-        assert self.standing([box_surface((4, 2, 1.5), 300, seed) for seed in range(25)], (0.5, 0, 0))
+    def test_observations_at_one_place_are_of_a_static_actor(self):
+        assert self.static([box_surface((4, 2, 1.5), 300, seed) for seed in range(25)], (0.5, 0, 0))
 
-    def test_sightings_that_overlap_only_after_their_motion_are_of_a_moving_one(self):
+    def test_observations_that_overlap_only_after_their_motion_are_of_a_moving_one(self):
         moving = [box_surface((4, 2, 1.5), 300, seed) + (8 * time, 0, 0) for seed, time in enumerate(SECONDS)]
-        assert not self.standing(moving, (8.0, 0, 0))
+        assert not self.static(moving, (8.0, 0, 0))
 
-    def test_sightings_that_never_overlap_are_not_of_a_standing_one(self):
+    def test_observations_that_never_overlap_are_not_of_a_static_one(self):
         rng = np.random.default_rng(3)
-        assert not self.standing([rng.uniform(-4, 4, (12, 3)) for _ in SECONDS])
+        assert not self.static([rng.uniform(-4, 4, (12, 3)) for _ in SECONDS])
 
-    def test_a_single_sighting_is_of_a_standing_actor(self):
-        assert is_standing([np.zeros((5, 3))], np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+    def test_a_single_observation_is_of_a_static_actor(self):
+        assert is_static([np.zeros((5, 3))], np.zeros((1, 3)), np.zeros(1), np.zeros(1))
 
 
 def test_a_path_goes_on_evenly_on_both_sides_of_where_it_starts():
     actor = MovingBox((10, 6, 0), speed=8.0)
-    sightings = sightings_of(actor)
-    path, _ = follow(sightings, SECONDS, best_sighting(sightings))
+    observations = observations_of(actor)
+    path, _ = follow(observations, SECONDS, best_observation(observations))
     assert np.abs(np.diff(path, axis=0) - (0.8, 0, 0)).max() < 0.1
 
 

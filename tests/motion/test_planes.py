@@ -22,8 +22,8 @@ def pairs(points, pose, model, squared):
     return nearest_within(points, pose, ordered, order, axis, squared)
 
 
-def sighting(rng, count=300):
-    """Two sides of a car, some of whose points are in cells that another sighting had."""
+def observation(rng, count=300):
+    """Two sides of a car, some of whose points are in cells that another observation had."""
     points = rng.uniform(0, 1, (count, 3)) * (4.4, 1.8, 1.5)
     points[: count // 2, 1] = 0
     points[count // 2 :, 0] = 4.4
@@ -54,7 +54,7 @@ def test_covariances_are_those_of_the_points_within_the_radius():
 
 
 def test_sums_that_grow_have_the_same_bits_as_sums_over_all_points():
-    model, sums, known = sighting(np.random.default_rng(1), 120), np.zeros((120, 10)), 0
+    model, sums, known = observation(np.random.default_rng(1), 120), np.zeros((120, 10)), 0
     for count in (50, 51, 90, 120):
         before = sums[:count].copy()
         changed = extend_sums(model[:count], known, RADIUS_M, sums[:count])
@@ -71,7 +71,7 @@ def test_a_model_that_grows_is_the_model_of_all_points(size):
     rng = np.random.default_rng(2)
     model, plain, thinned = None, np.empty((0, 3)), False
     for _ in range(8):
-        points = sighting(rng) * size
+        points = observation(rng) * size
         plain = plain_thin(np.concatenate([plain, points]))
         if model is None:
             model = planes_of(points)
@@ -86,7 +86,7 @@ def test_a_model_that_grows_is_the_model_of_all_points(size):
 
 
 def test_points_in_cells_that_are_known_change_nothing():
-    points = sighting(np.random.default_rng(3))
+    points = observation(np.random.default_rng(3))
     model = planes_of(points)
     before = model.points, model.normals
     model.add(points[::-1])
@@ -124,7 +124,7 @@ def test_pairs_are_those_of_all_distances(axis):
 
 def test_pairs_of_a_turned_actor_have_the_bits_of_numpy():
     rng = np.random.default_rng(6)
-    model, points = planes_of(sighting(rng)), sighting(rng) + (30, -20, 1)
+    model, points = planes_of(observation(rng)), observation(rng) + (30, -20, 1)
     pose = translation((30.2, -20.1, 1)) @ rotation_z(0.1)
     squared = np.square(transform_points(invert(pose), points)[:, None] - model.points).sum(axis=2)
     rows, nearest = pairs(points, pose, model, 0.04)
@@ -134,7 +134,7 @@ def test_pairs_of_a_turned_actor_have_the_bits_of_numpy():
 
 
 def test_a_pose_that_is_not_finite_pairs_nothing():
-    model = planes_of(sighting(np.random.default_rng(7)))
+    model = planes_of(observation(np.random.default_rng(7)))
     rows, nearest = pairs(model.points, np.full((4, 4), np.nan), model, 1.0)
     assert len(rows) == len(nearest) == 0
 
@@ -164,7 +164,7 @@ def box():
     return box_surface((4.4, 1.8, 1.5), 800, 1), box_surface((4.4, 1.8, 1.5), 300, 2)
 
 
-def test_a_sighting_is_laid_on_the_planes_wherever_it_is_expected(box):
+def test_an_observation_is_laid_on_the_planes_wherever_it_is_expected(box):
     model, seen = model_of(box[0]), transform_points(pose_of(STATE), box[1])
     for offset in ((0.2, 0, 0, 0), (0, -0.25, 0, 0.03), (-0.1, 0.1, 0.05, -0.04)):
         found = register(seen, model, STATE + offset, ERROR, STATE[:3], NO_SHIFTS)

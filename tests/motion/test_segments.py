@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carlasc.core.scans import Scan
-from carlasc.motion import Segment, segment_by_flow, segment_by_instances, standing_points
+from carlasc.motion import Segment, segment_by_flow, segment_by_instances, static_actor_points
 
 CAR, PERSON = 10, 4
 
@@ -59,7 +59,7 @@ def test_numbered_actors_are_segments_whether_they_move_or_not():
     assert [segment.velocity[0] for segment in segments] == [8.0, 0.0]
 
 
-class TestStandingPoints:
+class TestStaticPoints:
     def segment(self, count=40, label=CAR):
         points = np.random.default_rng(1).uniform(-1, 1, (count, 3))
         return Segment(7, label, np.arange(count), points, np.array([1.0, 0, 0]))
@@ -68,29 +68,29 @@ class TestStandingPoints:
     def test_a_fifth_of_the_points_is_enough_to_find_an_actor_that_stopped(self, count, found):
         seen = scan((0, 0, CAR, 0.0))
         part = Scan(seen.points[:count], seen.labels[:count], seen.flow[:count])
-        standing = standing_points(8, part, np.eye(4), {CAR})
-        assert (standing.segment_at(self.segment()) is not None) == found
+        static = static_actor_points(8, part, np.eye(4), {CAR})
+        assert (static.segment_at(self.segment()) is not None) == found
 
     def test_at_least_five_points_are_needed(self):
         seen = scan((0, 0, CAR, 0.0))
         for number, found in ((5, True), (4, False)):
             part = Scan(seen.points[:number], seen.labels[:number], seen.flow[:number])
-            standing = standing_points(8, part, np.eye(4), {CAR})
-            assert (standing.segment_at(self.segment(5)) is not None) == found
+            static = static_actor_points(8, part, np.eye(4), {CAR})
+            assert (static.segment_at(self.segment(5)) is not None) == found
 
     def test_only_points_of_its_class_at_its_place_count(self):
-        standing = standing_points(8, scan((0, 0, CAR, 0.0)), np.eye(4), {CAR})
-        found = standing.segment_at(self.segment())
+        static = static_actor_points(8, scan((0, 0, CAR, 0.0)), np.eye(4), {CAR})
+        found = static.segment_at(self.segment())
         assert (found.frame, found.label, len(found.members)) == (8, CAR, 20)
         assert not found.velocity.any()
-        assert standing.segment_at(self.segment(label=PERSON)) is None
+        assert static.segment_at(self.segment(label=PERSON)) is None
         for x, near in ((1.4, True), (1.7, False)):  # half a metre around the segment's points
-            other = standing_points(8, scan((x, 0, CAR, 0.0)), np.eye(4), {CAR})
+            other = static_actor_points(8, scan((x, 0, CAR, 0.0)), np.eye(4), {CAR})
             assert (other.segment_at(self.segment()) is not None) == near
 
     def test_moving_points_and_other_classes_are_left_out(self):
         seen = scan((0, 0, CAR, 0.0), (5, 0, CAR, 8.0), (9, 0, 7, 0.0))
-        assert standing_points(0, seen, np.eye(4), {CAR}).members.tolist() == list(range(20))
+        assert static_actor_points(0, seen, np.eye(4), {CAR}).members.tolist() == list(range(20))
 
 
 def test_ground_points_are_in_no_actor_whatever_their_number():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.references.whole_drives import link_segments
 
-from carlasc.motion import Segment, Standing
+from carlasc.motion import Segment, StaticPoints
 
 CAR, PERSON = 10, 4
 TIMES = {frame: 0.1 * frame for frame in range(100)}
@@ -95,24 +95,24 @@ def test_an_actor_that_stays_in_place_does_not_move_however_fast_its_points_are(
     assert not any(track.moves for track in link_segments(jitter, TIMES))
 
 
-def standing(frame, x):
+def static(frame, x):
     found = segment(frame, x)
-    return Standing(frame, np.arange(9), np.full(9, CAR), found.points)
+    return StaticPoints(frame, np.arange(9), np.full(9, CAR), found.points)
 
 
-def test_a_track_is_extended_back_to_where_its_actor_was_standing():
+def test_a_track_is_extended_back_to_where_its_actor_was_static():
     moving = drive(range(10, 15), 1.0)
-    still = {frame: standing(frame, 1.0) for frame in range(10)}
+    still = {frame: static(frame, 1.0) for frame in range(10)}
     (track,) = link_segments(moving, TIMES, still)
     assert sorted(track.members) == list(range(15))
-    fast = drive(range(10, 15), 8.0)  # it cannot have been standing a moment before
-    (track,) = link_segments(fast, TIMES, {frame: standing(frame, 8.0) for frame in range(10)})
+    fast = drive(range(10, 15), 8.0)  # it cannot have been static a moment before
+    (track,) = link_segments(fast, TIMES, {frame: static(frame, 8.0) for frame in range(10)})
     assert sorted(track.members) == list(range(10, 15))
 
 
 def test_a_slow_actor_that_stops_is_followed_and_a_fast_one_is_not():
     for speed, last in ((1.0, 19), (8.0, 14)):
-        still = {frame: standing(frame, speed * 1.4) for frame in range(15, 20)}
+        still = {frame: static(frame, speed * 1.4) for frame in range(15, 20)}
         (track,) = link_segments(drive(range(10, 15), speed), TIMES, still)
         assert max(track.members) == last
 

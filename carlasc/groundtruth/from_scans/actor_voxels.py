@@ -1,4 +1,4 @@
-"""Which actor each voxel of a frame from merged scans belongs to: of what moves by its body, of what stands by the numbers that the data have; and which of them no scan saw."""
+"""The actor of each voxel of a frame from merged scans: moving actors by their bodies, static ones by the numbers of the data."""
 
 from __future__ import annotations
 
@@ -18,35 +18,31 @@ from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
 from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of, number_actors
 from carlasc.motion import BODY_MARGIN_M
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 from carlasc.storage.protocol import Sequence
 
-_CLASS_PARTS = 1 << 10  # numbers whose upper 16 bits are below this may have a class there
-_TURN_FRAMES = 3  # frames before and after, between which the turning of an actor is measured
+_CLASS_PARTS = 1 << 10  # in the upper 16 bits, smaller values may be a class
+_TURN_FRAMES = 3  # frames before and after, between which the turn rate of an actor is measured
 Numbered = tuple[NDArray[np.float32], NDArray[np.int64]]
-_NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = (
-    WeakKeyDictionary()
-)  # the numbered points of scans, for the frames that follow
+_NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = WeakKeyDictionary()  # the numbered points of scans
 
 
 def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
-    """Return the actors with their numbers over the whole sequence."""
+    """Return the actors with their numbers in the whole sequence."""
     highest = max((int(actor["instance"]) for actor in actors.summary), default=0)
-    numbered = [track for track in actors.tracks.values() if 0 < track.instance < FIRST_MOVER]
+    numbered = [track for track in actors.tracks.values() if 0 < track.instance < FIRST_FOUND]
     if len(numbered) < len(actors.tracks):
         upper = lower = 0
         for given in _numbers_of(feed.sequence):
             highest, upper = max(highest, int(given.max(initial=0))), max(upper, int(given.max(initial=0)) >> 16)
             lower = max(lower, int((given & 0xFFFF).max(initial=0)))
-        if (
-            upper < _CLASS_PARTS
-        ):  # new numbers differ in the lower half too, which is all that SemanticKITTI's files keep
+        if upper < _CLASS_PARTS:  # new numbers are unique in the lower half too: SemanticKITTI's files keep it alone
             highest = max(highest, upper << 16 | lower)
     return replace(actors, numbers=number_actors(actors.tracks, highest))
 
 
 def _numbers_of(sequence: Sequence) -> Iterator[NDArray[np.int64]]:
-    """Yield the numbers that the data give to actors: those of the points of each scan, and the tracks of its boxes."""
+    """Yield the numbers of actors in the data: of the points of each scan, and of the tracks of its boxes."""
     fields = sequence.fields()
     for frame in sequence.frames("instances").tolist() if "instances" in fields else ():
         yield sequence.read("instances", frame).astype(np.int64)
@@ -68,11 +64,11 @@ def find_voxels(
     Args:
         spec: the grid.
         feed: the scans.
-        actors: what moves, with numbers.
+        actors: the moving actors, with numbers.
         now: the frame.
         regions: the voxels of their bodies.
         window: frames whose scans were merged.
-        labels: (V,) the classes of the grid, ground by its classes.
+        labels: (V,) classes of the grid, with ground classes.
     """
     classes, instance = feed.classes, np.zeros(spec.num_voxels, np.uint32)
     solid = (labels > 0) & ~np.isin(labels, sorted(classes.ground))
@@ -93,7 +89,7 @@ def find_voxels(
 
 
 def velocity_at(track: Track, frame: int, places: NDArray[np.float64], feed: ScanFeed) -> NDArray[np.float64]:
-    """Return (N, 3) m/s, world, of places of an actor, (N, 3) metres, world: it moves, and turns about the vertical."""
+    """Return the (N, 3) velocities, m/s, world, of (N, 3) positions on an actor, metres, world, which moves and turns about the vertical."""
     row, known = frame - track.first, feed.frames
     near = np.clip([frame - _TURN_FRAMES, frame + _TURN_FRAMES], known[0], known[-1]) - track.first
     before, after = np.clip(near, 0, len(track.world_T_actor) - 1).tolist()
@@ -113,7 +109,7 @@ def _number_points(
     free: NDArray[np.bool_],
     instance: NDArray[np.uint32],
 ) -> None:
-    """Give voxels without an actor the number that most points in them have, of those that do not move."""
+    """Give voxels without an actor the most frequent number of the static points in them."""
     if "instances" not in feed.sequence.fields():
         return
     moving = {track.instance for track in actors.tracks.values()}
@@ -125,19 +121,19 @@ def _number_points(
         if frame not in kept:
             kept[frame] = _numbered(feed, frame)
         points, numbers = kept[frame]
-        standing = ~np.isin(numbers, list(moving))
-        points, numbers = points[standing], numbers[standing]
+        static = ~np.isin(numbers, list(moving))
+        points, numbers = points[static], numbers[static]
         found = spec.flat_index(transform_points(now.grid_T_world, points))
         used = found >= 0
         used[used] = free[found[used]]
         pairs.append(found[used].astype(np.int64) << 32 | numbers[used])
     keys, counts = np.unique(np.concatenate(pairs), return_counts=True)
-    order = np.argsort(counts, kind="stable")  # the number of most points is written last
+    order = np.argsort(counts, kind="stable")  # the most frequent number is written last
     instance[keys[order] >> 32] = (keys[order] & 0xFFFFFFFF).astype(np.uint32)
 
 
 def _numbered(feed: ScanFeed, frame: int) -> Numbered:
-    """Return the points of a scan that have numbers, (M, 3) metres, world, and their numbers."""
+    """Return the (M, 3) numbered points of a scan, metres, world, and their (M,) numbers."""
     scan = feed.sequence.scan(frame, ("instances",))
     if scan.instances is None:
         return np.empty((0, 3), np.float32), np.empty(0, np.int64)
@@ -153,7 +149,7 @@ def _number_boxes(
     free: NDArray[np.bool_],
     instance: NDArray[np.uint32],
 ) -> None:
-    """Give voxels without an actor the number of the frame's box that they are in, the smallest one."""
+    """Give voxels without an actor the number of the smallest box of the frame that contains them."""
     boxes = feed.sequence.boxes(now.frame) if "boxes" in feed.sequence.fields() else None
     if boxes is None or not len(boxes):
         return
@@ -178,8 +174,8 @@ class BodyRegions:
     Attributes:
         of_voxel: (V,) uint16, region of each voxel; STATIC outside of all bodies.
         actors: number of the actor by region, for the regions that have voxels.
-        hidden: (H,) flat indices of voxels of a body's face that no scan saw. Rays beside the body go through them: they say nothing of it.
-        hidden_ends: (E,) those of a face that is hidden also if the body is completed by its mirror image.
+        hidden: (H,) flat indices of voxels of faces that no scan saw. Rays beside the body pass through them, and do not count there.
+        hidden_ends: (E,) the same for faces that are hidden also in the mirror image of the body.
     """
 
     of_voxel: NDArray[np.uint16]
@@ -189,10 +185,10 @@ class BodyRegions:
 
     @classmethod
     def at(cls, merger: Merger, now: Instant, window: Collection[int], spec: GridSpec) -> BodyRegions:
-        """Return the regions of a frame: of the bodies of what moves, and of moving points without a body.
+        """Return the regions of a frame: of the bodies of moving actors, and of moving points without a body.
 
         Args:
-            merger: what moves, and the scans.
+            merger: the moving actors, and the scans.
             now: the frame.
             window: frames whose scans are merged.
             spec: the grid.
@@ -207,7 +203,7 @@ class BodyRegions:
         return regions
 
     def with_points(self, spec: GridSpec, points: NDArray[np.floating]) -> BodyRegions:
-        """Return the regions with one more, of the voxels of points that move and belong to no body: only the frame's own rays vote there.
+        """Return the regions with another one for the voxels of moving points without a body. Only the frame's own rays vote there.
 
         Args:
             spec: the grid.
@@ -223,7 +219,7 @@ class BodyRegions:
     def of_bodies(cls, spec: GridSpec, world_T_grid: Transform, bodies: Series[tuple[int, Track, Transform]]) -> Self:
         """Return the regions of bodies: (number, track, world_T_actor) of each actor.
 
-        A body has all voxels that it touches. Where bodies overlap, the smaller one takes precedence.
+        A body has all voxels that it touches. Where bodies overlap, the smaller body has the voxel.
         """
         of_voxel = np.zeros(spec.num_voxels, np.uint16)
         hidden, hidden_ends = np.zeros(spec.num_voxels, np.bool_), np.zeros(spec.num_voxels, np.bool_)
@@ -258,13 +254,13 @@ class BodyRegions:
 def _on_hidden_face(
     track: Track, cells: NDArray[np.float64], slack: NDArray[np.float64], faces: tuple[bool, bool, bool, bool]
 ) -> NDArray[np.bool_]:
-    """Return which cells, (C, 3) centres in the actor's frame, touch a face that was not seen, and none that was seen.
+    """Return (C,) bool: which cells touch an unseen face and no seen face of an actor.
 
     Args:
         track: the actor.
-        cells: centres of cells that its body touches.
+        cells: (C, 3) centres of cells that its body touches, metres, actor frame.
         slack: (C, 3) half the extent of each cell along the axes of the actor.
-        faces: whether the rear, the front, the side of low y and the side of high y were seen.
+        faces: whether scans saw the rear, the front, the side of low y and the side of high y.
     """
     lower, upper = track.lower + BODY_MARGIN_M, track.upper - BODY_MARGIN_M
     away = np.stack([cells[:, 0] - lower[0], upper[0] - cells[:, 0], cells[:, 1] - lower[1], upper[1] - cells[:, 1]])

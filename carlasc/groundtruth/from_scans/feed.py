@@ -1,4 +1,4 @@
-"""The scans that are merged into each frame: which ones, and read and prepared only once for all frames that share them."""
+"""The scans that are merged into each frame. Each scan is read and prepared once for all frames that share it."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from carlasc.groundtruth.from_scans.merging import Instant, Merger, PreparedScan
 from carlasc.groundtruth.inputs import without_caches
 from carlasc.groundtruth.options import FromScans
 from carlasc.motion import (
+    EvidenceScan,
     Segment,
-    Sighting,
-    Standing,
+    StaticPoints,
     Track,
     ground_points,
     is_fast,
     segment_by_boxes,
     segment_by_flow,
     segment_by_instances,
-    standing_points,
+    static_actor_points,
 )
 from carlasc.motion.tracks import MovingActors
 from carlasc.storage import layout
@@ -39,11 +39,11 @@ from carlasc.storage.protocol import Sequence
 from carlasc.storage.resuming import scans_digest
 from carlasc.storage.views import SequenceView
 
-_SIGHTING_POINTS = 400  # points of an actor in one scan that its motion and its body are estimated from
-_SAMPLES = 5  # scans that are looked at to see whether labels name the ground
-_OTHERWISE = 0.1  # share of the points on the ground with other classes: feet of walls and kerbs have 2 to 4 %, labels that are often wrong 15 %
+_ACTOR_POINTS = 400  # greatest number of points of an actor in one scan, for its motion and its body
+_SAMPLES = 5  # number of scans that decide whether labels name the ground
+_OTHERWISE = 0.1  # greatest share of ground points with other classes: walls and kerbs give 2 to 4 %, labels that are often wrong 15 %
 _USED = ("labels", "flow", "instances", "origins", "probabilities")  # fields of a scan that are read for merging
-_PARTS = 30  # with `window_m`, scans are at least this fraction of it apart
+_PARTS = 30  # with `window_m`, scans are at least this part of it apart
 
 
 @dataclass(frozen=True)
@@ -52,19 +52,19 @@ class ScanMotion:
 
     Attributes:
         frame: frame number.
-        segments: actors that may move, with at most `_SIGHTING_POINTS` points each; `members` are complete.
-        standing: standing points of classes that may move.
+        segments: actors that may move, with at most `_ACTOR_POINTS` points each; `members` are complete.
+        static: static points of classes that may move.
     """
 
     frame: int
     segments: tuple[Segment, ...]
-    standing: Standing
+    static: StaticPoints
 
 
 class WithoutScans(SequenceView):
-    """A sequence some of whose scans are hidden. The poses and times of these frames are still known.
+    """A sequence with some hidden scans. The poses and times of these frames are still known.
 
-    A hidden frame is not listed among the frames of a scan's fields, and reads as a scan without points.
+    A hidden frame is not among the frames of the fields of scans, and reads as a scan without points.
 
     Args:
         whole: the sequence.
@@ -76,7 +76,7 @@ class WithoutScans(SequenceView):
         self.hidden = frozenset(hidden)
 
     def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames of a field; without the hidden ones if it is a field of the scans."""
+        """Return the frames of a field, without hidden ones if it is a field of the scans."""
         frames = self.whole.frames(field)
         return frames[~np.isin(frames, sorted(self.hidden))] if field in layout.SCAN_FIELDS else frames
 
@@ -89,10 +89,10 @@ class WithoutScans(SequenceView):
 
 
 class ScanFeed:
-    """The scans of one sequence, as merging needs them.
+    """The scans of one sequence for merging, with a cache.
 
     A feed pickles as the sequence and the options. Its copies in a process share one cache of scans. Another feed of the same sequence has
-    another cache, because files may have changed since.
+    its own cache, because files may have changed.
 
     Attributes:
         sequence: the sequence that the scans are read from.
@@ -117,14 +117,14 @@ class ScanFeed:
         return _restore, (self._key, without_caches(self.sequence), self.options)
 
     def without(self, hidden: Collection[int]) -> ScanFeed:
-        """Return the scans without those of some frames, which neither vote nor show how actors move.
+        """Return a feed without the scans of some frames: they neither vote nor show motion.
 
-        What the vehicle itself drove through is no evidence either.
+        The space that the recording vehicle drove through does not count as free either.
         """
         return ScanFeed(WithoutScans(self.sequence, hidden), replace(self.options, own_path=False))
 
     def under(self, sequence: Sequence) -> ScanFeed:
-        """Return the same scans under other poses, which `sequence` has."""
+        """Return a feed of the same scans under the poses of `sequence`."""
         other = ScanFeed(sequence, self.options)
         if "digest" in vars(self):
             other.digest = self.digest
@@ -132,7 +132,7 @@ class ScanFeed:
 
     @cached_property
     def digest(self) -> str:
-        """Digest of some scans, by which what was derived of the sequence is known again."""
+        """Digest of some scans, which identifies derived results of the sequence."""
         return scans_digest(self.sequence, self.frames)
 
     @cached_property
@@ -152,7 +152,7 @@ class ScanFeed:
 
     @cached_property
     def finds_ground(self) -> bool:
-        """Whether ground points have to be found, because no labels name them: none of some scans has points of a ground class."""
+        """Whether ground points have to be found: in some scans, no label is of a ground class."""
         if not self.classes.ground:
             return False
         ground = sorted(self.classes.ground)
@@ -160,7 +160,7 @@ class ScanFeed:
 
     @cached_property
     def names_ground(self) -> bool:
-        """Whether labels name the ground where it is: not if many points that lie on it have other classes, in some scans."""
+        """Whether labels name the ground: in some scans, few points on the ground have other classes."""
         scans = [self._voting_points(frame) for frame in self._sampled] if self.classes.ground else []
         found = [_labels(scan)[ground_points(scan.points)] for scan in scans]
         others = sum(int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground)))) for labels in found)
@@ -168,14 +168,14 @@ class ScanFeed:
 
     @property
     def _sampled(self) -> list[int]:
-        """Some frames with labels, which not all need to have."""
+        """Some frames with labels. Other frames may have none."""
         labelled = self.sequence.frames("labels")
         chosen = np.unique(np.linspace(0, len(labelled) - 1, _SAMPLES).astype(int)) if len(labelled) else labelled
         return labelled[chosen].tolist()
 
     @cached_property
     def motion(self) -> tuple[str, ...]:
-        """What tells how things move: "boxes", "instances" or "flow", and "evidence"; nothing if all points stay where they were seen.
+        """The sources of motion: "boxes", "instances" or "flow", and "evidence"; empty if all points count as static.
 
         Raises:
             MissingDataError: the options ask for a field that the sequence does not have.
@@ -191,7 +191,7 @@ class ScanFeed:
             if name in fields and (name == "boxes" or "labels" in fields)
         ]
         if asked == "auto":
-            # Boxes show what annotators saw, often in the view of a camera only; flow that comes from them knows no more.
+            # Boxes may be missing, as outside of the view of a camera. Flow that was made from boxes has the same gaps.
             whole = "flow" in usable and "boxes" not in usable
             return (*usable[:1], *(() if whole else ("evidence",)))
         if asked not in usable:
@@ -205,12 +205,12 @@ class ScanFeed:
 
     @property
     def needs_actors(self) -> bool:
-        """Whether the actors must be known before a frame can be made: flow and classes show what moves now without them."""
+        """Whether the actors must be found before a frame can be made. Flow and classes show moving points without them."""
         return self.options.dynamic == "align" if self.motion == ("flow",) else bool(self.motion)
 
     @property
     def reads(self) -> int:
-        """Number of scans that are read to find the actors: fields and evidence of motion are looked at one after the other."""
+        """Number of scans that are read to find the actors; fields and evidence of motion take a pass each."""
         if not self.needs_actors:
             return 0
         return len(self.frames) * (any(name != "evidence" for name in self.motion) + ("evidence" in self.motion))
@@ -243,7 +243,7 @@ class ScanFeed:
         ]
 
     def _by_distance(self, frame: int, others: NDArray[np.int64]) -> Iterator[int]:
-        """Yield those of `others`, in order of distance from `frame`, that are within `window_m` and not too close to each other."""
+        """Yield the frames of `others` within `window_m` that are not too close to each other, in order of distance from `frame`."""
         limit = self.options.window_m or np.inf
         driven, last_taken, previous = 0.0, 0.0, self.pose(frame)[:3, 3]
         for other in others:
@@ -261,7 +261,7 @@ class ScanFeed:
         return self.sequence.read_pose(frame)
 
     def merger(self, actors: MovingActors, frame: int) -> Merger:
-        """Return what merges scans into a frame, given the actors of its window. Its caches are kept from frame to frame."""
+        """Return the merger of scans into a frame, with the actors of its window. Its caches are kept from frame to frame."""
         with self._lock:
             if self._merger is None:
                 self._merger = Merger(self.read, actors, self.classes, self.options.dynamic)
@@ -270,7 +270,7 @@ class ScanFeed:
             return self._merger
 
     def instant(self, frame: int) -> Instant:
-        """Return the time and the place of a frame."""
+        """Return the time and the pose of a frame."""
         return Instant(frame, self.time(frame), self.pose(frame))
 
     def time(self, frame: int) -> float:
@@ -304,15 +304,15 @@ class ScanFeed:
             return self._scans[frame]
 
     def static_points(self, frame: int) -> NDArray[np.float32]:
-        """Return the (N, 3) points of a scan whose class cannot move, all of them without labels, metres, sensor frame."""
+        """Return the (N, 3) points of a scan of classes that cannot move, metres, sensor frame; all points without labels."""
         scan = self.sequence.scan(frame, ("labels", "origins"))
         static = self._in_range(scan)
         if scan.labels is not None:
             static &= ~np.isin(scan.labels, sorted(self.classes.movable))
         return np.ascontiguousarray(scan.points[static], np.float32)
 
-    def sighting(self, frame: int, boxes: Sequence_[Track]) -> Sighting:
-        """Return a scan as evidence of motion needs it; points of actors that the sequence's own fields show are marked.
+    def evidence_scan(self, frame: int, boxes: Sequence_[Track]) -> EvidenceScan:
+        """Return a scan for evidence of motion. Points of actors that the fields of the sequence show are marked.
 
         Args:
             frame: frame number.
@@ -325,23 +325,23 @@ class ScanFeed:
         ground = np.isin(_labels(scan), sorted(self.classes.ground)) if self.names_ground or self.finds_ground else None
         labels = _labels(scan) if self.has_labels else None
         origins = scan.others.get("origins")
-        return Sighting(frame, scan.points, pose, self.time(frame), ground, labels, explained, origins)
+        return EvidenceScan(frame, scan.points, pose, self.time(frame), ground, labels, explained, origins)
 
     def segments(self, frame: int, boxes: Sequence_[Track]) -> ScanMotion:
-        """Return the actors of a scan, as the sequence's own fields show them.
+        """Return the actors of a scan that the fields of the sequence show.
 
         Args:
             frame: frame number.
             boxes: the tracks of the sequence's boxes.
         """
-        scan, standing, speed = self._voting_points(frame), Standing.empty(frame), self.options.motion.min_speed_m_s
+        scan, static, speed = self._voting_points(frame), StaticPoints.empty(frame), self.options.motion.min_speed_m_s
         if self.motion[:1] == ("flow",):
-            standing = standing_points(frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed)
+            static = static_actor_points(frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed)
         found = self._segments(frame, scan, boxes)
-        return ScanMotion(frame, tuple(replace(s, points=thin(s.points, _SIGHTING_POINTS)) for s in found), standing)
+        return ScanMotion(frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in found), static)
 
     def _segments(self, frame: int, scan: Scan, boxes: Sequence_[Track]) -> list[Segment]:
-        """Return the actors of a scan with all of their points."""
+        """Return the actors of a scan with all their points."""
         pose, ground, by = self.pose(frame), self.classes.ground, [*self.motion, ""][0]
         if by == "flow":
             return segment_by_flow(frame, scan, pose, min_speed_m_s=self.options.motion.min_speed_m_s)
@@ -350,7 +350,7 @@ class ScanFeed:
         return segment_by_boxes(frame, scan, pose, boxes, ground=ground) if by == "boxes" else []
 
     def _voting_points(self, frame: int) -> Scan:
-        """Read a scan without the points that do not vote: unlabelled, too near or too far. Points with one origin are together."""
+        """Read the voting points of a scan: without unlabelled, too near and too far ones. Points with one origin follow each other."""
         scan = self.sequence.scan(frame, _USED)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
@@ -368,20 +368,20 @@ class ScanFeed:
         return scan.select(order[voting[order]])
 
     def _in_range(self, scan: Scan) -> NDArray[np.bool_]:
-        """Return (N,) which points are neither too near to where their rays began nor too far away; those that are not finite are not."""
+        """Return (N,) bool: which points are finite, and neither too near to the origins of their rays nor too far."""
         origins = scan.others.get("origins")
         with np.errstate(invalid="ignore", over="ignore"):
             distance = lengths(scan.points if origins is None else scan.points - origins)
             return (distance >= self.min_range_m) & (distance <= self.max_range_m)
 
     def _with_ground(self, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger]) -> NDArray[np.uint32]:
-        """Return labels in which geometry without a class that lies on the ground has a ground class, so that it votes as ground does."""
+        """Return labels in which points without a class on the ground have a ground class, so that they vote as ground."""
         found = np.asarray(labels, np.uint32).copy()
         found[ground_points(points) & (labels == self.classes.geometry_id)] = min(self.classes.ground)
         return found
 
 
-_FEEDS: dict[str, ScanFeed] = {}  # the feed of this process, by the key that its copies share: see ScanFeed
+_FEEDS: dict[str, ScanFeed] = {}  # the feed of this process, by the key of its copies: see ScanFeed
 
 
 def _restore(key: str, sequence: Sequence, options: FromScans) -> ScanFeed:

@@ -1,4 +1,4 @@
-"""The grid of one frame, made from the scans of a window."""
+"""The grid of one frame, merged from the scans of a window."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from carlasc.groundtruth.voting.consensus import ClassConsensus, agree
 from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.motion.tracks import MovingActors
 
-# The volume that certainly belongs to the recording vehicle, and to every vehicle that carries a LiDAR: metres around the sensor.
+# The volume that is inside of any recording vehicle: metres around the sensor.
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
-_RETURNED_PROBABILITY = 0.6  # that a voxel is occupied in which this scan has a return, and which other scans call free
-# Hits per metre of free path, in a voxel with a return of the frame's own scan, below which this return is an outlier: with other returns around
-# it, and alone.
+_RETURNED_PROBABILITY = 0.6  # of a voxel with a return of this scan that other scans saw free
+# Hits per metre of free path in a voxel with a return of the frame's own scan, below which this return is an outlier: with other returns around
+# it, and without.
 _OUTLIER_PER_M, _SINGLE_PER_M = 0.02, 0.05
-# Probabilities above which a voxel of a body is not free, and below which it is not occupied.
+# A voxel of a body with a greater probability is not free, and one with a smaller probability is not occupied.
 _DOUBTFUL, _UNSURE = 0.05, 0.75
 _NO_VOXELS = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
 class MergedFrame:
-    """What the scans of a window say of a frame.
+    """The grid of a frame, merged from the scans of a window.
 
     Attributes:
         grid: the grid.
-        votes: the votes that decided it, without what completes actors.
-        evidence: how certain each voxel is; None unless the plan asks for it.
-        actors: who is in each voxel; None unless the plan asks for it.
+        votes: the votes that decided it, without those that complete actors.
+        evidence: the certainty of each voxel; None unless the plan needs it.
+        actors: the actor of each voxel; None unless the plan needs it.
     """
 
     grid: Grid
@@ -67,7 +67,7 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
     Args:
         plan: geometry of the grid, and how votes are counted.
         feed: the scans of the sequence.
-        actors: what moves in them.
+        actors: the moving actors.
         frame: frame number.
         window: frames whose scans are merged; the frame itself need not be one of them.
     """
@@ -75,28 +75,28 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
 
     merger.rays = options.rays if plan.rule == "ray" else "all"
 
-    # The static scene votes everywhere, and each moving actor in the voxels of its body.
+    # The static scene votes in all voxels, and each moving actor in the voxels of its body.
     regions = BodyRegions.at(merger, now, window, plan.spec)
     steps, bodies = _FrameSteps(plan, feed, merger, now, window, regions), regions.actors
-    recent = merger.recent(now, window)  # first, so that what they saw is known apart from what others did
+    recent = merger.recent(now, window)  # first, to know which voxels they saw
     ballot = steps.vote(merger.observations(now, recent, {}), count_views=plan.needs_evidence)
     seen_now = ballot.seen()
     others = merger.observations(now, (other for other in window if other not in recent), {})
     steps.vote(chain(others, merger.in_bodies(now, window, bodies)), ballot)
     votes, views = ballot.votes(copy=False), ballot.views if plan.needs_evidence else None
-    del ballot  # its memory is needed by the next ones
+    del ballot  # frees memory for the next ballots
     if plan.rule != "ray":
         whole = votes.to_grid()
         return MergedFrame(whole, votes, actors=steps.actors(whole.labels.reshape(-1)))
     consensus = None if options.dynamic == "tube" else agree(votes.occupied, plan.spec, classes)
     made = steps.decide_seen(votes, consensus)
 
-    # What rays beside a body, or of other times, saw as free says nothing of these voxels.
+    # In these voxels, free space of rays beside a body or of other times does not count.
     contested = steps.contested()
     doubtful = np.concatenate([regions.hidden, steps.unseen_now(contested[~seen_now[contested]], recent)])
     made.forget(doubtful[made.labels[doubtful] == 0])
 
-    # Actors are completed by their mirror images, then by the usual shapes of vehicles.
+    # Actors are completed by their mirror images, then by the surfaces of their tracks.
     completing = list[Iterator[Observation]]()
     if bodies and options.complete != "seen":
         completing.append(merger.in_bodies(now, window, bodies, mirror=True))
@@ -132,7 +132,7 @@ def _join_shares(
     completed: list[tuple[NDArray[np.int64], NDArray[Any]]],
     classes: ClassTable,
 ) -> NDArray[Any]:
-    """Return the shares of classes: those that scans agree on, and of voxels that were completed those of the votes for them."""
+    """Return the shares of classes: from the consensus of scans, and for completed voxels from the votes that completed them."""
     seen = class_shares(votes.occupied, classes) if consensus is None else consensus.shares
     later = [class_shares(hits, classes) for _, hits in completed]
     taken = np.concatenate([_NO_VOXELS, *(hits["voxel"] for hits in later)])
@@ -141,7 +141,7 @@ def _join_shares(
 
 
 def _have_neighbours(voxels: NDArray[np.int64], others: NDArray[np.int64], spec: GridSpec) -> NDArray[np.bool_]:
-    """Return which of some voxels, (N,) flat indices, have one of others, (M,) increasing, among the 26 around them."""
+    """Return which of (N,) voxels, flat indices, have one of (M,) other voxels, increasing, among the 26 around them."""
     around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     near = np.stack(np.unravel_index(voxels, spec.size), axis=-1)[:, None] + around[np.any(around != 0, axis=1)]
     inside = ((near >= 0) & (near < spec.size)).all(axis=2)
@@ -151,14 +151,14 @@ def _have_neighbours(voxels: NDArray[np.int64], others: NDArray[np.int64], spec:
 
 @dataclass(frozen=True)
 class _VoxelEvidence:
-    """What votes say of N voxels.
+    """The evidence of N voxels from votes.
 
     Attributes:
         voxels: (N,) flat indices, increasing.
-        labels: (N,) class with most hits, 0 without hits.
+        labels: (N,) most frequent class of the hits, 0 without hits.
         hits: (N,) points.
         free: (N,) free samples.
-        matter: (N,) what the evidence is about.
+        matter: (N,) kind of matter: see `Matter`.
     """
 
     voxels: NDArray[np.int64]
@@ -179,13 +179,13 @@ class _VoxelEvidence:
 
 @dataclass
 class _UnfinishedGrid:
-    """The grid while it is made.
+    """The unfinished grid of a frame.
 
     Attributes:
         labels: (V,) classes.
         counts: (V,) hits and free samples; 0 means unknown.
         occupied: (V,) float32, probability that the voxel is occupied; None if it is not needed.
-        passed: (P,) flat indices of unknown voxels that rays went through on the other side of an actor.
+        passed: (P,) flat indices of unknown voxels whose mirror images rays passed through.
     """
 
     labels: NDArray[np.unsignedinteger]
@@ -217,11 +217,11 @@ class _FrameSteps:
 
     @cached_property
     def in_body(self) -> NDArray[np.bool_]:
-        """(V,) bool, the voxels of these regions."""
+        """(V,) bool: the voxels of bodies."""
         return self.regions.of_voxel != STATIC
 
     def decide_seen(self, votes: Votes, consensus: ClassConsensus | None) -> _UnfinishedGrid:
-        """Return what the votes for the static scene and in the actors' bodies say, with the classes that scans agree on."""
+        """Return the grid from the votes for the static scene and in the bodies of actors, with the classes of the consensus."""
         evidence = self.plan.needs_evidence
         labels, hits = votes.elect_occupied()
         if consensus is not None:
@@ -240,13 +240,13 @@ class _FrameSteps:
         return made
 
     def _doubtful(self, evidence: _VoxelEvidence) -> NDArray[np.int64]:
-        """Return those voxels that would be called free although they may well be occupied, or an actor although they may well not be."""
+        """Return the voxels of bodies with an uncertain decision: free ones that may be occupied, and actors that may be free."""
         likely, is_free = self._probability(evidence), self._decide(evidence) == 0
         unsure = np.where(is_free, likely > _DOUBTFUL, (likely < _UNSURE) & (evidence.matter == Matter.BODY))
         return evidence.voxels[(evidence.counts > 0) & unsure]
 
     def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
-        """Take what completes actors where nothing else is known of them: return these voxels, and the votes. What it says is free stays unknown."""
+        """Complete unknown voxels of bodies by votes; return these voxels and their votes. Voxels with free votes stay unknown."""
         found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
@@ -261,14 +261,14 @@ class _FrameSteps:
         return found.voxels, votes.occupied[np.isin(votes.occupied["voxel"], found.voxels)]
 
     def actors(self, labels: NDArray[np.integer]) -> VoxelActors | None:
-        """Return who is in the voxels of (V,) classes, if the plan asks for it."""
+        """Return the actors in the voxels of (V,) classes; None unless the plan needs them."""
         if not self.plan.voting.keep_actors:
             return None
         merger = self.merger
         return find_voxels(self.plan.spec, self.feed, merger.actors, self.now, self.regions, self.window, labels)
 
     def flags(self, inferred: NDArray[np.int64], contested: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return (V,) the flags of each voxel."""
+        """Return (V,) uint8: the flags of each voxel."""
         own = [self.now.frame] if self.now.frame in self.window else []
         now = self.vote(self.merger.observations(self.now, own, {}))
         flags = np.zeros(self.plan.spec.num_voxels, np.uint8)
@@ -284,7 +284,7 @@ class _FrameSteps:
     def vote(
         self, observations: Iterable[Observation], ballot: Ballot | None = None, count_views: bool = False
     ) -> Ballot:
-        """Return the votes of observations, each in its region: a ballot that is given, with them, or a new one."""
+        """Add the votes of observations, each in its region, to a ballot or to a new one, and return it."""
         ballot = ballot or Ballot(
             self.plan.spec,
             self.feed.classes,
@@ -301,7 +301,7 @@ class _FrameSteps:
     def _evidence(
         self, votes: Votes, labels: NDArray[Any], hits: NDArray[Any], voxels: NDArray[np.int64]
     ) -> _VoxelEvidence:
-        """Return what votes say of some voxels; `labels` and `hits` are those of `Votes.elect_occupied`."""
+        """Return the evidence of some voxels; `labels` and `hits` are from `Votes.elect_occupied`."""
         labels = labels[voxels]
         matter = matter_of(labels, self.in_body[voxels], self.feed.classes)
         return _VoxelEvidence(voxels, labels, hits[voxels], votes.free.reshape(-1)[voxels], matter)
@@ -321,17 +321,17 @@ class _FrameSteps:
         )
 
     def contested(self) -> NDArray[np.int64]:
-        """Return the voxels outside of bodies where something that moves passes at other times."""
+        """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
         return np.flatnonzero(self.vote(self.merger.passing(self.now, self.window)).hit & ~self.in_body)
 
     def unseen_now(self, voxels: NDArray[np.int64], recent: list[int]) -> NDArray[np.int64]:
-        """Return those of some voxels in which recent scans have no moving points either."""
+        """Return the voxels of `voxels` in which recent scans have no moving points."""
         return voxels[~self.vote(self.merger.moving(self.now, recent)).hit[voxels]] if len(voxels) else voxels
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
-        """Make voxels occupied in which the frame's own scan has returns, whatever other scans say, unless these are outliers."""
+        """Make voxels with returns of the frame's own scan occupied, unless the returns are outliers. Other scans do not count here."""
         if self.now.frame not in self.window:
             return
         spec, scan = self.plan.spec, self.feed.read(self.now.frame)
@@ -350,7 +350,7 @@ class _FrameSteps:
         made.set_probability(kept, _RETURNED_PROBABILITY)
 
     def driven(self, made: _UnfinishedGrid) -> NDArray[np.int64]:
-        """Return the occupied voxels that the recording vehicle drove through at other frames, without the ground and what is there now."""
+        """Return the occupied voxels on the ego path of other frames, without ground, bodies and returns of the frame's own scan."""
         apart = float(self.plan.spec.voxel_size[[0, 2]].min()) / 2
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)

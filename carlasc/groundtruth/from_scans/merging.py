@@ -1,8 +1,8 @@
 """Merging the scans of one sensor over time, without ghost trails of moving actors.
 
-Plain voting would remove moving actors: the free space that other scans saw in their voxels has more votes. So the static scene and each
-actor are voted on separately. In the box of an actor, the points and rays of every scan vote after the actor's motion has moved them to the
-time of the frame. Free space that other scans saw of the static scene does not count there.
+Plain voting would remove moving actors, because free space of other scans has more votes in their voxels. So the static scene and each actor
+have separate votes. In the box of an actor, the motion of the actor moves the points and rays of all scans to the time of the frame, and then
+they vote. Free space of the static scene from other scans does not count there.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
 
 STATIC = 0  # region of the voxels that belong to no actor
-_DEFORMABLE_S = 0.85  # a person's shape is used for this time before and after
-_RECENT_S = 0.25  # what scans saw within this time before and after a frame is so at the frame
-# What is so near to an actor's body may be a part of it that its path puts elsewhere: metres along, across and up.
+_DEFORMABLE_S = 0.85  # the shape of a person is used for this time before and after
+_RECENT_S = 0.25  # scans within this time before and after a frame show the scene at the frame
+# Points so near to the body of an actor may belong to it, as paths have errors: metres along, across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
 _MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
 _POINT_M2 = 0.004  # area of a sphere around the sensor, over the number of points, in which one ray is enough
-_GOLDEN, _SILVER = 2654435769, 1779033703  # multiples of them, modulo 2 ** 32, are evenly spread
+_GOLDEN, _SILVER = 2654435769, 1779033703  # their multiples modulo 2 ** 32 are evenly spread
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Instant:
 
 @dataclass(frozen=True)
 class PreparedScan:
-    """A scan that is ready for merging: decoded once, and used for every frame whose window contains it.
+    """A scan for merging. It is decoded once, and used for all frames whose windows contain it.
 
     Attributes:
         frame: frame number.
@@ -65,9 +65,9 @@ class PreparedScan:
         reach_m: distance of the farthest point, metres.
         seconds: time of the scan.
         moving: (M,) indices of the points that move by their flow or their class, on a track or not.
-        sure: (N,) float32, probability of each label, as a network gave it; None: 1.
-        ends: (N, 3) float32, the points seen from where their rays began, metres: `points` themselves if that is the sensor.
-        rays: the rays to the points, by where they began: at one place, unless there are several sensors, or the vehicle moved.
+        sure: (N,) float32, probability of each label from a network; None: 1.
+        ends: (N, 3) float32, the points relative to the origins of their rays, metres: `points` themselves if that is the sensor.
+        rays: the rays to the points, by origin: several for several sensors or a sensor that moves during the scan.
     """
 
     frame: int
@@ -102,14 +102,14 @@ class PreparedScan:
             labels: (N,) class ids.
             world_T_sensor: (4, 4) pose of the scan.
             seconds: time of the scan.
-            moving: (M,) indices of the points that move; None: none does.
-            origins: (N, 3) where the ray to each point began, metres; None: all at the sensor. Points with one origin are next to each other.
-            probabilities: (N, 6) the field of the scan; None: labels are sure.
+            moving: (M,) indices of the points that move; None: none.
+            origins: (N, 3) origins of the rays, metres, sensor frame; None: all at the sensor. Points with one origin follow each other.
+            probabilities: (N, 6) the field of the scan; None: labels are certain.
         """
         reach = float(lengths(points).max(initial=0.0))
         moving = np.empty(0, np.int64) if moving is None else moving
         sure = None
-        if probabilities is not None:  # labels that it does not name first were found by carlasc
+        if probabilities is not None:  # other labels than the likeliest one were found by carlasc
             likely = probabilities[:, 1] / np.float32(layout.CERTAIN)
             sure = np.where(probabilities[:, 0] == labels, likely, np.float32(1)).astype(np.float32)
         ends = points if origins is None or not origins.any() else points - origins
@@ -118,15 +118,15 @@ class PreparedScan:
 
     @cached_property
     def world_T_places(self) -> NDArray[np.float64]:
-        """(4, 4) pose of the sensor, or (K, 4, 4) those of the places where rays began."""
+        """(4, 4) pose of the sensor, or (K, 4, 4) poses of the origins of rays."""
         places = np.stack([rays.sensor_T_place for rays in self.rays])
         return self.world_T_sensor @ places if len(places) > 1 or places[0, :3, 3].any() else self.world_T_sensor
 
     @cached_property
     def enough(self) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
-        """(M,) indices of rays that are enough, and how many rays each stands for: of up to four near the sensor, where points are dense.
+        """(M,) indices of the rays that vote with `rays="enough"`, and their (M,) weights: near the sensor, one of up to four votes for all.
 
-        Which ones depends on the number of the frame and of the ray alone, so that scans of one place differ.
+        The choice depends on the frame number and the index of the ray alone, so that scans of one place use different rays.
         """
         crowd = len(self.ends) * _POINT_M2 / np.maximum(np.square(lengths(self.ends)), np.float32(1e-3))
         power = ((crowd >= 2).astype(np.uint32) + (crowd >= 4)).astype(np.uint32)
@@ -135,10 +135,10 @@ class PreparedScan:
         return chosen, np.left_shift(1, power[chosen]).astype(np.uint8)
 
     def votes_of(self, labels: NDArray[np.uint16], hits: NDArray[np.bool_] | None) -> dict[str, Any]:
-        """Return what the scan votes for, as `Observation` takes it: all but the poses of the places where rays began, and regions.
+        """Return arguments of `Observation` for the votes of the scan: all except poses and regions.
 
         Args:
-            labels: (N,) the classes that points vote for.
+            labels: (N,) uint16, the classes of the points.
             hits: (N,) bool, points that vote for their class; None: all.
         """
         ends = None if self.world_T_places.ndim == 2 else np.array([rays.part.stop for rays in self.rays])
@@ -147,10 +147,10 @@ class PreparedScan:
     def through(
         self, world_T_box: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> Iterator[tuple[RaysFromPlace, Transform, NDArray[np.int32]]]:
-        """Yield the rays from each place, (4, 4) box_T_place, and the indices of those of its points whose rays intersect a box.
+        """Yield the rays from each origin, (4, 4) box_T_place, and the indices of its rays that intersect a box.
 
         Args:
-            world_T_box: (4, 4) to the world from the frame in which the box is axis-aligned.
+            world_T_box: (4, 4) pose of the frame in which the box is axis-aligned.
             lower: (3,) lower corner, metres.
             upper: (3,) upper corner.
         """
@@ -164,7 +164,7 @@ class Merger:
 
     Args:
         scan_of: returns the prepared scan of a frame.
-        actors: what moves.
+        actors: the moving actors.
         classes: class table of the labels.
         dynamic: what happens to moving points.
     """
@@ -181,7 +181,7 @@ class Merger:
         self._moving: dict[int, tuple[NDArray[np.float32], NDArray[np.uint16]]] = {}
 
     def forget_before(self, frame: int) -> None:
-        """Remove what is kept of scans before a frame."""
+        """Clear the caches of scans before a frame."""
         for kept in (self._static, self._labels, self._moving, self._sampled):
             for other in [key for key in kept if key < frame]:
                 del kept[other]
@@ -190,8 +190,8 @@ class Merger:
     def observations(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
         """Yield the observations of a frame's grid: each scan of the static scene, then each actor's scans in its body.
 
-        Static surfaces vote everywhere, so the road below an actor is kept. Free space that was seen at other times does not count
-        inside an actor's body. The frame's own rays always count.
+        Static surfaces vote everywhere, so the road below an actor is kept. Free space from other times does not count in the bodies of
+        actors. The frame's own rays always count.
 
         Args:
             now: the frame.
@@ -203,7 +203,7 @@ class Merger:
             scan, own = self.scan_of(other), other == now.frame
             everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
             hits = None if everything else self.static(other)
-            if everything and self.actors.own:  # the recording vehicle is no part of the scene
+            if everything and self.actors.own:  # points on the recording vehicle do not vote
                 hits = ~self.actors.is_own(scan.points)
             sampled = self.rays == "enough" and not own
             votes = self._enough(scan, hits) if sampled else scan.votes_of(self.labels(other), hits)
@@ -212,7 +212,7 @@ class Merger:
         yield from self.in_bodies(now, window, bodies)
 
     def _enough(self, scan: PreparedScan, hits: NDArray[np.bool_] | None) -> dict[str, Any]:
-        """Return what a part of a scan's rays votes for: prepared once, for all frames that use it."""
+        """Return the votes of the rays that are enough: prepared once, for all frames that use them."""
         if scan.frame not in self._sampled:
             votes, (chosen, weights) = scan.votes_of(self.labels(scan.frame), hits), scan.enough
             ends = votes.pop("ends")
@@ -224,14 +224,14 @@ class Merger:
     def in_bodies(
         self, now: Instant, window: Iterable[int], bodies: Mapping[int, int], *, mirror: bool = False
     ) -> Iterator[Observation]:
-        """Yield what scans saw in each actor's body: one observation, with a voter for each place where rays began.
+        """Yield the observation of each actor's body by other scans, with a voter for each origin of rays.
 
         Args:
             now: the frame.
             window: frames of the scans.
             bodies: number of the actor by region, for the actors that vote in their bodies.
-            mirror: what scans would have seen if they had looked at the actors' other side. Vehicles are symmetric: their points and rays are
-                reflected in the vertical plane through the middle of the body, if that is known. The frame's own scan is used for this only.
+            mirror: yield mirror images instead. Vehicles are symmetric: their points and rays are reflected in the vertical plane through
+                the middle of the body, if that is known. Only mirror images use the frame's own scan.
         """
         window = [other for other in window if mirror or other != now.frame]
         for region, number in bodies.items():
@@ -256,11 +256,11 @@ class Merger:
             )
 
     def passing(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the moving points of each scan where that scan saw them. No ray votes for free space."""
+        """Yield the moving points of each other scan, at their positions in that scan. No ray votes for free space."""
         yield from self.moving(now, (other for other in window if other != now.frame))
 
     def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the same of all scans, that of the frame too."""
+        """Yield the same of all scans of the window, with the scan of the frame."""
         for other in window:
             scan = self.scan_of(other)
             if other not in self._moving:
@@ -271,11 +271,11 @@ class Merger:
                 yield Observation(points, labels, now.grid_T_world @ scan.world_T_sensor, free_region=NOWHERE)
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
-        """Return the scans of the instant: those just before and after the frame."""
+        """Return the frames of the scans within `_RECENT_S` of the frame."""
         return [other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= _RECENT_S]
 
     def shells(self, now: Instant, bodies: Mapping[int, int]) -> Iterator[Observation]:
-        """Yield the surface of each vehicle as it usually is, for what no scan saw of it. No ray votes for free space."""
+        """Yield the surface of each vehicle, for the parts that no scan saw. No ray votes for free space."""
         for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
@@ -285,9 +285,9 @@ class Merger:
                 yield Observation(points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE)
 
     def static(self, frame: int) -> NDArray[np.bool_]:
-        """Return (N,) bool: the points of a scan that do not belong to anything that moves.
+        """Return (N,) bool: the points of a scan that belong to no moving actor.
 
-        Ground aside, what is in or at the body of an actor is not static either: a field or free space need not show all points of an actor.
+        Points in or near the body of an actor are not static, except ground: fields and free space may miss some points of an actor.
         """
         if frame not in self._static:
             scan = self.scan_of(frame)
@@ -304,7 +304,7 @@ class Merger:
         return self._static[frame]
 
     def labels(self, frame: int) -> NDArray[np.uint16]:
-        """Return (N,) the classes that the points of a scan vote for: all points of an actor for the class that most of them have in all scans."""
+        """Return the (N,) classes of the points of a scan. All points of an actor have the most frequent class of its points in all scans."""
         if frame not in self._labels:
             labels = self.scan_of(frame).labels.copy()
             for track in self.actors.tracks.values() if self.dynamic == "align" else ():
@@ -313,7 +313,7 @@ class Merger:
         return self._labels[frame]
 
     def _carry(self, number: int, other: int, now: Instant) -> tuple[Observation, ...]:
-        """Return a scan's rays through an actor's body, in the actor's frame; none if it had another shape then."""
+        """Return the rays of a scan through the body of an actor, in the actor frame; none if the shape of the actor was different then."""
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
             return ()

@@ -1,7 +1,7 @@
 """The passes over the scans of a sequence, before the first grid is made: poses are refined, then actors are found.
 
-Scans are read in batches, by several workers; segments are linked as they come, and the track of an actor is estimated when it was seen for
-the last time. So memory does not grow with the length of a drive, except for the result.
+Several workers read scans in batches. Segments are linked in order of time, and the track of an actor is estimated after its last
+observation. Memory does not grow with the length of a drive, except for the result.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from carlasc.motion import (
     Track,
     complete_bodies,
     find_evidence,
-    follow_movers,
+    follow_actors,
     make_track,
     seen_from,
     tracks_from_boxes,
@@ -36,7 +36,7 @@ from carlasc.motion import (
 from carlasc.motion.bodies import surface_of
 from carlasc.motion.boxes import register_boxes
 from carlasc.motion.refinement import RefinedPoses, ThinnedScan, refine_poses
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors, with_surfaces
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors, with_surfaces
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
@@ -45,17 +45,14 @@ from carlasc.storage.resuming import derived_key, read_derived
 from carlasc.storage.sinks import SequenceWriter
 
 TRACKS, POSES = "tracks", "poses"
-"""What the files that keep actors and refined poses are called, in the folder of what is derived."""
+"""The names of the files with actors and with refined poses, in the folder of derived results."""
 
-_VERSIONS = {TRACKS: 5, POSES: 1}  # of the methods: they change only when the same input gives another result
-_NOTED_M = 0.04  # poses that are left alone are worth a note if scans disagree by more
-_BATCH = 200  # frames that are read before their finished tracks are estimated
-_MOVERS = 32  # movers whose tracks are estimated in one piece
-_SHAPE_POINTS = 128  # points of a boxed object in a scan that show its shape and its motion
-_BLOCK = (
-    100,
-    400,
-)  # least and most frames whose evidence is found in one piece: each piece reads the scans of some seconds around it too
+_VERSIONS = {TRACKS: 5, POSES: 1}  # of the methods: a version changes only when the same input gives another result
+_NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a note
+_BATCH = 200  # number of frames between estimates of finished tracks
+_ACTORS = 32  # number of actors whose tracks are estimated together
+_SHAPE_POINTS = 128  # number of points of a boxed object in a scan, for its shape and its motion
+_BLOCK = 100, 400  # least and greatest number of frames whose evidence is found in one piece
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -63,7 +60,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class _FindEvidence:
-    """Finds what else moved in the scans of a block, in a worker: it needs the scans of some seconds before and after them."""
+    """Finds evidence of motion in the scans of a block, in a worker. It also reads the scans of some seconds before and after."""
 
     feed: ScanFeed
     boxes: tuple[Track, ...]
@@ -71,9 +68,9 @@ class _FindEvidence:
     def __call__(self, block: tuple[int, ...]) -> list[FreeSpaceEvidence]:
         times = self.feed.times
         near = [f for f, s in times.items() if times[block[0]] - HORIZON_S <= s <= times[block[-1]] + HORIZON_S]
-        scans = (self.feed.sighting(frame, self.boxes) for frame in near)
+        scans = (self.feed.evidence_scan(frame, self.boxes) for frame in near)
         chosen = set(block)
-        # labels that are often wrong must not take things apart
+        # labels that are often wrong must not split actors
         found = find_evidence(scans, movable=self.feed.classes.movable if self.feed.names_ground else ())
         return [evidence.thinned() for evidence in found if evidence.frame in chosen]
 
@@ -92,7 +89,7 @@ class _MakeTrack:
 
 @dataclass(frozen=True)
 class _FollowBox:
-    """Gives the track of a box the points that are in it, and lays them on each other, in a worker."""
+    """Registers the track of a box to the points in it, in a worker."""
 
     times: dict[int, float]
 
@@ -106,7 +103,7 @@ class _MotionPass:
     """The steps of `find_actors`.
 
     Attributes:
-        feed: its scans.
+        feed: the scans of the sequence.
         run: how the work is spread.
         steps: called with the number of scans that were read since the last call.
     """
@@ -116,7 +113,7 @@ class _MotionPass:
     steps: Callable[[int], None] | None
 
     def _each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> closing[Generator[Result]]:
-        """Return the results of a function of each item, in a context that ends the work."""
+        """Return the results of a function of each item, in a context that stops the work at its end."""
         return closing(run_all(function, items, self.run))
 
     def _count(self, scans: int) -> None:
@@ -128,14 +125,14 @@ class _MotionPass:
         frames, times = list(self.feed.times), self.feed.times
         linker, tracks = Linker(), list[Track]()
         if not {"flow", "instances"} & set(self.feed.motion):
-            if "boxes" in self.feed.motion:  # but no frame has one
+            if "boxes" in self.feed.motion:  # a sequence of boxes without any box
                 self._count(len(frames))
             return tracks
         for begin in range(0, len(frames), _BATCH):
             ended: list[Chain] = []
             with self._each(partial(self.feed.segments, boxes=()), frames[begin : begin + _BATCH]) as scans:
                 for scan in scans:
-                    ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.standing)
+                    ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.static)
                     self._count(1)
             if begin + _BATCH >= len(frames):
                 ended += linker.finish()
@@ -143,7 +140,7 @@ class _MotionPass:
         return tracks
 
     def boxed(self, boxes: list[Track], moving: tuple[Track, ...]) -> list[Track]:
-        """Return the tracks of annotated boxes, with the points that are in them."""
+        """Return the tracks of annotated boxes, with the points in them."""
         segments: dict[int, list[Segment]] = {}
         with self._each(partial(self.feed.segments, boxes=moving), list(self.feed.times)) as scans:
             for scan in scans:
@@ -155,10 +152,10 @@ class _MotionPass:
         with self._each(follow, [(track, segments.get(track.instance, [])) for track in boxes]) as tracks:
             return with_surfaces(list(tracks))
 
-    def movers(
+    def found(
         self, boxes: tuple[Track, ...]
     ) -> tuple[list[Track], dict[int, NDArray[np.integer]], list[NDArray[np.float64]]]:
-        """Return the tracks of what moved although no field shows it, and what else `MovingActors` has: `moving` and `own`."""
+        """Return the tracks of found actors, and `moving` and `own` of `MovingActors`."""
         frames = list(self.feed.times)
         size = min(max(-(-len(frames) // self.run.processes), _BLOCK[0]), _BLOCK[1])
         blocks = [tuple(frames[begin : begin + size]) for begin in range(0, len(frames), size)]
@@ -173,12 +170,12 @@ class _MotionPass:
         label = 0 if self.feed.has_labels else classes.geometry_id
         moved: dict[int, NDArray[np.int64]] = {}
         own: list[NDArray[np.float64]] = []
-        movers = follow_movers(
-            evidence(), moved, deformable=classes.deformable, first_instance=FIRST_MOVER, default_label=label, own=own
+        actors = follow_actors(
+            evidence(), moved, deformable=classes.deformable, first_instance=FIRST_FOUND, default_label=label, own=own
         )
         tracks: list[Track] = []
-        while batch := list(islice(movers, _MOVERS)):
-            # their paths are estimated again: velocities alone would drift
+        while batch := list(islice(actors, _ACTORS)):
+            # their paths are estimated again: integrated velocities would drift
             chains = [([replace(s, velocity=None) for s in m.segments], m.rigid, m.confidence) for m in batch]
             tracks += self._estimate(chains)
         return tracks, _untracked(moved, tracks), own
@@ -210,8 +207,8 @@ def find_actors(
     moving: dict[int, NDArray[np.integer]] = {}
     own: list[NDArray[np.float64]] = []
     if "evidence" in feed.motion:
-        movers, moving, own = by.movers(moving_boxes)
-        tracks += movers
+        found, moving, own = by.found(moving_boxes)
+        tracks += found
     return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, own)
 
 
@@ -229,7 +226,7 @@ def _untracked(moved: dict[int, NDArray[np.int64]], tracks: list[Track]) -> dict
 
 
 def _with_members(track: Track, segments: list[Segment]) -> Track:
-    """Return the track of a box with the points that are in it, and the faces that they show."""
+    """Return the track of a box with the points in it, and the faces that they show."""
     present = [(segment, pose) for segment in segments if (pose := track.pose(segment.frame)) is not None]
     if not present:
         return track
@@ -243,7 +240,7 @@ def _with_members(track: Track, segments: list[Segment]) -> Track:
 
 
 def _box_tracks(feed: ScanFeed) -> list[Track]:
-    """Return the tracks of the sequence's boxes, if motion is taken from them. Boxes without a scan have no time.
+    """Return the tracks of the boxes of a sequence, if they show motion. Boxes without a scan have no time, and are left out.
 
     Raises:
         FormatError: the class of a box is not in the table.
@@ -259,7 +256,7 @@ def _box_tracks(feed: ScanFeed) -> list[Track]:
 
 
 def read_or_find_actors(feed: ScanFeed, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> MovingActors:
-    """Return the actors that an earlier run kept; if there are none of the same scans and options, find and keep them."""
+    """Return the actors that an earlier run kept for the same scans and options; without any, find and keep them."""
     about = {"motion": feed.motion, "min_speed_m_s": feed.options.motion.min_speed_m_s}
     key = _key_of(TRACKS, feed, **about)
     actors = read_derived(writer, TRACKS, key, MovingActors.from_bytes)
@@ -281,8 +278,8 @@ def refine_sequence(
 
     Args:
         feed: the scans, under the given poses.
-        writer: where the result is kept; None to keep it nowhere.
-        run: how the work is spread. Scans are read by all workers, and aligned by this process.
+        writer: keeps the result; None: it is not kept.
+        run: how the work is spread. All workers read scans, and this process aligns them.
         steps: called with the number of scans that were read since the last call.
     """
     frames, mode = feed.frames.tolist(), feed.options.poses.refine
@@ -309,7 +306,7 @@ class _ThinScan:
     def __call__(self, frame: int) -> ThinnedScan:
         try:
             points = self.feed.static_points(frame)
-        except CarlascError:  # making the frame raises the same error, and that one is reported
+        except CarlascError:  # making the frame raises the same error, which is reported
             points = np.empty((0, 3), np.float32)
         return ThinnedScan.of(points, self.feed.pose(frame))
 
@@ -320,7 +317,7 @@ def _key_of(name: str, feed: ScanFeed, **settings: Any) -> str:
 
 
 def with_refined_poses(sequence: StoredScans, frames: NDArray[np.int64], refined: RefinedPoses) -> StoredScans:
-    """Return a sequence with refined poses. Lines of frames without a scan get the correction of the scan before them."""
+    """Return a sequence with refined poses. Lines of frames without a scan get the correction of the last scan before them."""
     given = sequence.poses
     lines = np.array([sequence.line_of(frame, len(given), layout.POSES) for frame in frames.tolist()])
     row = np.clip(np.searchsorted(lines, np.arange(len(given)), side="right") - 1, 0, None)
@@ -331,7 +328,7 @@ def with_refined_poses(sequence: StoredScans, frames: NDArray[np.int64], refined
 
 
 def pose_notes(refined: RefinedPoses, frames: NDArray[np.int64]) -> Iterator[str]:
-    """Yield what the refinement did, in a line: nothing if the given poses are good, and were left alone."""
+    """Yield a line on the result of the refinement; none if the given poses are good."""
     before, after = (value or 0.0 for value in refined.disagreements_m)
     left = refined.left(frames)
     if refined.refined.any():

@@ -1,4 +1,4 @@
-"""Sequences whose grids are made from scans, each frame's from the scans around it in time, and the check of the trajectory that this needs."""
+"""Sequences whose grids are made from scans: the frames with their windows of scans, and the check of the trajectory."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
 from carlasc.motion import LONGEST_M, ground_points
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors, is_doubtful
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors, is_doubtful
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 from carlasc.storage.protocol import Sequence, Source
@@ -51,15 +51,15 @@ if TYPE_CHECKING:
     from carlasc.groundtruth.seen import Views
 
 _MAX_SPEED_M_S, _MAX_TURN_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster
-_RANGE_M = 100.0  # of a sensor whose range carlasc.json does not give
+_RANGE_M = 100.0  # range of a sensor if carlasc.json does not give it
 _TENTH = 10
-_LOOKED_AT = 3  # scans that are looked at for ground below the grid
-_BELOW = 0.2  # share of ground points below the grid that is worth a note: on hills, some are
+_LOOKED_AT = 3  # number of scans in which ground below the grid is measured
+_BELOW = 0.2  # with a greater share of ground points below the grid, there is a note: on hills, some are
 
 
 @dataclass(frozen=True)
 class ScanWindow:
-    """What a worker needs of a sequence for one frame: its scans, and the actors in the window of the frame."""
+    """The part of a sequence that a worker needs for one frame: its scans, and the actors in the window of the frame."""
 
     feed: ScanFeed
     actors: MovingActors
@@ -84,11 +84,11 @@ class ScanFrame(FrameInput):
         return scan_fields(self.inputs.feed.sequence, self.number)
 
     def views(self) -> Views:
-        """Return the cameras of the sequence, and where they were."""
+        """Return the cameras of the sequence, and their poses."""
         return stored_views(self.inputs.feed.sequence, self.number)
 
     def make(self, plan: GridPlan) -> FrameData:
-        """Read the frame's own files, and count the votes of the scans in its window."""
+        """Read the files of the frame, and count the votes of the scans in its window."""
         feed = self.inputs.feed
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
         merged = merge_frame(plan, feed, self.inputs.actors, self.number, feed.reaching(self.number, plan.spec))
@@ -104,7 +104,7 @@ class ScanFrame(FrameInput):
         return merge_frame(plan, feed, self.inputs.actors, self.number, kept).grid
 
     def residuals(self) -> Mapping[int, Residual]:
-        """Return how well the sightings of the moving actors in the frame overlay with the next ones, by number of the actor."""
+        """Return how well the observations of the moving actors in the frame align with the next ones, by number of the actor."""
         feed, frame, found = self.inputs.feed, self.number, {}
         last = frame + feed.options.window[1]
         for number, track in self.inputs.actors.tracks.items():
@@ -132,7 +132,7 @@ class ScanSequence(StoredSequence):
 
     @cached_property
     def estimates_poses(self) -> bool:
-        """Whether poses are estimated from the scans: if that is asked for, or if the sequence has none but those of an earlier run."""
+        """Whether poses are estimated from the scans: because the options require it, or the sequence has none except those of an earlier run."""
         sequence, grid = self.sequence, self.plan.grid
         if self.options.poses.source != "auto" or must_estimate(sequence, self.options):
             return must_estimate(sequence, self.options)
@@ -141,7 +141,7 @@ class ScanSequence(StoredSequence):
 
     @cached_property
     def posed(self) -> Sequence:
-        """The sequence with the poses that it has or that were estimated, not refined, after poses and times were checked.
+        """The sequence with its own poses, or estimated ones, not refined; poses and times are checked.
 
         Raises:
             MissingDataError: there are no poses.
@@ -153,7 +153,7 @@ class ScanSequence(StoredSequence):
 
     @cached_property
     def feed(self) -> ScanFeed:
-        """The scans of the sequence: under refined poses, after `refine`. It raises what `posed` does."""
+        """The scans of the sequence, under refined poses after `refine`. It raises the same errors as `posed`."""
         return ScanFeed(self.posed, self.options)
 
     def _find_frames(self) -> tuple[FrameInput, ...]:
@@ -166,11 +166,11 @@ class ScanSequence(StoredSequence):
 
     @property
     def steps_before(self) -> int:
-        """Number of scans that the passes that refine poses and find actors read."""
+        """Number of scans that the passes before the grids read: to refine poses, and to find actors."""
         return self.feed.reads + (len(self.feed.frames) if self.refines else 0)
 
     def prepare(self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> None:
-        """Refine the poses of the sequence, and find its actors, or read what an earlier run found."""
+        """Refine the poses of the sequence, and find its actors, or read the results of an earlier run."""
         self.refine(writer, run, steps)
         if self.feed.needs_actors:
             self.actors = read_or_find_actors(self.feed, writer, run, steps)
@@ -183,7 +183,7 @@ class ScanSequence(StoredSequence):
         return self.options.poses.refine != "never" and len(self.feed.frames) >= MIN_SCANS
 
     def refine(self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]) -> None:
-        """Refine the poses, or read what an earlier run kept with `writer`; the feed then has the refined poses."""
+        """Refine the poses, or read the result of an earlier run with `writer`. The feed then has the refined poses."""
         if not self.refines:
             return
         self.refined = refine_sequence(self.feed, writer, run, steps)
@@ -191,11 +191,11 @@ class ScanSequence(StoredSequence):
             self.feed = self.feed.under(with_refined_poses(self.posed, self.feed.frames, self.refined))
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
-        """Return what was found of each actor, by number; None if no actor is tracked."""
+        """Return the facts of each actor, by number; None if actors are not tracked."""
         return self.actors.summary if self.feed.needs_actors else None
 
     def pose_facts(self) -> PoseFacts | None:
-        """Return how poses were refined; None if they were not to be."""
+        """Return how poses were refined; None if refinement is off."""
         return None if self.refined is None else PoseFacts.of(self.refined, self.feed.frames)
 
     def record(self) -> dict[str, Any]:
@@ -216,12 +216,12 @@ class ScanSequence(StoredSequence):
         return record | {name: value for name, value in limits.items() if np.isfinite(value) and value > 0}
 
     def poses(self) -> NDArray[np.float64] | None:
-        """Return the poses to write beside the grids; None if they were estimated and the sequence has its own."""
+        """Return the poses to write beside the grids; None if poses were estimated although the sequence has its own."""
         has_own = layout.POSES in self.sequence.documents()
         return None if has_own and self.estimates_poses else self.posed.poses
 
     def notes(self) -> list[str]:
-        """Return what the scans lack, and what was found in spite of it."""
+        """Return remarks on missing fields, and on the results."""
         where, notes = self.location, self.findings()
         if not self.feed.has_labels:
             notes.append(f"{where}: the scans have no labels: grids contain geometry only, in one class")
@@ -235,7 +235,7 @@ class ScanSequence(StoredSequence):
         return notes
 
     def findings(self) -> list[str]:
-        """Return what was found of the poses, and of what moves."""
+        """Return remarks on poses and on moving actors."""
         where, notes = self.location, list[str]()
         if self.estimates_poses and self.options.poses.source == "auto":
             notes.append(f"{where}: there are no poses: they were estimated from the scans (kiss-icp)")
@@ -243,15 +243,17 @@ class ScanSequence(StoredSequence):
             [] if self.refined is None else [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
         )
         if self.feed.has_labels and not self.feed.motion and self.options.dynamic != "tube":
-            notes.append(f"{where}: nothing shows what moves: everything was treated as static")
-        found = sum(track.instance >= FIRST_MOVER for track in self.actors.tracks.values())
+            notes.append(f"{where}: no field shows motion: all points were treated as static")
+        found = sum(track.instance >= FIRST_FOUND for track in self.actors.tracks.values())
         left_out = sum(len(points) for points in self.actors.moving.values())
         if "evidence" in self.feed.motion and (found or left_out):
             doubtful = sum(is_doubtful(actor["confidence"]) for actor in self.actors.summary if actor["moves"])
             shown = [f"{found} actors that move ({doubtful} of them doubtful)"] if found else []
             shown += [f"{left_out} {'more ' if found else ''}points that moved"] if left_out else []
             out = ": these points were left out of other frames" if left_out else ""
-            notes.append(f"{where}: free space shows {' and '.join(shown)}, although nothing else says so{out}")
+            notes.append(
+                f"{where}: free space shows {' and '.join(shown)}, although no field of the data shows it{out}"
+            )
         if self.actors.own:
             notes.append(
                 f"{where}: points near the sensor move with it: they are on the recording vehicle, and were left out"
@@ -264,7 +266,7 @@ class ScanSequence(StoredSequence):
         return notes
 
     def _share_below(self) -> float:
-        """Return the share of the ground points of some scans that are below the grid. Scans that cannot be read fail elsewhere."""
+        """Return the share of the ground points of some scans that are below the grid. Scans that cannot be read are skipped here."""
         feed, spec = self.feed, self.plan.spec
         chosen = feed.frames[np.unique(np.linspace(0, len(feed.frames) - 1, _LOOKED_AT).astype(int))]
         heights = [np.empty(0, np.float32)]
@@ -299,7 +301,7 @@ def scan_sequences(source: str | os.PathLike[str] | Source, plan: GridPlan, opti
 
 
 def must_estimate(sequence: Sequence, options: FromScans) -> bool:
-    """Return whether poses are estimated from the scans: if that is asked for, or if the sequence has none and may do without."""
+    """Return whether poses are estimated from the scans: because the options require it, or the sequence has none and they allow it."""
     source = options.poses.source
     return source == "kiss-icp" or (source == "auto" and layout.POSES not in sequence.documents())
 
@@ -317,7 +319,7 @@ def with_estimated_poses(sequence: Sequence) -> Sequence:
     scans = (sequence.read("points", int(frame))[:, :3] for frame in frames)
     try:
         poses = estimate_poses(scans, max_range_m=sequence.metadata.max_range_m or _RANGE_M)
-    except ArgumentError as error:  # there the scans are an argument, here they are data
+    except ArgumentError as error:  # an argument there, data here
         raise FormatError(
             sequence.location, expected=f"poses, or {error.expected}", found=error.found, advice=error.advice
         ) from error
@@ -330,7 +332,8 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
 
     Raises:
         MissingDataError: it has no poses.
-        FormatError: nobody knows where points were seen from, a pose is not rigid, or jumps without `options.poses.force`, or a time does not increase; names the frame.
+        FormatError: the position of the sensor is unknown, or a pose is not rigid, or jumps without `options.poses.force`, or a time does
+            not increase; names the frame.
     """
     where = f"{sequence.location}/{layout.POSES}"
     if not sequence.metadata.has_rays:

@@ -1,1 +1,1 @@
-"""Maps: what is static in a drive, in one frame."""
+"""Maps: the static points of a drive, in one frame."""

@@ -1,6 +1,6 @@
-"""The cells of a map while it grows. What is not near any more is on the disk, so memory does not grow with the length of a drive.
+"""The cells of a growing map. Distant cells are kept on disk, so memory does not grow with the length of a drive.
 
-Each scan votes once in a cell: for the class that most of its points in the cell have. All sums are whole numbers, so that they do not depend
+Each scan has one vote per cell: for the most frequent class of its points in the cell. All sums are whole numbers, so that they do not depend
 on the order in which scans are added.
 """
 
@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from carlasc.storage.cloud_files import POINT_DTYPE
 
 Part = tuple[int, int, int]
-"""What cells are kept together: a group (`STATIC`, or the number of an actor), and x and y of a tile."""
+"""Cells that are kept together: a group (`STATIC`, or the number of an actor), and x and y of a tile."""
 
 STATIC = -1
 ROW_DTYPE = np.dtype(
     [("key", "<i8"), ("seen", "<u4"), ("points", "<u4"), ("votes", "<i8"), ("x", "<i8"), ("y", "<i8"), ("z", "<i8")]
 )
-"""A cell and a class: scans, points, votes in 1 / `_VOTE`, and the sums of the points' places in the cell in 1 / `_STEPS` of it."""
+"""A cell and a class: scans, points, votes in 1 / `_VOTE`, and the sums of the positions of points in the cell, in 1 / `_STEPS` of it."""
 
 _SIDE_BITS, _HEIGHT_BITS, _LABEL_BITS = 9, 24, 16  # of a key: x and y in the tile, z, and the class
 _SIDE, _MIDDLE = 1 << _SIDE_BITS, 1 << (_HEIGHT_BITS - 1)
 _STEPS, _VOTE = 1024, 65535
-_EDGE = 1 / 64  # of a cell: points stay so far from its faces that float32 keeps them in it
+_EDGE = 1 / 64  # least distance of points from the faces of a cell, so that float32 rounding keeps them inside
 _MOST_ROWS = 4_000_000  # in memory: 200 MB
 
 
@@ -42,7 +42,7 @@ def rows_of_scan(
     """Return the cells in which a scan has points.
 
     Args:
-        points: (N, 3) metres, map frame, or the frame of the actor that they belong to.
+        points: (N, 3) metres, map frame, or the frame of their actor.
         labels: (N,) classes.
         sure: (N,) probability of each class; None: 1.
         groups: (N,) `STATIC`, or the number of an actor.
@@ -68,7 +68,7 @@ def rows_of_scan(
     for axis, name in enumerate("xyz"):
         rows[name] = np.add.reduceat(places[order, axis], begins)
 
-    # The class that most points have, the lowest of several: one run of equal classes is the longest of its cell.
+    # The most frequent class, the lowest of several: in each cell, the longest run of equal classes.
     sorted_labels = labels[order].astype(np.int64)
     runs = np.flatnonzero(changed | np.append(True, np.diff(sorted_labels) != 0))
     lengths, cell_of = np.diff(np.append(runs, len(order))), np.searchsorted(begins, runs, side="right") - 1
@@ -87,17 +87,17 @@ def rows_of_scan(
 
 
 def split(parts: NDArray[np.int64], rows: NDArray[Any]) -> list[tuple[Part, NDArray[Any]]]:
-    """Return the rows of each part, in order, those of one cell and class added up."""
+    """Return the rows of each part, in order; rows of the same cell and class are summed."""
     order = np.lexsort((rows["key"], *parts.T[::-1]))
     parts, rows = parts[order], rows[order]
     begins = np.flatnonzero((np.diff(parts, axis=0, prepend=np.iinfo(np.int64).min) != 0).any(axis=1))
     places: list[Part] = [(int(p[0]), int(p[1]), int(p[2])) for p in parts[begins]]
-    pieces = np.split(rows, begins)[1:]  # before the first one is nothing
+    pieces = np.split(rows, begins)[1:]  # without the empty piece before the first part
     return [(place, _added([piece])) for place, piece in zip(places, pieces, strict=True)]
 
 
 def _added(pieces: Iterable[NDArray[Any]]) -> NDArray[Any]:
-    """Return rows in order of their keys, those with one key added up."""
+    """Return rows in order of their keys; rows with the same key are summed."""
     rows = np.concatenate(list(pieces))
     rows = rows[np.argsort(rows["key"], kind="stable")]
     begins = np.flatnonzero(np.diff(rows["key"], prepend=-1))
@@ -111,7 +111,7 @@ class GrowingCells:
     """The cells of a map, to which scans are added.
 
     Args:
-        folder: an empty folder, where cells are kept that do not fit into memory.
+        folder: an empty folder for cells that do not fit into memory.
         cell_m: size of a cell, metres.
         most_rows: rows in memory, of 48 bytes each.
     """
@@ -132,7 +132,7 @@ class GrowingCells:
         if self._held > self.most_rows:
             self._rows = OrderedDict((part, [_added(rows)]) for part, rows in self._rows.items())
             self._held = sum(len(rows[0]) for rows in self._rows.values())
-            while self._held > self.most_rows // 2:  # those that were seen longest ago
+            while self._held > self.most_rows // 2:  # the least recent ones first
                 part, (rows,) = self._rows.popitem(last=False)
                 self._held -= len(rows)
                 np.save(self._path(part), self._whole(part, [rows]))
@@ -145,14 +145,14 @@ class GrowingCells:
         return _added([np.load(self._path(part)), *rows] if part in self._stored else rows)
 
     def finish(self) -> None:
-        """Elect the class of each cell; then `counts` has the number of points of each part, and `points` yields them."""
+        """Elect the class of each cell. Afterwards `counts` has the number of points of each part, and `points` yields them."""
         for part in sorted({*self._rows, *self._stored}):
             points = self._elect(part, self._whole(part, self._rows.pop(part, [])))
             self.counts[part] = len(points)
             np.save(self._path(part), points)
 
     def _elect(self, part: Part, rows: NDArray[Any]) -> NDArray[Any]:
-        """Return one point for each cell: the mean of its points, with the class that has most votes, the lowest of several."""
+        """Return one point per cell: the mean of its points, with the class with most votes, the lowest of several."""
         cells = rows["key"] >> _LABEL_BITS
         begins = np.flatnonzero(np.diff(cells, prepend=-1))
         best = np.lexsort((rows["key"], -rows["votes"], cells))
@@ -174,7 +174,7 @@ class GrowingCells:
 
 
 def _indices(part: Part, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (N, 3) the indices of cells of a part, which keys without their class give."""
+    """Return the (N, 3) indices of cells of a part, from keys without their class."""
     column = cells >> _HEIGHT_BITS
     x, y = column >> _SIDE_BITS, column & (_SIDE - 1)
     z = (cells & (2 * _MIDDLE - 1)) - _MIDDLE

@@ -1,4 +1,4 @@
-"""The files that a map is written to, whatever it is made from."""
+"""The files of a map, and their contents."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from carlasc.storage.files import write_output, writing
 
 OCTOMAP = ".bt"
 ACTORS = "actors.json"
-_ALIGNED = 1e-3  # of a cell, by which a grid may miss the cells of a tree
+_ALIGNED = 1e-3  # greatest offset of a grid from the cells of a tree, as a share of a cell
 _NEEDS = (("skimage.measure", "mesh"), ("trimesh", "mesh"), ("scipy.ndimage", "mesh"), ("laspy", "scans"))
 
 
 @dataclass(frozen=True)
 class MapCells:
-    """The cells of a map that are known, in memory.
+    """The known cells of a map, in memory.
 
     Attributes:
         index: (N, 3) indices of cells.
@@ -45,7 +45,7 @@ class MapCells:
         """Write the cells as a tree of OctoMap.
 
         Raises:
-            ArgumentError: they are not cubes, or not those of a tree.
+            ArgumentError: they are not cubes, or not aligned with the cells of a tree.
         """
         edge = float(self.size[0])
         first = np.rint(self.lower / edge)
@@ -62,19 +62,19 @@ class MapCells:
 
 @dataclass(frozen=True)
 class MapFiles:
-    """Where a map is written: its points or its tree, its mesh, its distances, and the folder of its actors; None: nowhere."""
+    """The paths of a map: points or tree, mesh, distances, and the folder of actors; None: not written."""
 
     out: Path | None
     mesh: Path | None
     distance: Path | None
-    movers: Path | None
+    actors: Path | None
 
     @classmethod
-    def of(cls, out: Any, mesh: Any, distance: Any, movers: bool, grid: str | None) -> Self:
-        """Return where things are written.
+    def of(cls, out: Any, mesh: Any, distance: Any, actors: bool, grid: str | None) -> Self:
+        """Return the paths of a map.
 
         Raises:
-            ArgumentError: an ending is not known, or something cannot be made of this map.
+            ArgumentError: an ending is not known, or a file cannot be made from this map.
         """
         endings = {"out": (*POINT_ENDINGS, OCTOMAP), "mesh": MESH_ENDINGS, "distance": (".npz",)}
         given = {"out": out, "mesh": mesh, "distance": distance}
@@ -89,20 +89,20 @@ class MapFiles:
         if distance is not None and grid is None:
             advice = "scans alone do not tell free space from unknown space: make a grid with `carlasc regrid`"
             raise ArgumentError("distance", expected="the `grid` whose voxels it is of", found="none", advice=advice)
-        if movers and (grid is not None or "out" not in paths or paths["out"].suffix.lower() == OCTOMAP):
-            raise ArgumentError("movers", expected="a file of points of a drive in `out`", found=str(grid or out))
-        folder = paths["out"].with_name(f"{paths['out'].stem}_movers") if movers else None
+        if actors and (grid is not None or "out" not in paths or paths["out"].suffix.lower() == OCTOMAP):
+            raise ArgumentError("actors", expected="a file of points of a drive in `out`", found=str(grid or out))
+        folder = paths["out"].with_name(f"{paths['out'].stem}_actors") if actors else None
         return cls(paths.get("out"), paths.get("mesh"), paths.get("distance"), folder)
 
     @property
     def all(self) -> list[Path]:
         """All files, and the folder."""
-        return [path for path in (self.out, self.mesh, self.distance, self.movers) if path is not None]
+        return [path for path in (self.out, self.mesh, self.distance, self.actors) if path is not None]
 
     def check(self, overwrite: bool) -> None:
-        """Check that nothing is replaced, and that packages are installed, before hours of work."""
+        """Check, before hours of work, that no file is replaced and that packages are installed."""
         for path in self.all:
-            is_ours = (path / ACTORS).is_file() if path == self.movers else path.is_file()
+            is_ours = (path / ACTORS).is_file() if path == self.actors else path.is_file()
             if path.exists() and not (overwrite and is_ours):
                 found, advice = "a file" if path.is_file() else "a folder", "give another name"
                 advice = f"give `overwrite=True`, or {advice[5:]}" if is_ours else advice
@@ -113,14 +113,14 @@ class MapFiles:
                 import_extra(module, extra)
 
     def folder(self) -> tempfile.TemporaryDirectory[str]:
-        """Return a folder beside the map for what does not fit into memory; it is removed at the end, also after Ctrl-C."""
+        """Return a folder beside the map for cells that do not fit into memory; it is removed at the end, also after Ctrl-C."""
         place = self.all[0].parent
         with writing(place):
             place.mkdir(parents=True, exist_ok=True)
             return tempfile.TemporaryDirectory(dir=place, prefix=f".{self.all[0].name}.", suffix=".part")
 
     def write(self, points: PointPieces, cells: Callable[[], MapCells]) -> None:
-        """Write the points, or the tree, and the mesh; `cells` returns what the latter two are made of."""
+        """Write the points, or the tree, and the mesh; `cells` returns the cells of the tree and the mesh."""
         is_tree = self.out is not None and self.out.suffix.lower() == OCTOMAP
         if self.out is not None and not is_tree:
             write_points(self.out, points)
@@ -136,8 +136,8 @@ class MapFiles:
 
 
 MESH_ENDINGS = (".ply", ".glb")
-_BLOCK = 128  # cells along x and y that are meshed at once
-_STEPS = 1024  # places of vertices are rounded to such parts of a cell, so that blocks share them
+_BLOCK = 128  # number of cells along x and y that are meshed at once
+_STEPS = 1024  # positions of vertices are rounded to such parts of a cell, so that blocks share them
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # glTF: y is up
 
 
@@ -148,7 +148,7 @@ class SurfaceMesh:
     Attributes:
         vertices: (V, 3) float64, metres, between the middles of occupied cells and of free ones beside them.
         faces: (F, 3) int64 vertices of each triangle, anticlockwise as seen from outside, in right-handed axes.
-        labels: (V,) class of each vertex: that of its occupied cell.
+        labels: (V,) class of each vertex, from its occupied cell.
     """
 
     vertices: NDArray[np.float64]
@@ -214,7 +214,7 @@ class SurfaceMesh:
 def _blocks(
     cells: NDArray[np.int64], labels: NDArray[np.integer]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint16]]]:
-    """Yield the first cell of each block, and the classes of its cells and of those before and after it on every axis, 0 where free.
+    """Yield the first cell of each block, and the classes of its cells with a border of one cell, 0 where free.
 
     Blocks share their outermost cells, so that every cube between eight cells is in one block.
     """
@@ -231,26 +231,24 @@ def _blocks(
 
 
 def _march(volume: NDArray[np.uint16]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the places of the vertices in 1 / `_STEPS` of a cell, the triangles, and the classes of the vertices."""
+    """Return the positions of the vertices in 1 / `_STEPS` of a cell, the triangles, and the classes of the vertices."""
     measure = import_extra("skimage.measure", "mesh")
     if not volume.any():
         return np.empty((0, 3), np.int64), np.empty((0, 3), np.int64), np.empty(0, np.int64)
     found, triangles, _, _ = measure.marching_cubes((volume > 0).astype(np.float32), 0.5, gradient_direction="ascent")
     ends = np.stack([np.floor(found), np.ceil(found)]).astype(np.int64)
     labels = np.zeros(len(found), np.int64)
-    for corner in np.ndindex(
-        2, 2, 2
-    ):  # one of them is occupied: few vertices are inside of a cube, the others on its edges
+    for corner in np.ndindex(2, 2, 2):  # one corner is occupied: most vertices are on edges of a cube
         near = volume[tuple(ends[side, :, axis] for axis, side in enumerate(corner))]
         labels = np.maximum(labels, near)
     return np.rint(_STEPS * found).astype(np.int64), triangles.astype(np.int64), labels
 
 
 def write_distances(path: str | os.PathLike[str], grid: Grid) -> None:
-    """Write how far each voxel is from the surface: arrays `distance`, `lower`, `upper` and `voxel_size` in a .npz file.
+    """Write the distance of each voxel from the surface: arrays `distance`, `lower`, `upper` and `voxel_size` in a .npz file.
 
-    `distance`, (X, Y, Z) float32, metres between middles of voxels: to the nearest occupied voxel; in occupied ones minus that to the nearest other
-    one; NaN where it is unknown what is there. A grid in which nothing is occupied has infinite distances.
+    `distance`, (X, Y, Z) float32, metres between middles of voxels: to the nearest occupied voxel; in occupied voxels, minus the distance to
+    the nearest other voxel; NaN in unknown voxels. A grid without occupied voxels has infinite distances.
 
     Raises:
         DependencyError: SciPy is not installed.

@@ -1,4 +1,4 @@
-"""`carlasc.map`: the static points of a drive, or a grid of one frame, as a map, and the bodies of the actors of a drive."""
+"""`carlasc.map`: a map of the static points of a drive, or of a grid, and the bodies of the actors of a drive."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ from carlasc.storage.cloud_files import POINT_DTYPE, PointPieces, write_points
 from carlasc.storage.files import to_json, write_atomic, writing
 from carlasc.storage.protocol import Sequence, Source
 
-_LEAST_CELL_M = 0.001  # less is finer than float32 positions are
+_LEAST_CELL_M = 0.001  # smaller cells are finer than float32 positions
 
 
 @dataclass(frozen=True)
 class MapResult:
-    """What `map` wrote.
+    """The result of `map`.
 
     Attributes:
         files: the files, and the folder of actors.
         points: number of points, or of occupied voxels.
         frames: number of scans; 1 for a grid.
         actors: number of actors whose bodies were written.
-        notes: remarks about what was found, one line each.
+        notes: remarks on the results, one line each.
         elapsed_s: duration, in seconds.
     """
 
@@ -69,7 +69,7 @@ def map(
     cell_m: float = 0.05,
     frames: Frames = None,
     grid: str | None = None,
-    movers: bool = False,
+    actors: bool = False,
     mesh: str | os.PathLike[str] | None = None,
     distance: str | os.PathLike[str] | None = None,
     motion: MotionOptions = MotionOptions(),  # noqa: B008 (frozen)
@@ -77,29 +77,29 @@ def map(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> MapResult:
-    """Write a map of a drive: the static points of its scans in one frame, one point per cell, without what moves.
+    """Write a map of a drive: the static points of its scans in one frame, one point per cell, without moving points.
 
     The frame is that of the drive's poses, in right-handed axes: x ahead, y to the left, z up, at the first scan. Each point is the mean of
-    the points in its cell. Its class is that for which most scans vote, one vote per scan; `seen` is their number; `confidence` is the
-    share of the votes for the class where one more vote is against it: 0.5 for a cell that one scan saw. What moves is found as `regrid`
-    finds it. With `grid`, the map is a grid of one frame instead, in the frame of its sensor.
+    the points in its cell. Its class has the most votes, one vote per scan; `seen` is the number of scans; `confidence` is the share of the
+    votes for the class with one more vote against it: 0.5 for a cell that one scan saw. Moving points are found as in `regrid`. With `grid`,
+    the map is a grid of one frame instead, in the frame of its sensor.
 
     Args:
-        source: what has one sequence: anything that `carlasc.open` takes, or a source.
-        out: the file of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). None: only what `mesh` and `distance` ask for.
+        source: a data set with one sequence: anything that `carlasc.open` takes, or a source.
+        out: the file of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). None: only the files `mesh` and `distance`.
         cell_m: size of a cell, metres; a grid has its own cells.
-        frames: range of frame numbers; None for all. What moves is looked for in a few seconds more. With `grid`, it must hold one frame.
+        frames: range of frame numbers; None for all. Moving actors are searched for in a few more seconds. With `grid`, one frame.
         grid: name of the grid that is the map.
-        movers: also write the body of each actor that moves, in its own frame, to the folder `<out>_movers`, with `actors.json`: its poses.
+        actors: also write the body of each moving actor, in its own frame, to the folder `<out>_actors`, and their poses to `actors.json`.
         mesh: file of the surface of the occupied cells, with the colours of classes: .ply or .glb.
         distance: .npz file of each voxel's distance from the surface, with `grid`: see `docs/commands/map.md`.
-        motion: what tells which points move, and how.
-        poses: where poses come from. Those of a sequence without any are estimated from its scans, unless `PoseOptions("file")` is given.
+        motion: how moving points are found.
+        poses: where poses come from. Missing poses are estimated from the scans, unless `PoseOptions("file")` is given.
         overwrite: replace files that exist.
         run: how the work is spread. Steps of progress are scans.
 
     Returns:
-        What was written.
+        The files that were written.
 
     Raises:
         ArgumentError: an ending that is not known, cells that OctoMap cannot hold, or an argument that does not fit.
@@ -114,23 +114,23 @@ def map(
         raise ArgumentError("cell_m", expected=f"{_LEAST_CELL_M:g} metres or more", found=str(cell_m))
     if run.part.count > 1:
         raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
-    files = MapFiles.of(out, mesh, distance, movers, grid)
+    files = MapFiles.of(out, mesh, distance, actors, grid)
     files.check(overwrite)
-    opened, wanted, count, actors, notes = as_source(source), FrameRange.of(frames), 1, 0, tuple[str, ...]()
+    opened, wanted, count, bodies, notes = as_source(source), FrameRange.of(frames), 1, 0, tuple[str, ...]()
     if grid is not None:
         points = write_grid(opened, grid, wanted, files)
     else:
         options = FromScans(window=(0, 0), motion=motion, poses=poses)
         with files.folder() as folder:
             drive = DriveMap.of(opened, wanted, options, GrowingCells(Path(folder), cell_m))
-            drive.fill(run, movers)
+            drive.fill(run, actors)
             points, count, notes = drive.write(files), len(drive.frames), drive.notes()
-            if files.movers is not None and files.out is not None:
-                actors = drive.write_actors(files.movers, files.out.suffix.lower())
-    return MapResult(tuple(str(path) for path in files.all), points, count, actors, notes, time.perf_counter() - began)
+            if files.actors is not None and files.out is not None:
+                bodies = drive.write_actors(files.actors, files.out.suffix.lower())
+    return MapResult(tuple(str(path) for path in files.all), points, count, bodies, notes, time.perf_counter() - began)
 
 
-_BLOCK = 10  # scans that a worker adds up
+_BLOCK = 10  # number of scans that a worker sums
 
 
 @dataclass
@@ -138,7 +138,7 @@ class DriveMap:
     """The map of a drive.
 
     Attributes:
-        inputs: the scans, their poses, and what moves.
+        inputs: the scans, their poses, and the moving actors.
         frames: the frames whose scans are in the map.
         cells: the map.
     """
@@ -149,7 +149,7 @@ class DriveMap:
 
     @classmethod
     def of(cls, source: Source, frames: FrameRange, options: FromScans, cells: GrowingCells) -> Self:
-        """Find the one sequence of a source. Scans that are far from the chosen frames are hidden: what moves there does not matter."""
+        """Find the one sequence of a source. Scans far from the chosen frames are hidden: their motion does not matter."""
         plan = GridPlan(GridSpec.published(), "map", options, Voting(), frames)
         sequence = only(
             [one.sequence for one in scan_sequences(source, plan, options) if isinstance(one, ScanSequence)]
@@ -161,8 +161,8 @@ class DriveMap:
         view = WithoutScans(sequence, hidden) if hidden else sequence
         return cls(ScanSequence(view, plan, options), chosen, cells)
 
-    def fill(self, run: Run, movers: bool) -> None:
-        """Refine poses, find what moves, and add every scan without it; with `movers`, add their bodies too."""
+    def fill(self, run: Run, actors: bool) -> None:
+        """Refine poses, find moving actors, and add the static points of each scan; with `actors`, add the points of actors too."""
         inputs = self.inputs
         progress = StepCounter(run.progress, inputs.steps_before + len(self.frames))
         progress(0)
@@ -172,7 +172,7 @@ class DriveMap:
                 inputs.actors = find_actors(inputs.feed, pool, progress)
             blocks = [tuple(self.frames[first : first + _BLOCK]) for first in range(0, len(self.frames), _BLOCK)]
             items = ((block, inputs.actors.between(block[0], block[-1])) for block in blocks)
-            with closing(run_all(_AddScans(inputs.feed, self.cells.cell_m, movers), items, pool)) as added:
+            with closing(run_all(_AddScans(inputs.feed, self.cells.cell_m, actors), items, pool)) as added:
                 for block, pieces in zip(blocks, added, strict=True):
                     self.cells.add(pieces)
                     progress(len(block))
@@ -201,7 +201,7 @@ class DriveMap:
         return PointPieces(count, lambda: self.cells.points(group), self.inputs.metadata.classes, about)
 
     def write_actors(self, folder: Path, ending: str) -> int:
-        """Write the body of each actor, in its own frame, and where it was; return their number."""
+        """Write the body of each actor, in its own frame, and its poses; return the number of actors."""
         table, made = list[dict[str, Any]](), self.cells.folder / folder.name
         made.mkdir()
         for number in sorted({part[0] for part in self.cells.counts} - {STATIC}):
@@ -231,7 +231,7 @@ class DriveMap:
         }
 
     def notes(self) -> tuple[str, ...]:
-        """Return what was found, one line each."""
+        """Return remarks on the results, one line each."""
         where, notes, metadata = self.inputs.location, self.inputs.findings(), self.inputs.metadata
         if not self.inputs.feed.has_labels:
             notes.append(f"{where}: the scans have no labels: the map contains geometry only, in one class")
@@ -242,11 +242,11 @@ class DriveMap:
 
 @dataclass(frozen=True)
 class _AddScans:
-    """Adds up the scans of a block, in a worker."""
+    """Sums the scans of a block, in a worker."""
 
     feed: ScanFeed
     cell_m: float
-    movers: bool
+    actors: bool
 
     def __call__(self, block: tuple[tuple[int, ...], MovingActors]) -> list[tuple[Part, NDArray[Any]]]:
         frames, actors = block
@@ -256,14 +256,14 @@ class _AddScans:
         return split(np.concatenate(parts), np.concatenate(rows))
 
     def _rows(self, merger: Merger, frame: int) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-        """Yield the cells of the static points of a scan, then, if they are wanted, those of each actor."""
+        """Yield the cells of the static points of a scan, then, if `actors` is set, those of each actor."""
         feed, scan = self.feed, self.feed.read(frame)
         labels, static = merger.labels(frame), merger.static(frame)
         if feed.finds_ground:  # ground that was found had a class for the votes only
             labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
         chosen: list[tuple[int, NDArray[Any], NDArray[np.float64]]] = [(STATIC, np.flatnonzero(static), world[static])]
-        for number, track in merger.actors.tracks.items() if self.movers else ():
+        for number, track in merger.actors.tracks.items() if self.actors else ():
             members, pose = track.members.get(frame), track.pose(frame)
             if members is not None and pose is not None:
                 chosen.append((number, members, transform_points(invert(pose), world[members])))

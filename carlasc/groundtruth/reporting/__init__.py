@@ -1,1 +1,1 @@
-"""The report of a grid: what is in it, how it was made, and digests by which a later change is noticed."""
+"""The report of a grid: its content, how it was made, and digests that show later changes."""

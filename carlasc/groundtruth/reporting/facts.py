@@ -1,6 +1,6 @@
-"""What a report needs to know of one frame, and of each moving actor: how often it is seen, and how well its sightings overlay when its motion is undone.
+"""The facts of a report: of each frame, and of each moving actor, such as how well its observations align.
 
-A frame is measured while the frame is made, or from the files of a frame that exists already.
+A frame is measured while it is made, or from its files if it exists already.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.motion.refinement import RefinedPoses
 from carlasc.storage import layout
 
-_MOST_POINTS, _MOST_ASKED = 600, 50  # of one sighting: that are looked at, and whose distance is measured
+_MOST_POINTS, _MOST_ASKED = 600, 50  # of one observation: points that are used, and points whose distance is measured
 
 
 @dataclass(frozen=True)
 class Residual:
-    """How well a sighting of an actor overlays with the next one.
+    """How well an observation of an actor aligns with the next one.
 
     Attributes:
-        moving_m: sum of the distances from points of one to the nearest points of the other, once the motion is undone, metres.
-        standing_m: the same, if the actor is taken to stand still.
+        moving_m: sum of the distances from points of one to the nearest points of the other, with the motion removed, metres.
+        static_m: the same without removing the motion.
         count: number of these points.
     """
 
     moving_m: float
-    standing_m: float
+    static_m: float
     count: int
 
     @classmethod
@@ -44,18 +44,18 @@ class Residual:
         world_T_actor: Transform,
         world_T_next: Transform,
     ) -> Residual:
-        """Compare two sightings.
+        """Compare two observations.
 
         Args:
-            one: (N, 3) points of a sighting, metres, world.
+            one: (N, 3) points of an observation, metres, world.
             other: (M, 3) points of the next one.
-            world_T_actor: (4, 4) pose of the actor at the first sighting.
+            world_T_actor: (4, 4) pose of the actor at the first observation.
             world_T_next: (4, 4) its pose at the next one.
         """
         one, other = thin(one, _MOST_POINTS), thin(other, _MOST_POINTS)
-        standing = _distances(one, other)
+        static = _distances(one, other)
         moving = _distances(transform_points(invert(world_T_actor), one), transform_points(invert(world_T_next), other))
-        return cls(float(moving.sum()), float(standing.sum()), len(moving))
+        return cls(float(moving.sum()), float(static.sum()), len(moving))
 
 
 @dataclass(frozen=True)
@@ -65,32 +65,32 @@ class ActorTrack:
     Attributes:
         label: name of its class.
         instance: its number in the data; 0 if actors are not numbered.
-        first: first frame in which it was seen.
-        last: last frame in which it was seen.
-        sightings: number of frames in which it was seen.
-        points: number of its points in all sightings.
+        first: frame of its first observation.
+        last: frame of its last observation.
+        observations: number of scans that see it.
+        points: number of its points in all observations.
         speed_m_s: its median speed, metres per second.
         size_m: length, width and height of its body, metres.
-        seen_m: length, width and height of what was seen of it, metres.
-        faces: number of its sides that were seen: front, rear, left and right.
-        residual_m: how well neighbouring sightings overlay once the motion is undone: mean distance from a point of one to the nearest
+        seen_m: length, width and height of its visible part, metres.
+        faces: number of its visible sides: front, rear, left and right.
+        residual_m: how well neighbouring observations align with the motion removed: mean distance from a point of one to the nearest
             point of the one before or after, metres; None if none were compared. It is at least the distance between neighbouring points.
-        residual_standing_m: the same for an actor that is taken to stand still; a motion that is true makes `residual_m` smaller.
-        confidence: that it is real, from 0 to 1; 1 if the data say so.
+        residual_static_m: the same without removing the motion. With a correct motion, `residual_m` is smaller.
+        confidence: probability that it is real, from 0 to 1; 1 for an actor of the data.
     """
 
     label: str
     instance: int
     first: int
     last: int
-    sightings: int
+    observations: int
     points: int
     speed_m_s: float
     size_m: tuple[float, float, float]
     seen_m: tuple[float, float, float]
     faces: int
     residual_m: float | None
-    residual_standing_m: float | None
+    residual_static_m: float | None
     confidence: float
 
     @classmethod
@@ -104,14 +104,14 @@ class ActorTrack:
             instance=summary["instance"],
             first=summary["first"],
             last=summary["last"],
-            sightings=summary["scans"],
+            observations=summary["scans"],
             points=summary["points"],
             speed_m_s=summary["speed_m_s"],
             size_m=(length, width, height),
             seen_m=(seen_length, seen_width, seen_height),
             faces=summary["faces"],
             residual_m=round(sum(r.moving_m for r in residuals) / count, 4) if count else None,
-            residual_standing_m=round(sum(r.standing_m for r in residuals) / count, 4) if count else None,
+            residual_static_m=round(sum(r.static_m for r in residuals) / count, 4) if count else None,
             confidence=summary["confidence"],
         )
 
@@ -119,11 +119,11 @@ class ActorTrack:
 def actors_of(
     summaries: Sequence[Mapping[str, Any]], residuals: Iterable[Mapping[int, Residual]], classes: ClassTable
 ) -> tuple[ActorTrack, ...]:
-    """Return the moving actors, in order of their first sighting.
+    """Return the moving actors, in order of their first observation.
 
     Args:
-        summaries: what was found of each actor, by its number.
-        residuals: how well the sightings in each frame overlay with the next ones, by number.
+        summaries: the facts of each actor, by its number.
+        residuals: how well the observations in each frame align with the next ones, by number.
         classes: class table of the labels.
     """
     by_actor: dict[int, list[Residual]] = {}
@@ -135,7 +135,7 @@ def actors_of(
 
 
 def _distances(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the distances from some points of each sighting to the nearest point of the other, metres."""
+    """Return the distances from some points of each observation to the nearest point of the other, metres."""
     found = []
     for asked, others in ((one, other), (other, one)):
         squares = np.square(thin(asked, _MOST_ASKED)[:, None] - others[None]).sum(axis=2)
@@ -146,8 +146,8 @@ def _distances(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArra
 POWERS = 24
 """Number of bins of the histogram of votes: 1, 2 to 3, 4 to 7, ..."""
 _DIGEST_BYTES = 16
-_DRIFT = 100  # scans within which a drift of the height is measured
-_SAMPLED = 40  # one of so many frames is also made without a tenth of the scans
+_DRIFT = 100  # number of scans over which a drift of the height is measured
+_SAMPLED = 40  # one of so many frames is made again without a tenth of the scans
 
 
 @dataclass(frozen=True)
@@ -174,12 +174,11 @@ class PoseFacts:
     """How well neighbouring scans agree, and how their poses were refined.
 
     Attributes:
-        before_m: mean distance of scans from the surfaces that their neighbours saw, under the given poses, in metres; None if nothing tells.
+        before_m: mean distance of scans from the surfaces of their neighbours, under the given poses, in metres; None if it is unknown.
         after_m: the same under the poses that were used.
-        changed_m: (x, y, z) root mean square by which the motion from each scan to the next one differs from the given one, in metres on the
-            axes of the sensor.
-        changed_rad: (roll, pitch, yaw) the same of the rotation, in radians.
-        height_drift_m: the most by which the given height runs away from the used one within 100 scans, in metres.
+        changed_m: (x, y, z) root mean square change of the motion from each scan to the next one, in metres on the axes of the sensor.
+        changed_rad: (roll, pitch, yaw) the same for the rotation, in radians.
+        height_drift_m: greatest change of the difference between given and used height within 100 scans, in metres.
         left: first and last frame of the stretches that keep the given motion.
     """
 
@@ -202,7 +201,7 @@ class PoseFacts:
 
 @dataclass(frozen=True, eq=False)
 class FrameFacts:
-    """What a report needs to know of one frame.
+    """The facts of one frame for a report.
 
     Attributes:
         frame: frame number.
@@ -211,8 +210,8 @@ class FrameFacts:
         classes: (K,) int64 known voxels of each class, free space first.
         votes: (POWERS,) int64 histogram of the votes of known voxels, by powers of two.
         votes_sum: sum of these votes; 0 if the grid has no counts.
-        changes: how the grid changes if a tenth of the scans is left out; None if this was not tried.
-        residuals: how well the sightings of moving actors overlay with the next ones, by number of the actor.
+        changes: how the grid changes if a tenth of the scans is left out; None if this was not measured.
+        residuals: how well the observations of moving actors align with the next ones, by number of the actor.
         inferred: number of known voxels that were inferred, not seen; None if the grid does not say.
     """
 
@@ -260,7 +259,7 @@ class FrameFacts:
             labels, seen = labels[seen > 0], seen[seen > 0]
             powers = np.clip(np.frexp(seen.astype(np.float32))[1] - 1, 0, POWERS - 1)
             votes, votes_sum = np.bincount(powers, minlength=POWERS), float(seen.sum(dtype=np.float64))
-        classes.check(labels, f"{grid}: frame {frame}")  # a label of 2**32 - 1 would be counted in 32 GB
+        classes.check(labels, f"{grid}: frame {frame}")  # counting a label of 2**32 - 1 would take 32 GB
         by_class = np.bincount(labels, minlength=classes.num_channels)
         inferred = _inferred(arrays.get(f"{grid}/flags"), counts)
         return cls(frame, digests, len(labels), by_class, votes, votes_sum, changes, residuals or {}, inferred)
@@ -275,18 +274,18 @@ def _inferred(flags: NDArray[Any] | None, counts: NDArray[Any] | None) -> int | 
 
 
 def sample_frames(numbers: Sequence[int]) -> frozenset[int]:
-    """Return the frames that are also made without a tenth of the scans.
+    """Return the frames that are made again without a tenth of the scans.
 
-    Their choice depends on their numbers, so that runs over parts of a sequence choose the same ones; a short range has one of them.
+    The choice depends on the frame numbers, so that runs over parts of a sequence choose the same frames. A short range has one such frame.
     """
     chosen = frozenset(n for n in numbers if n % _SAMPLED == _SAMPLED // 2)
     return chosen or frozenset(numbers[len(numbers) // 2 :][:1])
 
 
 def digest_of(field: str, array: NDArray[Any]) -> bytes:
-    """Return the digest (BLAKE2b, 16 bytes) of a field of a frame: that of the bytes of its published file, whatever store it is in.
+    """Return the digest (BLAKE2b, 16 bytes) of a field of a frame: the digest of its published file, for all stores.
 
-    Votes are compressed in their file, so theirs is the digest of their rows.
+    Votes are compressed in their file, so their digest is that of their rows.
 
     Raises:
         FormatError: the array does not fit the field.

@@ -20,10 +20,10 @@ from carlasc.groundtruth.reporting.facts import ActorTrack, FrameFacts, PoseFact
 from carlasc.storage.files import parse_json, to_json
 
 REPORT_FORMAT = 1
-"""Version of carlasc-report.json: of its keys, and of what they mean."""
+"""Version of carlasc-report.json: of its keys and their meaning."""
 LEFT_OUT = 0.1
 """Share of the scans that is left out where convergence is measured."""
-_MOST_FRAMES = 10_000_000  # of a sequence: a small file must not name so many that they fill the memory
+_MOST_FRAMES = 10_000_000  # of a sequence: a small file must not fill the memory with frames
 _SHORT = 8  # hexadecimal digits of the digest of one frame
 _ABSENT = "-" * _SHORT
 
@@ -64,9 +64,9 @@ class Convergence:
     """How grids change if a tenth of the scans of other frames is left out, on some frames.
 
     Attributes:
-        frames: number of frames on which this was tried.
+        frames: number of frames on which this was measured.
         known: number of voxels that are known with and without these scans.
-        changed: how many of them have another label without.
+        changed: number of these with another label without the scans.
     """
 
     frames: int
@@ -99,7 +99,7 @@ class Digests:
 
 @dataclass(frozen=True)
 class FileDigest:
-    """The digest of a text file. Lines may be added to poses.txt and times.txt later, so the number of bytes belongs to it.
+    """The digest of a text file and its size. poses.txt and times.txt may get more lines later, so the size belongs to the digest.
 
     Attributes:
         size: size of the file, in bytes.
@@ -115,12 +115,12 @@ class FileDigest:
         return cls(len(data), digest_of_bytes(data).hex())
 
     def matches(self, data: bytes) -> bool:
-        """Return whether a file starts with the bytes that the digest is of."""
+        """Return whether a file starts with the bytes of the digest."""
         return self.of(data[: self.size]) == self
 
 
 class _HeldOutRays(TypedDict):
-    """What the rays of left-out scans found in a grid; see `carlasc.inspection.RayShares`."""
+    """The scores of the rays of left-out scans in a grid; see `carlasc.inspection.RayShares`."""
 
     returns: int
     free: float | None
@@ -134,7 +134,7 @@ class _HeldOutRays(TypedDict):
 
 
 class _Swept(TypedDict):
-    """What the grid says of the space that the vehicle drove through."""
+    """The score of the space that the vehicle drove through."""
 
     occupied_share: float | None
 
@@ -150,7 +150,7 @@ class _HeldOut(TypedDict):
 
 @dataclass(frozen=True)
 class Report:
-    """What a grid of one sequence holds, how it was made, and digests of its files.
+    """The report of a grid of one sequence: its content, how it was made, and digests of its files.
 
     Attributes:
         grid: name of the grid's folder.
@@ -158,8 +158,8 @@ class Report:
         settings: content of params.json.
         coverage: known and occupied voxels, and their votes.
         convergence: how grids change if scans are left out; None for grids that are not made from scans.
-        actors: moving actors that were tracked; None if none were looked for.
-        poses: how well scans agree, and how their poses were refined; None if they were not to be.
+        actors: moving actors that were tracked; None if actors were not tracked.
+        poses: how well scans agree, and how their poses were refined; None if refinement is off.
         inferred_share: share of the known voxels that were inferred, not seen; None if the grid does not say.
         holdout: held-out scores, as `carlasc.inspection.HeldOutScores.to_dict` returns them; None if they were not measured.
         digests: digests of each field beside the grid and of the grid, by name.
@@ -197,11 +197,11 @@ class Report:
 
         Args:
             grid: name of the grid's folder.
-            facts: what was measured of each frame, in any order.
+            facts: the facts of each frame, in any order.
             settings: content of params.json.
             classes: class table of the grid's labels.
             documents: the text files that belong to the grid, by name.
-            actors: what was found of each actor, by number; None if none were looked for.
+            actors: the facts of each actor, by number; None if actors were not tracked.
             poses: as in the attributes.
             holdout: as in the attributes.
         """
@@ -305,7 +305,7 @@ class Report:
 
 
 def short(digest: bytes) -> str:
-    """Return the digits by which `Digests.frames` knows the digest of a frame."""
+    """Return the digits of the digest of a frame in `Digests.frames`."""
     return digest.hex()[:_SHORT]
 
 
@@ -361,7 +361,7 @@ def _frames(spans: Any) -> tuple[int, ...]:
     """Return the frame numbers of half-open ranges.
 
     Raises:
-        ValueError: they are no such ranges, or more than any sequence has.
+        ValueError: the ranges are not valid, or have too many frames.
     """
     ranges = [range(start, stop) for start, stop in from_plain(spans, tuple[tuple[int, int], ...], "frames")]
     if not all(0 <= span.start <= span.stop for span in ranges) or sum(map(len, ranges)) > _MOST_FRAMES:

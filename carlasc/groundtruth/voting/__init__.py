@@ -1,4 +1,4 @@
-"""Voting: observations are turned into votes, and votes into a grid."""
+"""Voting: observations give votes, and votes give a grid."""
 
 from carlasc.groundtruth.voting.ballot import Ballot, Observation, VoteRule, Votes, count_votes
 

@@ -1,4 +1,4 @@
-"""Observations (the points of a scan, their labels, the pose of the sensor), their votes on the voxels of a grid, and the grid that these decide.
+"""The ballot: observations (points, labels and the pose of a sensor), their votes in the voxels of a grid, and the grid.
 
 Every labelled point votes for its class in its voxel, and free samples on its ray vote for free space (class 0) in their voxels. A voxel
 takes the class with most votes, ties go to the lowest id, and a voxel without votes is unknown: see the format page,
@@ -26,7 +26,7 @@ from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
 _ALL, _ALL_ONE = np.empty(0, np.bool_), np.empty(0, np.uint8)
 _ALL_SURE, _NONE = np.empty(0, np.float32), np.empty(0, np.int64)
-_FEW = 8  # so many times fewer voxels are few
+_FEW = 8  # voxels are few if they are so many times fewer than all
 NOWHERE = 65534
 """A region without voxels: rays with it do not vote."""
 OCCUPIED_DTYPE = np.dtype(
@@ -38,19 +38,19 @@ OCCUPIED_DTYPE = np.dtype(
 class Observation:
     """One voter: the scan of one sensor at one instant. Its points vote for their classes, its rays for free space.
 
-    A sensor that moves while it turns, or several sensors, are one observation of K voters: one for each place where rays began.
+    A sensor that moves during the scan, or several sensors, are one observation with K voters: one for each origin of rays.
 
     Attributes:
-        points: (N, 3) float32, metres, in the sensor's frame; of K voters those of each after those of the one before. The rounding to float32 is part of the rule: see the format page,
-            `docs/format.md#votes`.
+        points: (N, 3) float32, metres, in the sensor's frame; for K voters, in their order. The rounding to float32 is part of the rule: see
+            the format page, `docs/format.md#votes`.
         labels: (N,) unsigned integer class ids. Points labelled 0 and their rays do not vote.
         grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's; or (K, 4, 4).
-        hits: (N,) bool, points that vote for their class; of the other points only the rays vote. None: all points.
+        hits: (N,) bool, points that vote for their class; for the other points only the rays vote. None: all points.
         hit_region: region of the grid in which the points vote; None for the whole grid.
         free_region: region of the grid in which the rays vote; None for the whole grid.
         sure: (N,) float32, probability of the class of each point; None: 1.
-        ends: (K,) int64, behind the last point of each voter; None: there is one.
-        weights: (N,) uint8, number of rays that each ray stands for, where votes are not one per voxel; None: 1.
+        ends: (K,) int64, index after the last point of each voter; None: one voter.
+        weights: (N,) uint8, number of votes of each ray, unless there is one vote per voxel; None: 1.
 
     Raises:
         FormatError: points and labels differ in length, have another shape or type, or the transform is not rigid.
@@ -96,16 +96,16 @@ def count_votes(
     free_step_m: float = 1.5,
     keep_boxes: bool = False,
 ) -> Votes:
-    """Count the votes of observations. They are taken one at a time: memory does not grow with their number.
+    """Count the votes of observations. They are read one at a time, so memory does not grow with their number.
 
     Args:
         observations: the voters, all in one grid frame.
         spec: geometry of the grid.
         classes: class table of the labels.
         rule: "sensor": at most one vote per observation, voxel and class, as in the published files; "sample" and "ray": every sample
-            counts (they differ in what the votes decide: see `carlasc.groundtruth.voting.certainty`).
+            counts (they decide differently: see `carlasc.groundtruth.voting.certainty`).
         free_step_m: distance between two free samples on a ray, in metres.
-        keep_boxes: also keep how much of each voxel its points fill, of a Cartesian grid.
+        keep_boxes: also keep the box around the points in each voxel of a Cartesian grid.
 
     Raises:
         ArgumentError: an unknown rule, or a distance that is not positive.
@@ -118,7 +118,7 @@ def count_votes(
 
 
 def check_rule(rule: str, free_step_m: float) -> None:
-    """Check how votes are to be counted.
+    """Check the rule and the distance of free samples.
 
     Raises:
         ArgumentError: an unknown rule, or a distance that is not positive.
@@ -141,7 +141,7 @@ class Ballot:
         free_step_m: distance between two free samples on a ray, in metres.
         count_views: also count how many observations saw each voxel; not with "sensor".
         regions: (V,) uint16, region of each voxel, for observations that vote in one region only.
-        keep_boxes: also keep how much of each voxel its points fill, of a Cartesian grid.
+        keep_boxes: also keep the box around the points in each voxel of a Cartesian grid.
 
     Raises:
         ArgumentError: an unknown rule, a distance that is not positive, or regions that do not fit.
@@ -224,7 +224,7 @@ class Ballot:
         self.num_observations += len(ends)
 
     def _apart(self, region: int) -> NDArray[np.int64]:
-        """Return the voxels that are not in a region, if these are few and each sample counts; otherwise none."""
+        """Return the voxels outside of a region, if they are few and each sample counts; otherwise none."""
         if region < 0 or region == NOWHERE or self._tally.once:
             return _NONE
         if region not in self._outside:
@@ -246,7 +246,7 @@ class Ballot:
         return self._tally.heads != kernel.NONE
 
     def seen(self, voxels: NDArray[np.integer] | slice = slice(None)) -> NDArray[np.bool_]:
-        """Return (N,) bool: which of some voxels, flat indices, have votes; of all voxels if none are given."""
+        """Return (N,) bool: which of (N,) voxels, flat indices, have votes; by default of all voxels."""
         from carlasc.groundtruth.voting import kernel
 
         seen: NDArray[np.bool_] = self._tally.heads[voxels] != kernel.NONE
@@ -257,7 +257,7 @@ class Ballot:
         """Return the votes so far.
 
         Args:
-            copy: whether later observations leave the result as it is; without a copy, the ballot must take no more of them.
+            copy: whether the result is independent of later observations. Without a copy, add no more of them.
         """
         from carlasc.groundtruth.voting import kernel
 
@@ -269,7 +269,7 @@ class Ballot:
         return Votes(self.spec, self.classes, free.copy() if copy else free, occupied, boxes)
 
     def _make_room(self, points: int) -> None:
-        """Make room for one more candidate per point, the most that an observation can add."""
+        """Make room for one more candidate per point, which is the most that an observation can add."""
         used, candidates = int(self._tally.used[0]), self._tally.candidates
         if used + points > len(candidates):
             grown = np.empty(2 * (used + points), candidates.dtype)
@@ -279,14 +279,15 @@ class Ballot:
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """The votes of each voxel by class, with those for free space in an array of their own.
+    """The votes of each voxel by class; votes for free space are in their own array.
 
     Attributes:
         spec: the grid.
         classes: class table of the labels.
         free: (X, Y, Z) unsigned integer, votes for free space.
         occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0) and `voters`
-            (int32), the number of observations that they are of, and `sure` (float32), the sum of their probabilities; one row per voxel and class, sorted by voxel, then by label.
+            (int32), the number of their observations, and `sure` (float32), the sum of their probabilities; one row per voxel and class, sorted
+            by voxel, then by label.
         boxes: (V, 6) uint8, the box around the points of each voxel: see `carlasc.groundtruth.voting.filled`; None unless they are kept.
     """
 
@@ -297,16 +298,16 @@ class Votes:
     boxes: NDArray[np.uint8] | None = None
 
     def to_grid(self) -> Grid:
-        """Return the grid: the class with most votes of each voxel, free space included, and the sum of its votes. Ties go to the lowest id."""
+        """Return the grid: the class with most votes in each voxel, which may be free space, and the sum of its votes. Ties go to the lowest id."""
         labels, counts = self._elect(self.free.reshape(-1).copy())
         return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
 
     def elect_occupied(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return (V,) the class with most votes of each voxel, without free space, and (V,) the sum of these votes; 0 and 0 without any."""
+        """Return the (V,) classes with most votes, without free space, and the (V,) sums of the votes without free space; 0 without any."""
         return self._elect(np.zeros(self.spec.num_voxels, self.free.dtype))
 
     def _elect(self, counts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return (V,) the class with most votes, ties to the lowest id, and (V,) the sum of the votes, in `counts`: those of class 0."""
+        """Return the (V,) classes with most votes, ties to the lowest id, and the (V,) sums of votes. `counts` has the votes of class 0."""
         from carlasc.groundtruth.voting import kernel
 
         labels = np.zeros(len(counts), self.classes.dtype)
@@ -321,7 +322,7 @@ class Votes:
     def to_sparse(self) -> NDArray[Any]:
         """Return the votes as the layout stores them: non-zero ones only, sorted by voxel, then by label; free space is label 0.
 
-        More votes than the layout can hold are stored as the most that it can.
+        Numbers of votes above the maximum of the layout are stored as the maximum.
 
         Returns:
             (M,) `field_files.VOTES_DTYPE`, or `field_files.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.

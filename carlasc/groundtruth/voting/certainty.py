@@ -1,11 +1,11 @@
-"""What hits and free paths say of a voxel: the rule "ray", and how sure it is.
+"""Certainty: the rule "ray", which decides from hits and free paths whether a voxel is occupied, and the probability of it.
 
-A ray that ends in a voxel is a hit; one that goes through adds its free path. Hits per metre of free path are a property of what is in the voxel
-(Schaefer, Luft and Burgard, 2017, call it the decay rate): they do not depend on how many channels a LiDAR has, how often it turns, or how
-many scans are merged. A wall stops every ray; of the rays that graze a road, most go through the voxels of its surface.
+A ray that ends in a voxel is a hit. A ray that passes through adds its free path. The number of hits per metre of free path is a property of
+the matter in the voxel (the decay rate of Schaefer, Luft and Burgard, 2017). It does not depend on the number of channels of a LiDAR, its turn
+rate, or the number of merged scans. A wall stops every ray; most rays that graze a road pass through the voxels of its surface.
 
-The probability that a voxel is occupied is a logistic function of the logarithm of this ratio. It is calibrated against simulated drives in
-which many other sensors saw the same instant.
+The probability that a voxel is occupied is a logistic function of the logarithm of this ratio. It is calibrated on simulated drives in
+which many other sensors see the same instant.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from carlasc.storage import field_files, layout
 
 # Hits per metre of free path above which a voxel is occupied. Chosen on simulated drives: see docs/studies/movers.md.
 GROUND_PER_M = 0.05  # roads, pavements and other ground, which most rays graze
-SOLID_PER_M = 0.15  # everything else that stands, and actors within their bodies
-MOVABLE_PER_M = 0.5  # classes that may have left, or come, during the window
+SOLID_PER_M = 0.15  # other static objects, and actors within their bodies
+MOVABLE_PER_M = 0.5  # movable classes, which may come or leave during the window
 
 
 class Matter(IntEnum):
-    """What the evidence of a voxel is about: it decides how a ratio of hits to free path is read."""
+    """The kind of matter in a voxel, which decides the threshold of hits per metre of free path."""
 
     GROUND = 0
     SOLID = 1
-    MOVABLE = 2  # of a class that can move, and standing
+    MOVABLE = 2  # of a movable class, outside of bodies
     BODY = 3  # an actor, within its body
-    MIRRORED = 4  # an actor's side that was taken from its other side
+    MIRRORED = 4  # a side of an actor that is mirrored from its other side
 
 
 _PER_M = np.array([GROUND_PER_M, SOLID_PER_M, MOVABLE_PER_M, SOLID_PER_M, SOLID_PER_M])
 
-# Offset and slope of the logistic functions, for voxels of 0.4 m and of 0.2 m; between and beyond, linear in the logarithm of the size.
+# Offset and slope of the logistic functions, for voxels of 0.4 m and of 0.2 m; for other sizes, linear in the logarithm of the size.
 _HIT = np.array(
     [
         [(-1.2, 1.34), (1.4, 0.72)],
@@ -51,19 +51,19 @@ _HIT = np.array(
         [(0.45, 0.32), (1.2, 0.5)],
     ]
 )
-_FREE = np.array([-4.0, -0.7])  # of the logarithm of the number of free samples, where nothing was hit
+_FREE = np.array([-4.0, -0.7])  # of the logarithm of the number of free samples, in voxels without hits
 _FREE_IN_BODY = np.array([-1.7, -0.4])
-_SMALLEST_M, _LARGEST_M = 0.1, 0.8  # sizes beyond these count as these
+_SMALLEST_M, _LARGEST_M = 0.1, 0.8  # smaller and larger sizes count as these
 UNKNOWN = 0.5
 _BLOCK = 1 << 14  # voxels whose arrays fit into the L2 cache
 
 
 def matter_of(labels: NDArray[np.integer], in_body: NDArray[np.bool_], classes: ClassTable) -> NDArray[np.int8]:
-    """Return what the evidence of each voxel is about.
+    """Return the kind of matter in each voxel.
 
     Args:
-        labels: (V,) class with most hits.
-        in_body: (V,) bool, voxels of actors' bodies.
+        labels: (V,) most frequent class of the hits.
+        in_body: (V,) bool, voxels of bodies of actors.
         classes: class table of the labels.
     """
     kinds = np.full(classes.num_channels, Matter.SOLID, np.int8)
@@ -75,12 +75,12 @@ def matter_of(labels: NDArray[np.integer], in_body: NDArray[np.bool_], classes: 
 
 
 def is_occupied(hits: NDArray[np.integer], free_m: NDArray[np.floating], matter: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Return which voxels have more hits than the thing that is in them would have if it were not there.
+    """Return (V,) bool: which voxels have more hits per metre of free path than the threshold of their matter.
 
     Args:
-        hits: (V,) points in each voxel.
-        free_m: (V,) metres that rays went through it.
-        matter: (V,) what the evidence is about.
+        hits: (V,) number of points in each voxel.
+        free_m: (V,) free path of rays through each voxel, metres.
+        matter: (V,) kind of matter: see `Matter`.
     """
     return hits > _PER_M[matter] * free_m
 
@@ -96,10 +96,10 @@ def probability(
     """Return (V,) the calibrated probability that each voxel is occupied; `UNKNOWN` without hits and free path.
 
     Args:
-        hits: (V,) points in each voxel.
-        free_m: (V,) metres that rays went through it.
-        matter: (V,) what the evidence is about.
-        in_body: (V,) bool, voxels of actors' bodies.
+        hits: (V,) number of points in each voxel.
+        free_m: (V,) free path of rays through each voxel, metres.
+        matter: (V,) kind of matter: see `Matter`.
+        in_body: (V,) bool, voxels of bodies of actors.
         spec: the grid.
         step_m: distance between two free samples of a ray, metres.
     """
@@ -130,17 +130,17 @@ def _probability(
 
 
 def _volume(spec: GridSpec) -> float:
-    """Return the volume of a cell, in cubic metres; of a cylindrical grid at half its greatest radius."""
+    """Return the volume of a cell, cubic metres; in a cylindrical grid at half the greatest radius."""
     x, y, z = spec.voxel_size.tolist()
     return float(x * z * (y * spec.upper[0] / 2 if spec.coordinates == "cylindrical" else y))
 
 
 @dataclass(frozen=True, eq=False)
 class VoxelCertainty:
-    """How certain each voxel of a grid is. The attributes are the fields of the grid: see `docs/format.md#evidence`.
+    """The certainty of each voxel of a grid. The attributes are the fields of the grid: see `docs/format.md#evidence`.
 
     Attributes:
-        occupied: (X, Y, Z) floating, probability that the voxel is occupied; 0.5 where nothing is known.
+        occupied: (X, Y, Z) floating, probability that the voxel is occupied; 0.5 if it is unknown.
         classes: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel, then by label: the probability of each class
             if the voxel is occupied, in 1/65535, in the column `votes`; only non-zero ones.
         flags: (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`.
@@ -162,13 +162,13 @@ class VoxelCertainty:
 
 
 def class_shares(votes: NDArray[Any], classes: ClassTable) -> NDArray[Any]:
-    """Return the probability of each class of the voxels in which something was hit, if they are occupied: its share of the votes.
+    """Return the probability of each class of the voxels with votes, if they are occupied: its share of the votes.
 
-    Shares are rounded down, so that those of a voxel add up to at most 1.
+    Shares are rounded down, so the sum of a voxel is at most 1.
 
     Args:
-        votes: (M,) structured, with `voxel`, `label` (never 0) and `votes`, as `Votes.occupied` has them, in any order. Several rows of a
-            voxel and a class are added up.
+        votes: (M,) structured, with `voxel`, `label` (never 0) and `votes`, as in `Votes.occupied`, in any order. Rows of the same voxel
+            and class are summed.
         classes: class table of the labels.
 
     Returns:

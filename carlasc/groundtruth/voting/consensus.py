@@ -1,8 +1,8 @@
-"""The class of each voxel, from scans that may be wrong: how often labels are wrong is estimated from scans that disagree.
+"""Consensus: the class of each voxel from scans with wrong labels, whose errors are estimated where scans disagree.
 
-A voxel with the votes of twenty scans has the class of most of them, but many voxels were hit once or twice, and one wrong label decides them.
-Dawid and Skene (1979) estimate what each class is mistaken for from voters who judge the same thing; so do scans that see the same voxel. Where
-few scans vote, the classes of the neighbours say what is likely. Both count only as much as labels are wrong: if all scans agree, each voxel
+In a voxel with twenty scans, the majority decides. Many voxels have one or two hits, and a single wrong label decides them. Dawid and Skene
+(1979) estimate the confusion of classes from voters that judge the same object. Here, scans that see the same voxel give the confusion. Where few
+scans vote, the classes of the neighbours give a prior. Both have an effect only as far as labels are wrong: if all scans agree, each voxel
 keeps the class with most votes.
 """
 
@@ -20,27 +20,27 @@ from carlasc.core.grids import GridSpec
 from carlasc.storage import field_files, layout
 
 # Chosen on simulated drives whose labels were made wrong: see docs/studies/wrong-labels.md.
-_JUDGES = 4.0  # scans that must have hit a voxel for it to show how often labels are wrong
-_SMOOTHING = 20.0  # votes that each row of the confusion starts with
-_LEAST_WRONG = 1e-3  # no labels are better
+_MIN_SCANS = 4.0  # least number of scans with hits in a voxel that counts for the confusion
+_SMOOTHING = 20.0  # number of prior votes in each row of the confusion
+_LEAST_WRONG = 1e-3  # least share of wrong labels
 _REACH = (2, 2, 1)  # neighbours of a voxel, in voxels along each axis
-_ROUNDS = 2  # of asking the neighbours
-_SURE = 0.999  # a voxel whose own votes say more is not changed by its neighbours
-_UNHEARD = 1e-3  # least probability that neighbours give a class
-_PRIOR = 6.0  # weight of the likeliest class in the shares of a voxel, in votes
-_HEARD = 5.0  # votes after which more of them make no class likelier: a voxel may hold two things
-_FEW = 2.5  # fewer votes are of one thing
-_SHARES = 5  # steps in which shares are found
+_PASSES = 2  # number of passes over the neighbours
+_SURE = 0.999  # neighbours do not change a voxel with a greater probability
+_LEAST_PRIOR = 1e-3  # least prior probability of a class from neighbours
+_PRIOR = 6.0  # weight of the most probable class in the shares of a voxel, in votes
+_ENOUGH_VOTES = 5.0  # more votes do not raise a probability: a voxel may hold two objects
+_FEW = 2.5  # fewer votes are of one object
+_SHARES = 5  # number of steps of the estimate of shares
 
 
 class _Cast(NamedTuple):
-    """The votes that were cast, by voxel.
+    """The votes, by voxel.
 
     Attributes:
         voxels: (N,) int32 flat indices.
-        begins: (N + 1,) int64 first row of each voxel in the next two.
-        own: (M,) int64 the class of each row, as an index.
-        weight: (M,) float64 its votes.
+        begins: (N + 1,) int64 first row of each voxel in `own` and `weight`.
+        own: (M,) int64 class of each row, as an index.
+        weight: (M,) float64 votes of each row.
         rows: (V,) int32 index of each voxel of the grid in `voxels`; -1 without votes.
         size: (3,) int64 of the grid.
     """
@@ -55,13 +55,13 @@ class _Cast(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassConsensus:
-    """What scans agree on.
+    """The classes on which scans agree.
 
     Attributes:
         labels: (V,) class of each voxel; 0 without votes.
         shares: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel, then by label: the probability of each class if the
             voxel is occupied, as `VoxelCertainty.classes` has them.
-        wrong: share of the votes that are estimated to be wrong.
+        wrong: estimated share of wrong votes.
     """
 
     labels: NDArray[np.unsignedinteger]
@@ -70,7 +70,7 @@ class ClassConsensus:
 
 
 def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassConsensus:
-    """Return the class that each voxel has by the votes of all scans.
+    """Return the class of each voxel from the votes of all scans.
 
     Args:
         votes: (M,) structured, as `Votes.occupied`: `voxel`, `label`, `votes`, `voters` and `sure`, sorted by voxel, then by label.
@@ -87,7 +87,7 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     voxels = votes["voxel"][begins[:-1]]
     rows = np.full(spec.num_voxels, -1, np.int32)
     rows[voxels] = np.arange(len(voxels))
-    # The points of one scan are wrong together, so each scan counts as one vote, of which each class has its share.
+    # Errors of the points of one scan are correlated, so each scan has one vote, which is split among its classes.
     scans = np.maximum.reduceat(votes["voters"], begins[:-1]) / np.add.reduceat(votes["votes"], begins[:-1])
     weight = votes["sure"] * np.repeat(scans, np.diff(begins))
     cast = _Cast(voxels, begins, own, weight, rows, np.array(spec.size))
@@ -106,7 +106,7 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     plain = (np.diff(begins) == 1) & (weight[first] >= _needed(confusion, frequency)[own[first]])
     place = np.where(plain, -1, np.cumsum(~plain) - 1)
     shares = np.empty((np.count_nonzero(~plain), len(present)), np.float32)
-    _ask(cast, confusion, frequency, place, shares)
+    _find_shares(cast, confusion, frequency, place, shares)
     labels[voxels] = present[own[first]]
     labels[voxels[~plain]] = present[shares.argmax(axis=1)]
 
@@ -120,9 +120,9 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
 
 
 def _needed(confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (K,) how many votes for a class alone make it so sure that neighbours are not asked."""
+    """Return (K,) the number of votes for one class alone with which neighbours are not needed."""
     gain = np.log(np.diag(confusion)) - np.log(confusion)  # (other class, voted class)
-    odds = np.log(_SURE / (1 - _SURE)) + np.log((frequency[:, None] + _UNHEARD) / (frequency + _UNHEARD))
+    odds = np.log(_SURE / (1 - _SURE)) + np.log((frequency[:, None] + _LEAST_PRIOR) / (frequency + _LEAST_PRIOR))
     needed = np.where(
         gain > 0, odds / np.maximum(gain, 1e-9), np.where(np.eye(len(gain), dtype=np.bool_), -np.inf, np.inf)
     )
@@ -131,7 +131,7 @@ def _needed(confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> N
 
 @jit
 def _neighbour(cast: _Cast, i: int, x: int, y: int, z: int) -> int:
-    """Return the index of the voxel that is x, y and z voxels away from voxel i; -1 if it is outside of the grid or has no votes."""
+    """Return the index of the voxel at an offset of x, y and z voxels from voxel i; -1 if it is outside of the grid or has no votes."""
     voxel, size = cast.voxels[i], cast.size
     a = voxel // (size[1] * size[2]) + x
     b = voxel // size[2] % size[1] + y
@@ -143,7 +143,7 @@ def _neighbour(cast: _Cast, i: int, x: int, y: int, z: int) -> int:
 
 @cached
 def _compare(cast: _Cast, confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> None:
-    """Count the votes of voxels amid others of their class: `confusion[a, b]` of those for b in voxels of a. `frequency` counts all voxels."""
+    """Count votes in voxels among neighbours of their class: `confusion[a, b]`: votes for b in voxels of a. `frequency` counts all voxels."""
     voxels, begins, own, weight = cast.voxels, cast.begins, cast.own, cast.weight
     most = np.empty(len(voxels), np.int64)
     for i in range(len(voxels)):
@@ -160,56 +160,56 @@ def _compare(cast: _Cast, confusion: NDArray[np.float64], frequency: NDArray[np.
             for y in range(-1, 2):
                 for z in range(-1, 2):
                     other = _neighbour(cast, i, x, y, z)
-                    if other >= 0:  # itself among them
+                    if other >= 0:  # counts the voxel itself too
                         around += 1 if most[other] == most[i] else -27
-        if total >= _JUDGES and around >= 3:
+        if total >= _MIN_SCANS and around >= 3:
             for row in range(begins[i], begins[i + 1]):
                 confusion[most[i], own[row]] += weight[row]
 
 
 @cached
-def _ask(
+def _find_shares(
     cast: _Cast,
     confusion: NDArray[np.float64],
     frequency: NDArray[np.float64],
     place: NDArray[np.int64],
     shares: NDArray[np.float32],
 ) -> None:
-    """Find the shares of classes: the likeliest class of each voxel, from its neighbours too where it is in doubt, then what explains the votes.
+    """Find the shares of classes: the probabilities from the votes, and from neighbours if these are uncertain, then the mixture.
 
     Args:
         cast: the votes.
-        confusion: (K, K) probability that something of the first class is called the second one.
+        confusion: (K, K) probability that a point of the first class has a label of the second one.
         frequency: (K,) share of each class.
-        place: (N,) row of each voxel in `shares`; -1 if it is plainly of the class of its only row.
+        place: (N,) row of each voxel in `shares`; -1 if it certainly has the class of its only row.
         shares: (D, K) output.
     """
     kinds, few = len(frequency), np.log(confusion)
-    # Many votes for two classes are of two things in the voxel: each explains the points of the other as badly as the other way round.
+    # Many votes for two classes are of two objects in the voxel, so their confusion is made symmetric.
     many = (few + few.T) / 2
-    doubtful, asked = np.empty(len(shares), np.int64), 0
+    doubtful, unsure = np.empty(len(shares), np.int64), 0
     for i in range(len(cast.voxels)):
         if place[i] >= 0:
-            _weigh(cast, i, few, many, frequency, shares[place[i]])
+            _posterior(cast, i, few, many, frequency, shares[place[i]])
             if shares[place[i]].max() < _SURE:
-                doubtful[asked] = i
-                asked += 1
-    changed, prior = np.empty((asked, kinds), np.float32), np.empty(kinds)
-    for _ in range(_ROUNDS):
-        for k in range(asked):
+                doubtful[unsure] = i
+                unsure += 1
+    changed, prior = np.empty((unsure, kinds), np.float32), np.empty(kinds)
+    for _ in range(_PASSES):
+        for k in range(unsure):
             i = doubtful[k]
-            _hear(cast, i, frequency, place, shares, prior)
-            _weigh(cast, i, few, many, prior, changed[k])
-        for k in range(asked):
+            _neighbour_prior(cast, i, frequency, place, shares, prior)
+            _posterior(cast, i, few, many, prior, changed[k])
+        for k in range(unsure):
             shares[place[doubtful[k]]] = changed[k]
     likeliest, left = np.empty(kinds), np.empty(kinds)
     for i in range(len(cast.voxels)):
         if place[i] >= 0:
-            _explain(cast, i, confusion, shares[place[i]], likeliest, left)
+            _mix_shares(cast, i, confusion, shares[place[i]], likeliest, left)
 
 
 @jit
-def _weigh(
+def _posterior(
     cast: _Cast,
     i: int,
     few: NDArray[np.float64],
@@ -217,13 +217,13 @@ def _weigh(
     prior: NDArray[np.float64],
     out: NDArray[np.float32],
 ) -> None:
-    """Write the probability of each class by the votes of a voxel and what is likely before."""
+    """Write the probability of each class of a voxel from its votes and a prior."""
     begins, own, weight = cast.begins, cast.own, cast.weight
-    scores = np.log(prior + _UNHEARD)
+    scores = np.log(prior + _LEAST_PRIOR)
     total = weight[begins[i] : begins[i + 1]].sum()
     for row in range(begins[i], begins[i + 1]):
         likely = few[:, own[row]] if total < _FEW else many[:, own[row]]
-        scores += min(1.0, _HEARD / total) * weight[row] * likely
+        scores += min(1.0, _ENOUGH_VOTES / total) * weight[row] * likely
     best = scores.max()
     total = 0.0
     for c in range(len(prior)):
@@ -234,7 +234,7 @@ def _weigh(
 
 
 @jit
-def _hear(
+def _neighbour_prior(
     cast: _Cast,
     i: int,
     frequency: NDArray[np.float64],
@@ -242,7 +242,7 @@ def _hear(
     shares: NDArray[np.float32],
     prior: NDArray[np.float64],
 ) -> None:
-    """Write how likely each class is by the neighbours of a voxel: near ones, and those that many scans hit, count more."""
+    """Write the prior of each class from the neighbours of a voxel. Near neighbours, and those with many votes, have more weight."""
     begins, own, weight = cast.begins, cast.own, cast.weight
     total = 0.1
     prior[:] = 0.1 * frequency
@@ -262,7 +262,7 @@ def _hear(
 
 
 @jit
-def _explain(
+def _mix_shares(
     cast: _Cast,
     i: int,
     confusion: NDArray[np.float64],
@@ -270,7 +270,7 @@ def _explain(
     likeliest: NDArray[np.float64],
     left: NDArray[np.float64],
 ) -> None:
-    """Replace the probabilities of a voxel's class by the shares of classes in it that explain its votes: a voxel may hold two things."""
+    """Replace the class probabilities of a voxel by the shares of classes that fit its votes: a voxel may hold two objects."""
     begins, own, weight = cast.begins, cast.own, cast.weight
     total = weight[begins[i] : begins[i + 1]].sum()
     likeliest[:] = shares

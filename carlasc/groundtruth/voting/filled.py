@@ -1,4 +1,4 @@
-"""How much of each voxel its points fill: the box around them. A pole, a roof or a kerb hides what is behind this box, not all behind its voxels."""
+"""The box around the points in each voxel. A pole, a roof or a kerb hides the space behind this box, not behind its whole voxels."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from carlasc.core.cells import Cells, transform
 from carlasc.core.compiling import cached
 from carlasc.groundtruth.voting.kernel import ANYWHERE, Voters
 
-STEPS = 256  # of an edge of a voxel, in which boxes are measured
+STEPS = 256  # number of steps of a box along an edge of a voxel
 
 
 def no_boxes(num_voxels: int) -> NDArray[np.uint8]:
-    """Return (V, 6) the boxes of voxels without points: first x, y, z, which are after the last x, y, z."""
+    """Return (V, 6) uint8: the boxes of voxels without points, in which first x, y, z are greater than last x, y, z."""
     return np.tile(np.array([255, 255, 255, 0, 0, 0], np.uint8), (num_voxels, 1))
 
 

@@ -1,7 +1,7 @@
-"""The compiled loops of the voting: they add the votes of one observation, read the votes that were counted, and mark the voxels of points.
+"""The compiled loops of voting: they add the votes of one observation, and collect the counted votes.
 
-Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the voxels of their samples; where rounding
-could change the voxel, its rule finds it. Votes for free space are stored densely, votes for other classes as a linked list of candidates
+Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the voxels of their samples. Where rounding
+could change the voxel, the exact rule finds it. Votes for free space are stored densely, votes for other classes as a linked list of candidates
 per voxel.
 """
 
@@ -53,7 +53,7 @@ CANDIDATE_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""A class that a voxel may have: its votes, the observation that voted for it last, how many did, how unsure its votes are in sum, and the next candidate."""
+"""A candidate class of a voxel: its votes, its last voter, its number of voters, the summed doubt of its votes, and the next candidate."""
 
 
 class Tally(NamedTuple):
@@ -83,16 +83,16 @@ class Tally(NamedTuple):
 
 
 class Voters(NamedTuple):
-    """What one observation votes with.
+    """The voters of one observation: its points, labels and poses.
 
     Attributes:
-        points: (3 N,) float32, metres, x, y, z of each point, from where its ray began, on the axes of the sensor.
+        points: (3 N,) float32, metres, x, y, z of each point from the origin of its ray, on the axes of the sensor.
         labels: (N,) uint16; points labelled 0 and their rays do not vote.
-        hits: (N,) which points vote for their class; empty if all do.
-        sure: (N,) float32, probability of these classes; empty if all are 1.
-        weights: (N,) uint8, votes that each point and each sample of its ray has; empty if all have one, as with `Tally.once`.
-        poses: (K, 12) grid_T_place of the places where rays began, each of which is a voter.
-        ends: (K,) behind the last point of each place.
+        hits: (N,) bool, points that vote for their class; empty: all.
+        sure: (N,) float32, probability of these classes; empty: 1.
+        weights: (N,) uint8, votes of each point and of each sample of its ray; empty: 1, as with `Tally.once`.
+        poses: (K, 12) grid_T_place of the origins of rays; each one is a voter.
+        ends: (K,) index after the last point of each origin.
     """
 
     points: NDArray[np.float32]
@@ -106,7 +106,7 @@ class Voters(NamedTuple):
 
 @inlined
 def count_view(voxel: int, voter: int, tally: Tally) -> None:
-    """Count that an observation saw a voxel, if views are counted."""
+    """Count a view of a voxel, at most one per observation, if views are counted."""
     if len(tally.views) and tally.viewers[voxel] != voter:
         tally.viewers[voxel] = voter
         tally.views[voxel] += np.uint16(1)
@@ -127,7 +127,7 @@ def vote_occupied(
     region: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of a block's points for their classes, in the voxels of a region; if `hits` is not empty, of those that it names."""
+    """Add the votes of the points of a block for their classes, in the voxels of a region; `hits` chooses points, unless it is empty."""
     entry, last, label = 0, NONE, np.uint16(0)
     for i in range(len(labels)):
         if rays.state[i] == DROPPED or (len(hits) and not hits[i]):
@@ -141,7 +141,7 @@ def vote_occupied(
                 last, label = voxel, labels[i]
                 entry = vote_for(voxel, label, weight, voter, tally)
                 count_view(voxel, voter, tally)
-            elif not tally.once:  # neighbours are often in one voxel
+            elif not tally.once:  # neighbouring points are often in one voxel
                 tally.candidates[entry].votes += weight
             if len(sure):
                 tally.candidates[entry].doubt += np.float32(weight) * (np.float32(1) - sure[i])
@@ -164,7 +164,7 @@ def vote_for(voxel: int, label: int, weight: int, voter: int, tally: Tally) -> i
         candidates[entry].voter = NONE
         candidates[entry].label = label
         tally.heads[voxel] = entry
-    # Without the branch, with a sum of conditions, the whole kernel takes half as long again.
+    # A sum of conditions instead of the branch would make the whole kernel 1.5 times slower.
     if not tally.once or candidates[entry].voter != voter:
         candidates[entry].votes += weight
         candidates[entry].voters += candidates[entry].voter != voter
@@ -187,7 +187,7 @@ def vote_free(
     counted: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of a block's free samples, which lie between the sensor and the points.
+    """Add the votes of the free samples of a block, which lie between the sensor and the points.
 
     If each sample counts, those in the region `counted` are added; otherwise all are marked in `passed`. Views count in `region`.
     """
@@ -202,7 +202,7 @@ def vote_free(
         x, y, z, dx, dy, dz = rays.x[i], rays.y[i], rays.z[i], rays.dx[i], rays.dy[i], rays.dz[i]
         step, last = rays.first[i], rays.last[i]
         while step <= last:
-            # These loops are not in a function of their own: Numba would count a reference to the array at every call.
+            # These loops are inline: in a function, Numba would count a reference to the array at every call.
             lowest = np.int32(0)
             if view.cylindrical:
                 for j in range(CHUNK):
@@ -248,7 +248,7 @@ def vote_free_by_rule(
     region: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of one ray's free samples by the rule alone, clipped to the grid with a wide margin."""
+    """Add the votes of the free samples of one ray by the exact rule, clipped to the grid with a wide margin."""
     x, y, z = point
     norm, ux, uy, uz = unit_ray(x, y, z)
     starts = transform(view.pose, x, y, z)
@@ -290,7 +290,7 @@ def vote(
         voter: number of the first voter.
         hit_region: region in which points vote, or ANYWHERE.
         free_region: region in which rays vote, ANYWHERE, or NOT_AT_ALL.
-        apart: (A,) voxels outside of `free_region`, if they are so few that their votes are better put back than not counted; or empty.
+        apart: (A,) voxels outside of `free_region`, if they are few: their votes are counted and then restored, which is faster. Or empty.
         tally: the votes so far, with room for N more candidates.
     """
     points, labels, hits, sure, weights, poses, ends = cast
@@ -320,7 +320,7 @@ def vote(
 
 @jit
 def count_passed(region: int, tally: Tally) -> None:
-    """Add one vote for free space to each voxel of a region that an observation saw free."""
+    """Add one vote for free space to each voxel of a region that the observation saw free."""
     if region != ANYWHERE:
         for v in range(len(tally.passed)):
             tally.passed[v] &= np.uint8(tally.regions[v] == region)
@@ -357,7 +357,7 @@ def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[An
 
 @cached
 def elect(rows: NDArray[Any], labels: NDArray[Any], counts: NDArray[Any]) -> None:
-    """Find the class with most votes of each voxel, where ties go to the lowest id, and the sum of its votes.
+    """Find the class with most votes in each voxel, where ties go to the lowest id, and the sum of its votes.
 
     Args:
         rows: (M,) `voxel`, `label`, `votes` of the classes other than 0, sorted by voxel, then by label.

@@ -1,12 +1,12 @@
-"""The rule that places the samples of a ray in voxels, and its fast twin, which never finds another voxel.
+"""The exact rule that places the samples of a ray in voxels, and its fast twin, which always gives the same voxel.
 
 `sample_voxel` is the rule, bit for bit, one sample at a time (see the format page, `docs/format.md#votes`): norm and unit ray are float32, as
 the points are; distances, differences and the transform are float64; the cell is that of `carlasc.core.cells.find_voxel`.
 
-The twin finds the voxels of many samples at once, in vectorised code. RayBlock are clipped to the grid's box. Samples are computed in working
-coordinates: cells, counted from the grid's lower corner (for a cylindrical grid: metres in x and y, cells in z). There a sample is
-`start - step * stride`, which differs from the rule's only by rounding, by far less than `MARGIN` cells. So a sample that is farther than this
-from the edges of its cell is in the same voxel as by the rule. The few others, some in a million, are DOUBTFUL, and the rule finds their voxels.
+The twin finds the voxels of many samples at once, in vectorised code. Rays are clipped to the box of the grid. Samples are computed in working
+coordinates: cells from the lower corner of the grid (for a cylindrical grid: metres in x and y, cells in z). There a sample is
+`start - step * stride`, which differs from the rule by rounding only, by far less than `MARGIN` cells. A sample that is farther than this from
+the edges of its cell is in the same voxel as by the rule. The few others, some in a million, are DOUBTFUL, and the rule finds their voxels.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from carlasc.core.cells import (
 )
 from carlasc.core.compiling import fused, inlined, jit
 
-DOUBTFUL = -1  # index of a sample that is too near an edge of its cell
+DOUBTFUL = -1  # index of a sample that is too near to an edge of its cell
 
 # The states of a ray:
 SURE = 0.0
@@ -51,7 +51,7 @@ def unit_ray(x: Real, y: Real, z: Real) -> tuple[Real, Real, Real, Real]:
 
 @inlined
 def before_sensor(x: Real, ux: Real) -> bool:
-    """Return whether a sample is kept: its x over the unit ray's is positive. A ray whose x is 0 drops out altogether."""
+    """Return whether a sample is kept: its x over the x of the unit ray is positive. Rays with x = 0 have no samples."""
     return bool(x / ux > 0.0 and ux != 0.0)
 
 
@@ -70,7 +70,7 @@ def sample_voxel(
 
 
 class GridView(NamedTuple):
-    """The grid as seen from one sensor, in working coordinates.
+    """The grid in the working coordinates of one sensor.
 
     Attributes:
         cylindrical: whether the grid is cylindrical.
@@ -113,7 +113,7 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
     if curved:
         low, high = (-upper[0] - MARGIN, -upper[0] - MARGIN), (upper[0] + MARGIN, upper[0] + MARGIN)
         sx, sy, origin, finest = 1.0, 1.0, (0.0, 0.0), min(voxel[0], voxel[2])
-    # Rounding may add at most a quarter of the margin. This limits how far a point may be, and how near to the axis.
+    # Rounding may take at most a quarter of the margin. This limits the distance of a point, and its nearness to the axis.
     allowed = MARGIN / 4 * finest / (_NEAR_AXIS if curved else 1.0)
     known = max(abs(pose[3]), abs(pose[7]), abs(pose[11])) + max(abs(lower[0]), abs(lower[1]), abs(lower[2]))
     known += max(abs(upper[0]), abs(upper[1]), abs(upper[2]))
@@ -191,7 +191,7 @@ def clip(
         px, py, pz = transform(view.pose, ux, uy, uz)
         dx, dy, dz = (px - ox) * free_step_m, (py - oy) * free_step_m, (pz - oz) * free_step_m
 
-        # Samples up to this step are in front of the sensor; it is not certain for one that is almost at the sensor.
+        # Samples up to this step are in front of the sensor; this is uncertain for a sample that is almost at the sensor.
         length = (np.float64(x) / np.float64(ux)) / free_step_m
         whole = np.floor(length)
         slack = length * 1e-14 + 1e-12

@@ -18,7 +18,7 @@ from carlasc.inspection.auditing.loops import count_occupied_under, crossings, g
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import Sums, add
 from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
-from carlasc.motion.tracks import FIRST_MOVER, MovingActors, Track
+from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 
 HEIGHTS = 4  # layers of equal height that shares are told by
 MAX_ID = 511  # larger ids of classes count as this one
@@ -349,9 +349,9 @@ def _are_returns(scan: Scan) -> NDArray[np.bool_]:
 
 
 def _name(number: int, track: Track) -> str:
-    is_named = 0 < track.instance < FIRST_MOVER
+    is_named = 0 < track.instance < FIRST_FOUND
     return (
         str(track.instance)
         if is_named
-        else f"mover {number}, first seen in scan {min(track.members, default=track.first)}"
+        else f"of track {number}, first seen in scan {min(track.members, default=track.first)}"
     )

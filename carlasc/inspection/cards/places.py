@@ -75,7 +75,7 @@ def _title(name: str) -> str:
     if name == "frames":
         return "one row per frame: its sequence, pose, time and figures"
     entry = layout.field_named(name)
-    rows = {"scan": "frame", "vote": "vote", "mover": "voxel that moves", "box": "box"}.get(entry.per, entry.per)
+    rows = {"scan": "frame"}.get(entry.per, entry.per)
     return f"one row per {rows}: {entry.meaning}"
 
 

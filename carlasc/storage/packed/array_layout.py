@@ -26,7 +26,10 @@ SEQUENCE, FIELD, COLUMN, DOCUMENT = "carlasc.sequence", "carlasc.field", "carlas
 _SLOTS = 16  # a frame has room for this many typical frames
 _PCODEC = "pcodec"  # value of the attribute `codec` of points that are packed smaller
 _HEADROOM = 1.125  # a chunk is this much larger than a typical frame, so that few frames need a second one
-_CELLS_PER_ROW = {"vote": 4, "mover": 64}  # a frame has room for four votes per voxel, and for a quarter that moves
+_CELLS_PER_ROW = {
+    "vote": 4,
+    "moving voxel": 64,
+}  # a frame has room for four votes per voxel, and for a quarter that moves
 _PICTURE = 1 << 18  # bytes of a picture, unless the first ones are larger: their size must not decide
 FrameTable = dict[int, dict[str, int]]
 """Frames of a field: the number of elements of each in each column that it needs."""

@@ -9,23 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.motion import (
+    EvidenceScan,
     Linker,
     Segment,
-    Sighting,
-    Standing,
+    StaticPoints,
     Track,
     complete_bodies,
     find_evidence,
-    follow_movers,
+    follow_actors,
     make_track,
 )
-from carlasc.motion.movers import Mover
+from carlasc.motion.found_actors import FoundActor
 
 
 def link_segments(
     segments: Iterable[Segment],
     times: Mapping[int, float],
-    standing: Mapping[int, Standing] | None = None,
+    static: Mapping[int, StaticPoints] | None = None,
     *,
     deformable: Collection[int] = (),
 ) -> list[Track]:
@@ -34,7 +34,7 @@ def link_segments(
     Args:
         segments: the segments of all scans, in any order.
         times: seconds by frame, for every frame with a segment.
-        standing: the standing points of each scan, in which an actor that stops, for example at a crossing, is found until it continues.
+        static: the static points of each scan, in which an actor that stops, for example at a crossing, is found until it continues.
         deformable: classes whose actors change their shape; without flow, the centre of their points is followed.
 
     Returns:
@@ -45,39 +45,39 @@ def link_segments(
         by_frame.setdefault(segment.frame, []).append(segment)
     linker = Linker()
     chains: list[list[Segment]] = []
-    for frame in sorted(by_frame.keys() | (standing or {}).keys()):
-        chains += linker.add(frame, times[frame], by_frame.get(frame, []), (standing or {}).get(frame))
+    for frame in sorted(by_frame.keys() | (static or {}).keys()):
+        chains += linker.add(frame, times[frame], by_frame.get(frame, []), (static or {}).get(frame))
     chains += linker.finish()
     return complete_bodies([make_track(chain, times, deformable=deformable) for chain in chains])
 
 
 @dataclass(frozen=True)
-class Movers:
+class FoundActors:
     """What moved in a drive.
 
     Attributes:
         moved: (M,) int64 indices of the points of each frame that belong to something that moved, tracked or not. They must be left out
             of other frames.
-        tracked: the movers whose sightings overlay better along an estimated path than standing.
+        tracked: the actors whose observations align better along an estimated path than without motion.
     """
 
     moved: Mapping[int, NDArray[np.int64]]
-    tracked: tuple[Mover, ...]
+    tracked: tuple[FoundActor, ...]
 
     @property
     def segments(self) -> list[Segment]:
-        """The segments of all tracked movers, for `link_segments`."""
-        return [segment for mover in self.tracked for segment in mover.segments]
+        """The segments of all tracked actors, for `link_segments`."""
+        return [segment for actor in self.tracked for segment in actor.segments]
 
 
-def find_movers(
-    scans: Iterable[Sighting],
+def find_actors(
+    scans: Iterable[EvidenceScan],
     *,
     movable: Collection[int] = (),
     deformable: Collection[int] = (),
     first_instance: int = 1,
     default_label: int = 0,
-) -> Movers:
+) -> FoundActors:
     """Find what moved in the scans of a drive from the free space that other scans saw, and follow it over time.
 
     Scans are read one by one, and only those of some seconds are held. A block of a drive gives the same evidence as the whole drive, if
@@ -87,15 +87,15 @@ def find_movers(
         scans: the scans in order of time, in one world frame whose z is up.
         movable: classes of objects that can move, if the scans have labels.
         deformable: classes of objects that change their shape as they move. Without labels, the size tells.
-        first_instance: number of the first mover; others follow.
-        default_label: class of movers without labels.
+        first_instance: number of the first actor; others follow.
+        default_label: class of actors without labels.
 
     Returns:
-        The points that moved, and the movers that earned a track.
+        The points that moved, and the actors with enough evidence.
     """
     moved: dict[int, NDArray[np.int64]] = {}
     evidence = find_evidence(scans, movable=movable)
-    tracked = follow_movers(
+    tracked = follow_actors(
         evidence, moved, deformable=deformable, first_instance=first_instance, default_label=default_label
     )
-    return Movers(moved, tuple(tracked))
+    return FoundActors(moved, tuple(tracked))

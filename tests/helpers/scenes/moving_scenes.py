@@ -4,7 +4,7 @@ import numpy as np
 
 from carlasc.captures.settings import Lidar
 from carlasc.core.geometry import rotation_z, transform_points
-from carlasc.motion.evidence import Sighting
+from carlasc.motion.evidence import EvidenceScan
 
 HEIGHT_M = 1.8
 GROUND, WALL, CAR, PERSON = 7, 1, 10, 4
@@ -56,7 +56,7 @@ def rays_towards(azimuth, lower, upper):
 
 
 def film(scene, frames=40, *, period_s=0.1, ego_m_s=0.0, noise_m=0.0, noise_deg=0.0, labels=False, lidar=LIDAR):
-    """Yield the sightings of a scene, a function of time that returns boxes; poses get errors."""
+    """Yield the scans of a scene, a function of time that returns boxes; poses get errors."""
     rng = np.random.default_rng(5)
     for frame in range(frames):
         seconds = frame * period_s
@@ -66,9 +66,9 @@ def film(scene, frames=40, *, period_s=0.1, ego_m_s=0.0, noise_m=0.0, noise_deg=
         wrong = rotation_z(np.radians(noise_deg) * rng.normal())
         wrong[:3, 3] = noise_m * rng.normal(size=3)
         known = {"ground": classes == GROUND, "labels": classes} if labels else {}
-        yield Sighting(frame, points, pose @ wrong, seconds, **known), classes
+        yield EvidenceScan(frame, points, pose @ wrong, seconds, **known), classes
 
 
-def place(sighting, indices):
-    """Return the (M, 3) world positions of points of a sighting."""
-    return transform_points(sighting.world_T_sensor, sighting.points[indices].astype(np.float64))
+def place(scan, indices):
+    """Return the (M, 3) world positions of points of a scan."""
+    return transform_points(scan.world_T_sensor, scan.points[indices].astype(np.float64))

@@ -1,49 +1,49 @@
-"""Movers are followed over time, and only what overlays better along a path than standing earns a track."""
+"""Actors are followed over time, and only actors whose observations align better along a path than without motion are found."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.references.whole_drives import find_movers, link_segments
+from helpers.references.whole_drives import find_actors, link_segments
 from helpers.scenes.moving_scenes import CAR, PERSON, WALL, WALLS, box, car, film, person
 
 from carlasc.captures.settings import Lidar
 from carlasc.motion.evidence import find_evidence
-from carlasc.motion.movers import follow_movers
+from carlasc.motion.found_actors import follow_actors
 
 
-def movers(scene, frames=40, **options):
-    return find_movers([sighting for sighting, _ in film(scene, frames, **options)])
+def actors(scene, frames=40, **options):
+    return find_actors([scan for scan, _ in film(scene, frames, **options)])
 
 
-def test_a_passing_car_is_one_mover_with_its_velocity():
-    found = movers(lambda t: [*WALLS, car(-16.0 + 8.0 * t, 6.0), car(5.0, -6.0)])
-    (mover,) = found.tracked
-    assert mover.rigid
-    assert len(mover.segments) >= 35
-    velocities = np.stack([segment.velocity for segment in mover.segments])
+def test_a_passing_car_is_one_actor_with_its_velocity():
+    found = actors(lambda t: [*WALLS, car(-16.0 + 8.0 * t, 6.0), car(5.0, -6.0)])
+    (actor,) = found.tracked
+    assert actor.rigid
+    assert len(actor.segments) >= 35
+    velocities = np.stack([segment.velocity for segment in actor.segments])
     assert np.abs(velocities - (8.0, 0.0, 0.0)).max() < 0.5
     assert {segment.instance for segment in found.segments} == {1}
 
 
-def test_someone_who_walks_is_a_mover_that_changes_its_shape():
-    (mover,) = movers(lambda t: [*WALLS, person(-3.0 + 1.4 * t, 7.0)], noise_m=0.01).tracked
-    assert not mover.rigid
-    assert abs(np.median([segment.velocity[0] for segment in mover.segments]) - 1.4) < 0.2
+def test_someone_who_walks_is_an_actor_that_changes_its_shape():
+    (actor,) = actors(lambda t: [*WALLS, person(-3.0 + 1.4 * t, 7.0)], noise_m=0.01).tracked
+    assert not actor.rigid
+    assert abs(np.median([segment.velocity[0] for segment in actor.segments]) - 1.4) < 0.2
 
 
-def test_two_cars_that_meet_are_two_movers():
+def test_two_cars_that_meet_are_two_actors():
     def meet(seconds):
         return [*WALLS, car(-16.0 + 8.0 * seconds, 4.0), car(16.0 - 8.0 * seconds, 8.0)]
 
-    speeds = sorted(float(np.median([s.velocity[0] for s in m.segments])) for m in movers(meet).tracked)
+    speeds = sorted(float(np.median([s.velocity[0] for s in m.segments])) for m in actors(meet).tracked)
     assert np.allclose([speeds[0], speeds[-1]], [-8.0, 8.0], atol=0.4)
     assert all(abs(abs(speed) - 8.0) < 1.0 for speed in speeds)
 
 
 def test_numbers_and_classes_can_be_given():
-    sightings = [sighting for sighting, _ in film(lambda t: [*WALLS, car(-16.0 + 8.0 * t, 6.0)])]
-    found = find_movers(sightings, first_instance=500, default_label=3)
+    scans = [scan for scan, _ in film(lambda t: [*WALLS, car(-16.0 + 8.0 * t, 6.0)])]
+    found = find_actors(scans, first_instance=500, default_label=3)
     assert {(segment.instance, segment.label) for segment in found.segments} == {(500, 3)}
 
 
@@ -51,13 +51,13 @@ def test_labels_say_what_moved():
     def both(seconds):
         return [*WALLS, car(-16.0 + 8.0 * seconds, 6.0), person(-3.0 + 1.4 * seconds, -7.0)]
 
-    sightings = [sighting for sighting, _ in film(both, labels=True)]
-    found = find_movers(sightings, movable={CAR, PERSON}, deformable={PERSON})
+    scans = [scan for scan, _ in film(both, labels=True)]
+    found = find_actors(scans, movable={CAR, PERSON}, deformable={PERSON})
     assert sorted((m.segments[0].label, m.rigid) for m in found.tracked) == [(PERSON, False), (CAR, True)]
 
 
 def test_segments_become_tracks_as_those_of_labelled_actors():
-    found = movers(lambda t: [*WALLS, car(-16.0 + 8.0 * t, 6.0)])
+    found = actors(lambda t: [*WALLS, car(-16.0 + 8.0 * t, 6.0)])
     (track,) = link_segments(found.segments, {frame: 0.1 * frame for frame in range(40)})
     assert track.moves
     assert np.allclose(track.velocity_at(20), (8.0, 0.0, 0.0), atol=0.4)
@@ -65,20 +65,20 @@ def test_segments_become_tracks_as_those_of_labelled_actors():
 
 
 def test_moved_points_are_told_for_every_frame():
-    found = movers(lambda t: [*WALLS, car(-16.0 + 8.0 * t, 6.0)], 20)
+    found = actors(lambda t: [*WALLS, car(-16.0 + 8.0 * t, 6.0)], 20)
     assert sorted(found.moved) == list(range(20))
     for segment in found.segments:
         assert np.isin(segment.members, found.moved[segment.frame]).all()
 
 
 def test_nothing_moves_without_scans_or_with_one():
-    assert movers(lambda _: [*WALLS], 0).tracked == ()
-    assert movers(lambda t: [*WALLS, car(8.0 * t, 6.0)], 1).tracked == ()
+    assert actors(lambda _: [*WALLS], 0).tracked == ()
+    assert actors(lambda t: [*WALLS, car(8.0 * t, 6.0)], 1).tracked == ()
 
 
 COARSE = Lidar(channels=16, points=16 * 1800, noise_m=0.0)
 LEAVES = np.random.default_rng(3).uniform((-0.1, 0.1, 0.2, 0.9), (0.1, 0.3, 0.5, 1.3), (113, 4)).tolist()
-STANDING = {
+STATIC = {
     "fence": (8.0, [box(x, 6.0, (0.1, 0.1, 1.2), WALL) for x in np.arange(-15.0, 30.0, 0.5)]),
     "rail": (4.0, [box(x, 4.0, (4.0, 0.1, 0.3), WALL) for x in np.arange(-15.0, 30.0, 4.5)]),
     "hedge": (4.0, [box(-15.0 + 0.4 * i, 6.0 + y, size, WALL) for i, (y, *size) in enumerate(LEAVES)]),
@@ -86,34 +86,34 @@ STANDING = {
 """What repeats: the speed of the sensor, m/s, at which most of it seems to move, and the boxes."""
 
 
-@pytest.mark.parametrize("name", STANDING)
-def test_what_repeats_along_the_street_is_no_mover(name):
-    speed, boxes = STANDING[name]
+@pytest.mark.parametrize("name", STATIC)
+def test_what_repeats_along_the_street_is_no_actor(name):
+    speed, boxes = STATIC[name]
     filmed = film(lambda _: [*WALLS, *boxes], 24, ego_m_s=speed, noise_m=0.02, noise_deg=0.1, lidar=COARSE)
-    assert find_movers(sighting for sighting, _ in filmed).tracked == ()
+    assert find_actors(scan for scan, _ in filmed).tracked == ()
 
 
 @pytest.mark.parametrize(
     ("size", "speed", "y"), [((4.4, 1.8, 1.5), 8.0, 3.5), ((1.7, 0.5, 1.6), 5.0, 5.0), ((0.5, 0.5, 1.7), 1.4, -4.0)]
 )
-def test_movers_are_found_beside_what_repeats_and_are_sure(size, speed, y):
+def test_actors_are_found_beside_what_repeats_and_are_sure(size, speed, y):
     def scene(seconds):
-        return [*WALLS, *STANDING["rail"][1], box(-6.0 + speed * seconds, y - 1.0, size, CAR)]
+        return [*WALLS, *STATIC["rail"][1], box(-6.0 + speed * seconds, y - 1.0, size, CAR)]
 
     filmed = film(scene, 30, ego_m_s=4.0, noise_m=0.02, noise_deg=0.1)
-    found = find_movers(sighting for sighting, _ in filmed).tracked
+    found = find_actors(scan for scan, _ in filmed).tracked
     assert [round(float(np.median([s.velocity[0] for s in m.segments])) / speed, 0) for m in found] == [1.0]
-    assert all(mover.confidence > 0.8 for mover in found)
+    assert all(actor.confidence > 0.8 for actor in found)
 
 
-def test_points_on_the_recording_vehicle_are_found_and_are_no_mover():
+def test_points_on_the_recording_vehicle_are_found_and_are_no_actor():
     rack = np.random.default_rng(1).uniform((-2.4, 0.2, -0.6), (-2.1, 0.5, -0.4), (25, 3)).astype(np.float32)
     filmed = [
-        replace(sighting, points=np.concatenate([sighting.points, rack]))
-        for sighting, _ in film(lambda _: WALLS, 24, ego_m_s=6.0, lidar=COARSE)
+        replace(scan, points=np.concatenate([scan.points, rack]))
+        for scan, _ in film(lambda _: WALLS, 24, ego_m_s=6.0, lidar=COARSE)
     ]
     own = []
-    assert list(follow_movers(find_evidence(filmed), {}, own=own)) == []
+    assert list(follow_actors(find_evidence(filmed), {}, own=own)) == []
     (corners,) = own
     assert (rack > corners[:3]).all() and (rack < corners[3:]).all() and np.ptp(corners.reshape(2, 3), axis=0).max() < 1
 
@@ -121,5 +121,5 @@ def test_points_on_the_recording_vehicle_are_found_and_are_no_mover():
 def test_a_car_beside_the_sensor_that_keeps_its_speed_is_not_the_recording_vehicle():
     own = []
     filmed = film(lambda t: [*WALLS, car(6.0 * t + 1.0, 3.0)], 24, ego_m_s=6.0)
-    (mover,) = follow_movers(find_evidence(sighting for sighting, _ in filmed), {}, own=own)
-    assert mover.confidence > 0.8 and own == []
+    (actor,) = follow_actors(find_evidence(scan for scan, _ in filmed), {}, own=own)
+    assert actor.confidence > 0.8 and own == []

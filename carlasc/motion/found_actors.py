@@ -1,4 +1,4 @@
-"""Movers: things that moved although no flow, instance or label says so, found in the scans of a drive and followed over time."""
+"""Found actors: moving actors that free space shows, and no box, instance or flow. They are followed from scan to scan."""
 
 from __future__ import annotations
 
@@ -11,38 +11,38 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.motion.evidence import FreeSpaceEvidence
 from carlasc.motion.linking import best_pairs
-from carlasc.motion.paths import estimate_path, is_standing, middles_of, overlay
+from carlasc.motion.paths import estimate_path, is_static, middles_of, misalignment
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
 
-_MAX_GAP_S = 1.0  # a mover may be hidden for this long
-_REACH_M, _MAX_SPEED_M_S = 1.0, 25.0  # maximum gap to the prediction; without one, the farthest that a mover gets
-_FAR_M = 15.0  # fast first test: nothing gets farther between two sightings
-_HISTORY = 6  # sightings that the prediction is made from
-_MIN_SIGHTINGS, _MIN_WAY_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # a mover with less earns no track
-_STRAIGHT = 0.35  # extent of a path over its length; noise goes to and fro
-_MAX_JUMP_M_S = 4.0  # median deviation of the sightings' steps from the path's; more is no one thing
+_MAX_GAP_S = 1.0  # an actor may be hidden for this long
+_REACH_M, _MAX_SPEED_M_S = 1.0, 25.0  # maximum gap to the prediction, and maximum speed where there is no prediction
+_FAR_M = 15.0  # fast first test: no actor moves farther between two observations
+_HISTORY = 6  # observations that the prediction is made from
+_MIN_OBSERVATIONS, _MIN_PATH_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # an actor needs so much for a track
+_STRAIGHT = 0.35  # least extent of a path over its length: noise moves back and forth
+_MAX_JUMP_M_S = 4.0  # greatest median deviation of the observations' steps from the path's
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
-_PERSON_M = (1.5, 2.3)  # what is narrower and lower than this changes its shape as it moves
-_SLIDE_M = 0.5  # by which sightings are slid along their path, to see whether they overlay as well then
-_SIGHTINGS, _MANY_SIGHTINGS = 10, 30  # more than the latter do not raise the confidence
-_WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of one, and of the terms of `_confidence`
-_LEAST_CONFIDENCE = 0.5  # of a mover
-_STAYS_M, _SENSOR_WAY_M = 0.5, 1.0  # what moves with the sensor stays there in its frame, while it drives so far
-_LINE_SLOPE = 0.004  # a quarter of a degree: points of one scan line are within it
+_PERSON_M = (1.5, 2.3)  # actors that are narrower and lower change their shape as they move
+_SHIFT_M = 0.5  # observations are shifted along their path by so much, to test whether they still align
+_OBSERVATIONS, _MANY_OBSERVATIONS = 10, 30  # more than the latter do not raise the confidence
+_WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of 1 and of the terms of `_confidence`
+_LEAST_CONFIDENCE = 0.5  # of an actor
+_STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
+_LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
 _OWN_HALF_M, _OWN_REACH_M = 1.3, 3.5  # half the width of the recording vehicle, and how far from the sensor it reaches
 _OWN_MARGIN_M = 0.2  # around most of its points
-_SAMPLES = 300  # points of a sighting that its path is estimated from
+_SAMPLES = 300  # points of an observation that its path is estimated from
 
 
 @dataclass(frozen=True)
-class Mover:
-    """One thing that moved, over time.
+class FoundActor:
+    """A moving actor that free space shows, over time.
 
     Attributes:
-        segments: its points in each scan, in order of frames, with its estimated velocity and its number as `instance`.
+        segments: its points in each scan, in order of frames. `velocity` is estimated, and `instance` is its number.
         rigid: whether it keeps its shape, as vehicles do.
-        confidence: that it is real, from 0 to 1: see `_confidence`.
+        confidence: probability that it is real, from 0 to 1: see `_confidence`.
     """
 
     segments: tuple[Segment, ...]
@@ -50,7 +50,7 @@ class Mover:
     confidence: float
 
 
-def follow_movers(
+def follow_actors(
     evidence: Iterable[FreeSpaceEvidence],
     moved: dict[int, NDArray[np.int64]],
     *,
@@ -58,60 +58,63 @@ def follow_movers(
     first_instance: int = 1,
     default_label: int = 0,
     own: list[NDArray[np.float64]] | None = None,
-) -> Iterator[Mover]:
-    """Follow what moved from scan to scan, and yield each mover that earned a track when it was seen for the last time.
+) -> Iterator[FoundActor]:
+    """Follow what moved from scan to scan, and yield each actor that has enough evidence, after its last observation.
 
     Args:
-        evidence: what moved in each scan, in order of time.
-        moved: filled with the indices of the points of each frame that moved, tracked or not.
-        deformable: classes of objects that change their shape as they move. Without labels, the size tells.
-        first_instance: number of the first mover; others follow.
-        default_label: class of movers without labels.
-        own: filled with the (6,) lower and upper corners of parts of the recording vehicle, which are no movers, metres, sensor frame.
+        evidence: the evidence of each scan, in order of time.
+        moved: filled with the (M,) indices of the points that moved, tracked or not, by frame.
+        deformable: classes of actors that change their shape as they move. Without labels, small actors do.
+        first_instance: number of the first actor; others follow.
+        default_label: class of actors without labels.
+        own: filled with the (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor frame.
+
+    Yields:
+        The actors, numbered in the order of their last observations.
     """
     own = [] if own is None else own
-    alive: list[_MoverChain] = []
+    alive: list[_ActorChain] = []
     number = first_instance
     for found in evidence:
         moved[found.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *found.clusters]))
         ended = [chain for chain in alive if found.seconds - chain.last.seconds > _MAX_GAP_S]
-        for mover in _earned(ended, deformable, number, default_label, own):
-            yield mover
+        for actor in _tracked(ended, deformable, number, default_label, own):
+            yield actor
             number += 1
         alive = [chain for chain in alive if found.seconds - chain.last.seconds <= _MAX_GAP_S]
         _link(found, alive, deformable)
-    yield from _earned(alive, deformable, number, default_label, own)
+    yield from _tracked(alive, deformable, number, default_label, own)
 
 
-def _earned(
-    chains: list[_MoverChain],
+def _tracked(
+    chains: list[_ActorChain],
     deformable: Collection[int],
     number: int,
     default_label: int,
     own: list[NDArray[np.float64]],
-) -> Iterator[Mover]:
-    """Yield the movers of the chains that earn a track, numbered from `number`; parts of the recording vehicle are added to `own`."""
+) -> Iterator[FoundActor]:
+    """Yield the actors of the chains with enough evidence, numbered from `number`, and add parts of the recording vehicle to `own`."""
     for chain in chains:
         part = chain.own_vehicle()
         if part is not None:
             own.append(part)
             continue
-        mover = chain.mover(deformable, number, default_label)
-        if mover is not None:
-            yield mover
+        actor = chain.actor(deformable, number, default_label)
+        if actor is not None:
+            yield actor
             number += 1
 
 
 @dataclass(frozen=True)
 class _Link:
-    """One sighting of a chain."""
+    """One observation of a chain."""
 
     seconds: float
     segment: Segment
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     freed: int  # points at places that were free at other times
-    around: int  # points that stand around it
+    around: int  # static points around it
     world_T_sensor: Transform
 
     @classmethod
@@ -132,7 +135,7 @@ class _Link:
         return _is_small(self.upper - self.lower)
 
     def joined(self, other: _Link) -> _Link:
-        """Return both as one sighting."""
+        """Return the two as one observation."""
         segment = replace(
             self.segment,
             members=np.concatenate([self.segment.members, other.segment.members]),
@@ -143,14 +146,12 @@ class _Link:
         return replace(self, segment=segment, lower=lower, upper=upper, freed=freed, around=around)
 
 
-class _MoverChain:
-    """Sightings of one thing in consecutive scans."""
+class _ActorChain:
+    """The observations of one actor in consecutive scans."""
 
     def __init__(self, first: _Link) -> None:
         self.links = [first]
-        self.velocity: NDArray[np.float64] | None = (
-            None  # (3,) m/s of the most recent sightings; None if there is one only
-        )
+        self.velocity: NDArray[np.float64] | None = None  # (3,) m/s over the last observations; None for a single one
 
     def append(self, link: _Link) -> None:
         """Continue the chain."""
@@ -164,7 +165,7 @@ class _MoverChain:
     def _velocity(self) -> NDArray[np.float64]:
         recent = self.links[-_HISTORY:]
         seconds = np.array([link.seconds for link in recent])
-        # The faces that are seen change, so lower corner, middle and upper corner are measured, and the least motion counts.
+        # The visible faces change: the velocities of the lower corner, the middle and the upper corner are compared, and the lowest one counts.
         offsets = seconds - seconds.mean()
         corners = np.stack([[link.lower, link.middle, link.upper] for link in recent])
         slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
@@ -172,7 +173,7 @@ class _MoverChain:
         return np.where(np.abs(slopes).max(axis=0) > 0, (least + slopes[1]) / 2, 0.0)
 
     def cost(self, link: _Link) -> float | None:
-        """Return how badly a sighting continues the chain; None if it cannot."""
+        """Return how badly an observation continues the chain; None if it cannot."""
         last, velocity = self.last, self.velocity
         if last.segment.label != link.segment.label:
             return None
@@ -191,15 +192,15 @@ class _MoverChain:
         return float(np.linalg.norm(gap, axis=0) + 0.3 * np.linalg.norm(offset[:2], axis=0) + 0.2 * sizes.sum())
 
     def covers(self, link: _Link) -> bool:
-        """Return whether a sighting is inside the place where the chain's next one is expected."""
+        """Return whether an observation is inside the place where the chain's next one is expected."""
         velocity = self.velocity
         shift = np.zeros(3) if velocity is None else velocity * (link.seconds - self.last.seconds)
         lower, upper = self.last.lower + shift - 0.3, self.last.upper + shift + 0.3
         return bool(((link.middle > lower) & (link.middle < upper))[:2].all())
 
-    def mover(self, deformable: Collection[int], instance: int, default_label: int) -> Mover | None:
-        """Return the thing that moved; None if its sightings do not overlay better along a path than standing."""
-        if len(self.links) < _MIN_SIGHTINGS:
+    def actor(self, deformable: Collection[int], instance: int, default_label: int) -> FoundActor | None:
+        """Return the actor; None unless its observations align better along a path than without motion."""
+        if len(self.links) < _MIN_OBSERVATIONS:
             return None
         seconds = np.array([link.seconds for link in self.links])
         segments = [link.segment for link in self.links]
@@ -210,14 +211,14 @@ class _MoverChain:
         samples = [thin(s.points, _SAMPLES) for s in segments]
         positions, velocities, headings = estimate_path(samples, seconds, rigid=rigid)
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
-        if np.ptp(positions[:, :2], axis=0).max() < _MIN_WAY_M or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S:
+        if np.ptp(positions[:, :2], axis=0).max() < _MIN_PATH_M or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S:
             return None
         length = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1).sum()
         if np.ptp(positions[:, :2], axis=0).max() < _STRAIGHT * length:
             return None
         middles = np.stack([link.middle for link in self.links])
         steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(seconds)
-        if np.median(steps) > _MAX_JUMP_M_S or is_standing(samples, positions, headings, seconds):
+        if np.median(steps) > _MAX_JUMP_M_S or is_static(samples, positions, headings, seconds):
             return None
         confidence = self._confidence(samples, positions, headings, seconds)
         if confidence < _LEAST_CONFIDENCE:
@@ -226,7 +227,7 @@ class _MoverChain:
             replace(segment, label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
-        return Mover(tuple(found), rigid, confidence)
+        return FoundActor(tuple(found), rigid, confidence)
 
     def _confidence(
         self,
@@ -235,36 +236,36 @@ class _MoverChain:
         headings: NDArray[np.float64],
         seconds: NDArray[np.float64],
     ) -> float:
-        """Return how sure it is that the thing is real, from 0 to 1; the arguments are those of `overlay`.
+        """Return the probability that the actor is real, from 0 to 1; the arguments are those of `misalignment`.
 
-        The terms: the share of its points that were at places seen free; the share that stands around it, at its height, of all points there;
-        the share by which its sightings overlay better than slid along its path; the logarithm of their number; and whether it is a scan
-        line. A piece of a rail, a fence or a hedge has neighbours that stand, and overlays as well after any slide. The result is the
-        logistic function of the sum.
+        It is the logistic function of a weighted sum of these terms: the share of its points at places that were seen free; the share of
+        static points among all points around it; the share by which its observations align better than shifted along its path; the
+        logarithm of their number; and whether it is a scan line. The second and the third term reject pieces of rails, fences and
+        hedges: these have static neighbours, and align as well after any shift.
         """
-        _, best, *slid = overlay(samples, positions, headings, seconds, (0.0, -_SLIDE_M, _SLIDE_M))
+        _, best, *shifted = misalignment(samples, positions, headings, seconds, (0.0, -_SHIFT_M, _SHIFT_M))
         counts = np.array([(len(link.segment.members), link.freed, link.around) for link in self.links])
         points, freed, around = counts.sum(axis=0).tolist()
-        gain = 1.0 - best / max(min(slid), 1e-3)
-        support = float(np.log(min(len(self.links), _MANY_SIGHTINGS) / _SIGHTINGS))
+        gain = 1.0 - best / max(min(shifted), 1e-3)
+        support = float(np.log(min(len(self.links), _MANY_OBSERVATIONS) / _OBSERVATIONS))
         terms = (1.0, freed / points, around / (points + around), gain, support, float(self._is_scan_line()))
         return 1.0 / (1.0 + float(np.exp(-sum(weight * term for weight, term in zip(_WEIGHTS, terms, strict=True)))))
 
     def _in_sensor(self) -> list[NDArray[np.float64]] | None:
-        """Return (M, 3) points of each sighting, metres, sensor frame, if they stay there while the sensor moves; None if they do not."""
-        way = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
+        """Return the (M, 3) points of each observation, metres, sensor frame; None unless they stay in place there while the sensor moves."""
+        driven = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
         local = [transform_points(invert(link.world_T_sensor), link.segment.points) for link in self.links]
         middles = middles_of(local)
         stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
-        return local if stays and way > _SENSOR_WAY_M and len(local) >= _MIN_SIGHTINGS else None
+        return local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
 
     def own_vehicle(self) -> NDArray[np.float64] | None:
-        """Return (6,) lower and upper corner of the place in the sensor's frame, metres, if the thing is a part of the recording vehicle."""
+        """Return the (6,) lower and upper corner, metres, sensor frame, of a part of the recording vehicle; None if it is none."""
         local = self._in_sensor()
         if local is None:
             return None
-        way = np.gradient(np.stack([link.world_T_sensor[:2, 3] for link in self.links]), axis=0)
-        for link, step in zip(self.links, way, strict=True):
+        steps = np.gradient(np.stack([link.world_T_sensor[:2, 3] for link in self.links]), axis=0)
+        for link, step in zip(self.links, steps, strict=True):
             x, y, _ = (link.segment.points - link.world_T_sensor[:3, 3]).T
             across = np.abs(x * step[1] - y * step[0]) / max(float(np.hypot(*step)), 1e-6)
             if across.max() > _OWN_HALF_M or np.hypot(x, y).max() > _OWN_REACH_M:
@@ -273,7 +274,7 @@ class _MoverChain:
         return np.concatenate([low - _OWN_MARGIN_M, high + _OWN_MARGIN_M])
 
     def _is_scan_line(self) -> bool:
-        """Return whether it is what one scan line hits, and moves with the sensor, as the place does where a line meets a rail."""
+        """Return whether its points are of one scan line and move with the sensor, as where a scan line meets a rail."""
         local = self._in_sensor()
         if local is None:
             return False
@@ -286,7 +287,7 @@ def _is_small(size: NDArray[np.float64]) -> bool:
 
 
 def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
-    """Join clusters that are near to each other to one vehicle: rays are far apart on sides that are seen at a grazing angle."""
+    """Join clusters of one vehicle. Rays that meet a side at a grazing angle are far apart, and split it."""
     joined = list(links)
     i = 0
     while i < len(joined):
@@ -311,8 +312,8 @@ def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     return bool(nearest_points(*samples)[1].min() < _PARTS_M**2)
 
 
-def _link(evidence: FreeSpaceEvidence, alive: list[_MoverChain], deformable: Collection[int]) -> None:
-    """Continue chains with the clusters of a scan, and start new ones: best first, then parts of what a chain has found already."""
+def _link(evidence: FreeSpaceEvidence, alive: list[_ActorChain], deformable: Collection[int]) -> None:
+    """Continue chains with the clusters of a scan, best pairs first; join further parts to them; start new chains with the rest."""
     links = _join_parts([_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable)
     costs = []
     ends = np.array([chain.last.middle for chain in alive]).reshape(-1, 3)
@@ -332,7 +333,7 @@ def _link(evidence: FreeSpaceEvidence, alive: list[_MoverChain], deformable: Col
     for i, j in extra.items():
         main = next(k for k, chain in taken.items() if chain == j)
         links[main] = links[main].joined(links[i])
-    fresh = [_MoverChain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
+    fresh = [_ActorChain(link) for i, link in enumerate(links) if i not in taken and i not in extra]
     for i, j in taken.items():
         alive[j].append(links[i])
     alive.extend(fresh)
