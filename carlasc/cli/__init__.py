@@ -128,7 +128,7 @@ app = typer.Typer(
     name="carlasc",
     cls=_Group,
     **_SETTINGS,
-    help="Read, convert, regenerate and score CarlaSC data: complete semantic scenes without ghost trails.",
+    help="Read, convert, regenerate and score CarlaSC data: complete, trace-free semantic scenes.",
 )
 
 

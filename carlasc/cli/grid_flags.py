@@ -225,7 +225,7 @@ class WindowFlags(Flags):
         carlasc.motion.MotionSource | None,
         typer.Option(
             help="What tells which points move. boxes, instances, flow: the field of that name; evidence: free space that other scans saw"
-            " there; none: nothing but moving classes; auto: the best field that exists, and evidence for what it misses, unless all scans have flow (default)."
+            " there; none: nothing but moving classes; auto: the best field that exists, and evidence for what it misses (default)."
         ),
     ] = None
 

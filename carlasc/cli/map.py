@@ -48,7 +48,7 @@ def map(
         carlasc.motion.MotionSource,
         typer.Option(
             help="What tells which points move. boxes, instances, flow: the field of that name; evidence: free space that other scans saw"
-            " there; none: nothing but moving classes; auto: the best field that exists, and evidence for what it misses, unless all scans have flow."
+            " there; none: nothing but moving classes; auto: the best field that exists, and evidence for what it misses."
         ),
     ] = "auto",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,

@@ -1,4 +1,4 @@
-"""What carlasc.json says of a sequence, and the version of the files that carlasc adds. See `docs/format.md#carlascjson`."""
+"""What carlasc.json says of a sequence, and the version of the files that carlasc adds. See `docs/format.md#carlasc-json`."""
 
 from __future__ import annotations
 
