@@ -38,7 +38,7 @@ from carlasc.storage.sinks import Sink
 from carlasc.storage.transport.targets import check_shared
 from carlasc.storage.transport.trees import is_url
 
-RULES = {"capture": 1, "scans": 2, "grid": 1}
+RULES = {"capture": 1, "scans": 3, "grid": 1}
 """Version of the rule that makes grids, by what observes the scene. It changes only when the same input gives other grids."""
 
 
