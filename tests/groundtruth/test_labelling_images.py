@@ -137,7 +137,7 @@ def test_bad_input_is_one_line(labelled, tmp_path):
         np.save(camera / "000000.npy", np.zeros((HEIGHT, 20), np.uint8))
 
     refused(FormatError, "200 x 100 pixels.*found 20 x 100", changed("size", other_size))
-    refused(FormatError, r"\(100, 200\) whole numbers.*found uint8 of shape \(100, 20\)", changed("array", other_array))
+    refused(FormatError, r"\(100, 200\) integers.*found uint8 of shape \(100, 20\)", changed("array", other_array))
     refused(FormatError, "a whole JPEG or PNG", changed("short", cut_short))
     refused(FormatError, "ids of the class table carla.*found 99", changed("class", unknown_class))
     refused(

@@ -138,8 +138,8 @@ def test_an_unfinished_store_of_any_format_says_the_same(tmp_path: Path, name: s
     with pytest.raises(FormatError) as error:
         carlasc.open(tmp_path / opened)
     assert str(error.value) == (
-        f"{tmp_path / opened}: expected a finished store, found one that is being written, or was interrupted: "
-        "run the same command again to finish it (`carlasc finish` for a .zarr store whose parts are all written)"
+        f"{tmp_path / opened}: expected a finished store, found an unfinished one: a run is writing it, or was interrupted: "
+        "run the same command again to finish it (`carlasc finish` if all parts of a .zarr store are written)"
     )
 
 
@@ -153,5 +153,5 @@ def test_a_frame_is_written_once(tmp_path: Path, kind: str, package: str) -> Non
     pytest.importorskip(package)
     writer = open_sink(tmp_path / f"x.{kind}", PackOptions(), False).sequence(SCANS)
     writer.write("labels", 3, np.arange(3, dtype=np.uint32))
-    with pytest.raises(FormatError, match="frame 3: its number: expected frames in rising order, above 3, found 3"):
+    with pytest.raises(FormatError, match="frame 3: its number: expected frames in ascending order, above 3, found 3"):
         writer.write("labels", 3, np.arange(3, dtype=np.uint32))

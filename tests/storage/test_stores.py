@@ -173,13 +173,16 @@ def make_larger(root: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (remove_chunk, "expected the size of its chunks, found None: the store is damaged"),
-        (forget_columns, r"expected \(4, 0\) numbers of elements, of rising frames, found others"),
+        (remove_chunk, "expected a chunk size above 0, found None: the store is damaged"),
+        (forget_columns, r"expected \(4, 0\) numbers of elements, with ascending frame numbers, found other values"),
         (shorten, r"xyz: expected <f4 with room for frame 5, found <f4 of shape \(5, 3, 262144\)"),
         (flatten, r"expected <f4 with room for frame 5, found <f4 of shape \(16, 2, "),
         (widen, r"expected <f4 with room for frame 5, found <f8"),
         (make_larger, "the checksum does not match|found none: the store is damaged"),
-        (take_completeness, "expected a finished store, found one that is being written, or was interrupted"),
+        (
+            take_completeness,
+            "expected a finished store, found an unfinished one: a run is writing it, or was interrupted",
+        ),
         (change_type, "expected the sequence that the store lists"),
         (remove_split, "expected the attribute split, found none: the store is damaged"),
         (change_kind, "expected a field of kind points, found 'values'"),
@@ -226,11 +229,15 @@ SEQUENCE = "Town01_Light/cartesian"
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [
-        ("frames", [0, 1, 2, 2], "expected rising numbers of frames"),
-        ("frames", [-1, 1, 2, 5], "expected rising numbers of frames"),
+        ("frames", [0, 1, 2, 2], "expected ascending frame numbers"),
+        ("frames", [-1, 1, 2, 5], "expected ascending frame numbers"),
         ("frames", [0, 1, 2, 6], "expected u1 with room for frame 6"),
         ("frames", [0, 1, 2, 2**62], f"expected u1 with room for frame {2**62}"),
-        ("frames", [0, 1, 2], r"expected \(3, [0-9]+\) numbers of elements, of rising frames, found others"),
+        (
+            "frames",
+            [0, 1, 2],
+            r"expected \(3, [0-9]+\) numbers of elements, with ascending frame numbers, found other values",
+        ),
         ("counts", [0, 1, 777, 2**40], "expected u1 with room for frame 5"),
         ("counts", [1, 1, 777, 1001], r"frame 0.*expected chunk 0 of .*values, found none: the store is damaged"),
         ("counts", [0, 1, 777, 16385], r"frame 5.*expected chunk 81 of .*values, found none: the store is damaged"),

@@ -366,7 +366,7 @@ def test_sinks_are_of_the_kind_that_their_place_says(tmp_path: Path) -> None:
     assert type(as_sink(tmp_path / "out.zarr")).__name__ == "ZarrSink"
     remote = as_sink("memory://folder")
     assert isinstance(remote, FolderSink) and remote.location == "memory://folder"
-    with pytest.raises(ArgumentError, match="found a web server, which is only read"):
+    with pytest.raises(ArgumentError, match="found a web server, which can only be read"):
         as_sink("https://host/folder")
 
 
