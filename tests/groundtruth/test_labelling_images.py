@@ -147,7 +147,7 @@ def test_bad_input_is_one_line(labelled, tmp_path):
     )
     refused(MissingDataError, "classes of pixels, such as A/at0/000000.png", None)
     refused(MissingDataError, "cameras in cameras.json, found none", good, source=folder / "truth")
-    refused(ArgumentError, "a name of one line", good, by="\n")
+    refused(ArgumentError, "a name in one line", good, by="\n")
     for more in (["--frames", "1:"], ["--logits"]):
         call = ["label", source, "-o", tmp_path / "out", "--from", "images", "--pixels", good, *more]
         done = CliRunner().invoke(app, list(map(str, call)))

@@ -153,5 +153,5 @@ def test_a_frame_is_written_once(tmp_path: Path, kind: str, package: str) -> Non
     pytest.importorskip(package)
     writer = open_sink(tmp_path / f"x.{kind}", PackOptions(), False).sequence(SCANS)
     writer.write("labels", 3, np.arange(3, dtype=np.uint32))
-    with pytest.raises(FormatError, match="frame 3: its number: expected frames in ascending order, above 3, found 3"):
+    with pytest.raises(FormatError, match="frame 3: its number: expected frames in rising order, above 3, found 3"):
         writer.write("labels", 3, np.arange(3, dtype=np.uint32))

@@ -297,7 +297,7 @@ def test_the_table_answers_for_each_split_and_kind() -> None:
     [
         (("validation",), "sequences", "expected one of train, val, test, all"),
         ((), "sequences", "found none"),
-        (("val",), "fine", "leave it out"),
+        (("val",), "fine", "leave `split` out"),
         ((), "coarse", "what"),
     ],
 )

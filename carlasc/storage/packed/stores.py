@@ -215,7 +215,7 @@ class FieldWriter(ABC):
         """
         last = next(reversed(self.frames), -1)
         if frame <= last:
-            raise FormatError("its number", expected=f"frames in ascending order, above {last}", found=str(frame))
+            raise FormatError("its number", expected=f"frames in rising order, above {last}", found=str(frame))
         self.entry.check(array, "its array")
         self.write(frame, array)
         self.frames[frame] = None

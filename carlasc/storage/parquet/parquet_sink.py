@@ -192,7 +192,7 @@ class TableWriter(FieldWriter):
         self._writer: Any = None
 
     def write(self, frame: int, array: NDArray[Any]) -> None:
-        """Append one row group; an empty frame has none."""
+        """Append one row group. An empty frame has no row group."""
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
             self._start(pa, array)

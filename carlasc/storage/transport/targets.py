@@ -125,7 +125,7 @@ class LocalTarget(Target):
 
     def _inside(self, path: str) -> Path:
         if leads_outside(path):
-            raise FormatError(path, expected=f"a path inside {self.folder}", found="one that leads elsewhere")
+            raise FormatError(path, expected=f"a path inside {self.folder}", found="a path that leads out of it")
         return self.folder / path
 
 
@@ -246,7 +246,7 @@ class RemoteTarget(Target):
 
     def _checked(self, path: str) -> str:
         if leads_outside(path):
-            raise FormatError(path, expected=f"a path inside {self.location}", found="one that leads elsewhere")
+            raise FormatError(path, expected=f"a path inside {self.location}", found="a path that leads out of it")
         return path
 
 
