@@ -163,7 +163,7 @@ def test_frames_that_cannot_be_scored_are_listed_and_the_others_done(folders, wo
 def test_a_prediction_of_another_grid_is_refused(folders, world, tmp_path):
     other = GridSpec("cartesian", (4, 4, 2), SPEC.lower, SPEC.upper)
     write_grids(tmp_path / "other", {key: np.zeros(other.size) for key in world[0]}, spec=other)
-    with pytest.raises(FormatError, match="expected the truth's grid cartesian 8 x 8 x 2"):
+    with pytest.raises(FormatError, match="expected the geometry of the ground truth, cartesian 8 x 8 x 2"):
         evaluate(tmp_path / "other", folders[1])
     plain = tmp_path / "plain"
     plain.mkdir()
@@ -328,7 +328,7 @@ def test_plain_folders_of_different_sizes_are_told_by_the_size_of_their_files(tm
     without = write_plain(tmp_path / "without", {"000000.label": np.zeros(4, np.uint32)})
     counted = {"000000.label": np.zeros(4, np.uint32), "000000.bin": np.ones(4, np.float32)}
     assert (
-        r"expected the truth's shape (4,), found (3,)"
+        r"expected the shape of the ground truth (4,), found (3,)"
         in evaluate(source, without, scoring=Scoring(voxels="all")).failures[0][1]
     )
     assert "expected 4 labels" in evaluate(source, write_plain(tmp_path / "counted", counted)).failures[0][1]

@@ -130,7 +130,7 @@ def test_a_vertical_field_of_view_includes_both_ends_and_is_measured_from_the_ho
 
 
 def test_masks_that_can_hold_nothing_are_refused():
-    with pytest.raises(ArgumentError, match="far_m: expected more than 5, where the band starts, found 5"):
+    with pytest.raises(ArgumentError, match="far_m: expected more than 5, the value of `near_m`, found 5"):
         distance_band(SMALL, 5, 5)
     with pytest.raises(ArgumentError, match="near_m: expected 0 or more, found -1"):
         distance_band(SMALL, -1, 5)
