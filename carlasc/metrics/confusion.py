@@ -175,7 +175,7 @@ class ConfusionMatrix:
 
     @property
     def miou(self) -> float:
-        """mIoU of the paper: the mean over all classes, including free. Absent classes count as zero."""
+        """Mean IoU as in the paper: over all classes, including free. Absent classes count as zero."""
         return self.mean_iou()
 
     def mean_iou(self, *, with_free: bool = True, absent: Absent = "zero") -> float:

@@ -130,7 +130,7 @@ def test_a_missing_folder_sensor_or_frame_is_named(tmp_path):
     with pytest.raises(MissingDataError, match="nowhere: expected a folder, found nothing"):
         Capture(tmp_path / "nowhere")
     (tmp_path / "raw").mkdir()
-    with pytest.raises(MissingDataError, match="raw: expected the ego sensor's folder velodyne0, found no sensor"):
+    with pytest.raises(MissingDataError, match="raw: expected the folder velodyne0 of the ego sensor, found no sensor"):
         _ = Capture(tmp_path).sensors
     (tmp_path / "raw/velodyne2").mkdir()
     with pytest.raises(MissingDataError, match=r"found only the sensors \[2\]"):

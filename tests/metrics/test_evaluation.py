@@ -232,7 +232,7 @@ def test_voxels_that_no_camera_sees_do_not_count_for_cameras(folders):
     assert by_camera.matrix.total < 0.8 * by_lidar.matrix.total
     parts = evaluate(folders[0], truth, convention="occ3d-lidar", scoring=Scoring(by=["seen"])).breakdown
     assert parts["seen"] == by_camera.matrix and parts["seen"] + parts["not seen"] == by_lidar.matrix
-    with pytest.raises(MissingDataError, match="without the field `seen`"):
+    with pytest.raises(MissingDataError, match="cameras and the field `seen`"):
         evaluate(folders[0], folders[0], convention="own", scoring=Scoring(by=["seen"]))
 
 
@@ -246,7 +246,7 @@ def test_a_sequence_without_prediction_is_named_in_a_note(folders):
     result = evaluate(*folders)
     assert set(result.sequences) == set(SEQUENCES)
     assert result.notes == (
-        "1 of 3 sequences of the truth have no prediction and were not scored: Test/Town10_New/cartesian",
+        "1 of 3 sequences of the ground truth have no prediction and were not scored: Test/Town10_New/cartesian",
     )
 
 
@@ -373,7 +373,7 @@ def test_sequences_of_different_classes_are_summed_in_the_classes_of_the_convent
         write_grids(tmp_path, {k: v for k, v in labels.items() if k[0] == path}, counts, classes=classes)
     result = evaluate(tmp_path, tmp_path)
     assert (result.frames, result.matrix.accuracy) == (6, 1.0)
-    with pytest.raises(FormatError, match=r"the convention own has a map for \(carlasc11\), found carla"):
+    with pytest.raises(FormatError, match=r"a class table with a map in the convention own \(carlasc11\), found carla"):
         evaluate(tmp_path, tmp_path, convention="own")
 
 
@@ -381,7 +381,7 @@ def test_of_several_grids_one_is_to_be_named(world, tmp_path):
     for grid in ("evaluation_a", "evaluation_b"):
         write_grids(tmp_path, world[0], world[1], grid=grid)
     with pytest.raises(
-        MissingDataError, match="expected the grid evaluation, found evaluation_a, evaluation_b: choose one with"
+        MissingDataError, match="expected the grid evaluation, found evaluation_a, evaluation_b: choose a grid with"
     ):
         evaluate(tmp_path, tmp_path)
     assert evaluate(tmp_path, tmp_path, truth_grid="evaluation_b").miou > 0.9

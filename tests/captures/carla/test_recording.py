@@ -243,7 +243,7 @@ def test_a_replay_that_departs_from_the_drive_is_refused(tmp_path):
     call(tmp_path, FakeServer(), count=2)
     server = FakeServer()
     server.drift = 0.5
-    with pytest.raises(ConflictError, match="frame 0: expected the replay to follow"):
+    with pytest.raises(ConflictError, match="frame 0: expected a replay that follows"):
         call(tmp_path, server, count=4)
     assert Capture(tmp_path).frames.tolist() == [0, 1]
     assert_cleaned_up(server)
