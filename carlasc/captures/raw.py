@@ -82,7 +82,7 @@ def parse_times(data: bytes | memoryview, where: str) -> dict[int, tuple[float, 
         match = re.match(r"\s*([0-9]{1,18})\s*,.*\belapsed_seconds=([-+0-9.eE]+)", line)
         try:
             if match is None:
-                raise ValueError("another form")
+                raise ValueError("another format")
             found[int(match[1])] = float(match[2]), line
         except ValueError as error:
             raise FormatError(

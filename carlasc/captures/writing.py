@@ -135,7 +135,7 @@ class CaptureWriter:
         """
         scan, where = recording.scan, f"{self.location}: sensor {sensor}, frame {frame}"
         if scan.labels is None or scan.instances is None:
-            raise FormatError(where, expected="labels and instances", found="none")
+            raise FormatError(where, expected="a scan with labels and instances", found="a scan without one of them")
         arrays: dict[str, NDArray[Any]] = {
             "points": scan.points,
             "labels": scan.labels,

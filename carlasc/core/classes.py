@@ -91,7 +91,7 @@ class ClassTable:
         known = [entry.name for entry in fields(cls)]
         if unknown := sorted(set(values) - set(known)):
             raise FormatError(
-                f"{where}: classes", expected=f"the keys {', '.join(known)}", found=", ".join(map(str, unknown))
+                f"{where}: classes", expected=f"only the keys {', '.join(known)}", found=", ".join(map(str, unknown))
             )
         try:
             return cls(

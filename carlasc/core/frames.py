@@ -32,7 +32,7 @@ class FrameRange:
     def __post_init__(self) -> None:
         for bound in (self.start, self.stop, *(self.only or ())):
             if bound is not None and (isinstance(bound, bool) or not isinstance(bound, int | np.integer)):
-                raise ArgumentError("frames", expected="whole numbers or None", found=repr(bound))
+                raise ArgumentError("frames", expected="integers or None", found=repr(bound))
         if self.start is not None and self.stop is not None and self.start >= self.stop:
             raise ArgumentError("frames", expected="a range that holds a frame", found=str(self))
 
@@ -65,7 +65,7 @@ class FrameRange:
         try:
             chosen = sorted({operator.index(frame) for frame in frames})
         except TypeError:
-            raise ArgumentError("frames", expected="a list of whole numbers", found=repr(frames)) from None
+            raise ArgumentError("frames", expected="a list of integers", found=repr(frames)) from None
         if not chosen:
             raise ArgumentError("frames", expected="a range that holds a frame", found=repr(frames))
         gapless = chosen[-1] - chosen[0] == len(chosen) - 1

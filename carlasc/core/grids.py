@@ -102,7 +102,7 @@ class GridSpec:
         try:
             size = [float(v) for v in params["grid_size"]]
             if any(v != int(v) for v in size):
-                raise FormatError(where, expected="whole numbers in grid_size", found=str(size))
+                raise FormatError(where, expected="integers in grid_size", found=str(size))
             lower, upper = tuple(params["min_bound"]), tuple(params["max_bound"])
             return cls(
                 params["coordinates"],

@@ -382,7 +382,9 @@ class Dataset(_MapStyle):
         lengths = {name: len(array) for name, array in sample.items()}
         if len(set(lengths.values())) > 1:
             found = ", ".join(f"{length} {name}" for name, length in lengths.items())
-            raise FormatError(f"{part.scans.location}: frame {frame}", expected="the same number of each", found=found)
+            raise FormatError(
+                f"{part.scans.location}: frame {frame}", expected="one value per point in each field", found=found
+            )
         return sample
 
 

@@ -273,9 +273,8 @@ def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.
         FormatError: the grids differ in geometry, or an id is out of range.
     """
     if grid.spec != reference.spec:
-        raise FormatError(
-            "grid", expected=f"the geometry of the reference, {reference.spec}", found=f"{grid.spec}, or other bounds"
-        )
+        expected, found = (f"{spec}, {spec.lower} to {spec.upper}" for spec in (reference.spec, grid.spec))
+        raise FormatError("grid", expected=f"the geometry of the reference, {expected}", found=found)
     selected = np.ones(grid.spec.size, np.bool_) if mask is None else mask
     known, known_reference = grid.known & selected, reference.known & selected
     both = known & known_reference

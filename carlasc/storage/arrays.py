@@ -33,9 +33,9 @@ _READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 _ORDERS = ("<", ">")
 WHOLE_NUMBERS = ("?", "i1", "u1", *(f"{order}{kind}{size}" for order in _ORDERS for kind in "iu" for size in (2, 4, 8)))
-"""Types of whole numbers, for files of other programs, which choose the type themselves."""
+"""All integer types, for files of other programs, whose type is not fixed."""
 NUMBERS = (*WHOLE_NUMBERS, *(f"{order}f{size}" for order in _ORDERS for size in (2, 4, 8)))
-"""The same of all real numbers."""
+"""All integer and floating-point types, for files of other programs."""
 
 
 @dataclass(frozen=True)

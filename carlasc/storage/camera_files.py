@@ -61,8 +61,9 @@ def cameras_from_json(data: bytes, where: str, axes: Axes) -> dict[str, CameraMo
         if camera.name in cameras:
             raise FormatError(where, expected="a different name for each camera", found=f"two named {camera.name}")
         if (np.linalg.det(camera.sensor_T_camera[:3, :3]) > 0) != (axes == "right"):
-            expected = "a rotation" if axes == "right" else "a reflection, as the scans are left-handed"
-            raise FormatError(f"{where}: {camera.name}", expected=f"{expected} in sensor_T_camera", found="the other")
+            expected, found = ("a rotation", "a reflection") if axes == "right" else ("a reflection", "a rotation")
+            advice = f"convert sensor_T_camera to the {axes}-handed axes of the scans"
+            raise FormatError(f"{where}: {camera.name}: sensor_T_camera", expected=expected, found=found, advice=advice)
         cameras[camera.name] = camera
     return cameras
 
@@ -95,7 +96,7 @@ def scan_T_camera(sequence: Sequence, camera: CameraModel, frame: int) -> Transf
     line = sequence.line_of(frame, len(times), layout.TIMES)
     where = f"{sequence.location}/{layout.CAMERAS}: {camera.name}, frame {frame}"
     if len(camera.times) != len(times):
-        raise FormatError(where, expected=f"{len(times)} times, as in times.txt", found=str(len(camera.times)))
+        raise FormatError(where, expected=f"{len(times)} times, as in times.txt", found=f"{len(camera.times)} times")
     seconds = float(camera.times[line])
     if np.isnan(seconds):
         return None

@@ -165,7 +165,8 @@ class _LabelledSequence(DerivedSequence):
             words = (
                 ("labels", "probabilities") if "probabilities" not in self.made else ("probabilities", "labels only")
             )
-            raise FormatError(path, expected=f"{words[0]}, as in the first file", found=words[1])
+            advice = "predict all frames in the same form"
+            raise FormatError(path, expected=f"{words[0]}, as in the first file", found=words[1], advice=advice)
         return {name: array for name, array in found.items() if array is not None}
 
 

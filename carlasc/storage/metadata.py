@@ -90,7 +90,7 @@ def check_format(version: object, where: str) -> None:
         FormatError: it is not a version, or is a newer one.
     """
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
-        raise FormatError(where, expected="a whole number above 0 in format", found=repr(version))
+        raise FormatError(where, expected="an integer above 0 in format", found=repr(version))
     if version > FORMAT:
         raise FormatError(
             where, expected=f"format {FORMAT} or older", found=f"format {version}", advice="upgrade carlasc to read it"

@@ -210,7 +210,7 @@ def test_a_file_of_another_size_is_named(tmp_path, change, message):
 
 def test_a_recording_without_labels_is_not_written(tmp_path):
     scan = Scan(np.zeros((1, 3), np.float32))
-    with pytest.raises(FormatError, match="sensor 0, frame 5: expected labels and instances"):
+    with pytest.raises(FormatError, match="sensor 0, frame 5: expected a scan with labels and instances"):
         CaptureWriter(tmp_path).write(0, 5, SensorRecording(scan, np.eye(4), np.empty((0, 4))))
 
 

@@ -161,7 +161,7 @@ def test_a_table_of_ones_own_is_kept_whole():
         ),
         ({"colors": {"0": [0, 0], "7": [0, 0, 0]}}, "a.json: classes: expected names and colours by id"),
         ({"movable": [9]}, "a.json: class table lab: expected ids of the table in movable, found 9"),
-        ({"moveable": [7]}, "a.json: classes: expected the keys name, names, .*found moveable"),
+        ({"moveable": [7]}, "a.json: classes: expected only the keys name, names, .*found moveable"),
         ({"name": "carla"}, "a.json: classes: expected a name that is not in use.*give the table a new name"),
     ],
 )

@@ -28,7 +28,7 @@ def test_bands_share_the_grid_out():
     np.testing.assert_array_equal(sum(band.astype(int) for band in bands.values()), 1)
     heights = height_bands(SPEC, (-1, 0, 1))
     assert heights["-1-0 m up"][..., :2].all() and not heights["-1-0 m up"][..., 2:].any()
-    with pytest.raises(ArgumentError, match="rising"):
+    with pytest.raises(ArgumentError, match="increasing"):
         height_bands(SPEC, (1, 0))
 
 

@@ -229,19 +229,19 @@ def check_small(dataset: Any, what: str) -> None:
     """
     size, stored, filters = dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size(), _filters(dataset)
     if dataset.dtype.kind not in "uif" or not set(filters) <= _SMALL_FILTERS:
-        raise FormatError(what, expected="numbers, packed by gzip or not at all", found="others", advice=_UNTRUSTED)
+        raise FormatError(what, expected="numbers without filters or with gzip", found="other data", advice=_UNTRUSTED)
     check_ratio(size, stored, what)
     if dataset.chunks is None or not size:
         if size > stored:  # HDF5 would fill the rest with zeros
             raise FormatError(what, expected=f"{size} bytes", found=f"{stored}", advice="the store is damaged")
         return
     if dataset.chunks != dataset.shape or dataset.id.get_num_chunks() != 1:
-        raise FormatError(what, expected="one chunk", found="several", advice="the store is damaged")
+        raise FormatError(what, expected="one chunk", found="several chunks", advice="the store is damaged")
     if _GZIP in filters:  # HDF5 decompresses a whole chunk without a limit
         packed = dataset.id.read_direct_chunk((0,) * len(dataset.shape))[1]
         unpacked = zlib.decompressobj().decompress(packed, size + 1)
         if len(unpacked) != size:
-            raise FormatError(what, expected=f"{size} bytes", found="others", advice=_UNTRUSTED)
+            raise FormatError(what, expected=f"{size} bytes", found="another size", advice=_UNTRUSTED)
 
 
 def _filters(dataset: Any) -> list[int]:

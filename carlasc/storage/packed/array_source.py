@@ -213,6 +213,7 @@ class ArraySequence(PackedSequence[ArrayField]):
                 f"{self.location}: field {field}",
                 expected=f"grids of shape {grid.size}, as in params.json",
                 found=f"{shape}",
+                advice="the store is damaged",
             )
 
     def __getstate__(self) -> dict[str, Any]:

@@ -215,7 +215,8 @@ class FlowPacking(Packing):
         """Return (N, 3) float32."""
         index, palette = columns["index"], columns["palette"]
         if index.size and int(index.max()) >= palette.shape[1]:
-            raise FormatError("its index", expected=f"indices below {palette.shape[1]}", found=str(int(index.max())))
+            found, advice = str(int(index.max())), "the store is damaged"
+            raise FormatError("its index", expected=f"indices below {palette.shape[1]}", found=found, advice=advice)
         return np.ascontiguousarray(palette.T)[index]
 
 

@@ -156,7 +156,7 @@ class FieldTable:
         where = f"{self.where}: field {self.field}, frame {frame}"
         most = None if shape is None else math.prod(shape)
         if most is not None and rows != most:
-            raise FormatError(where, expected=f"{most} voxels", found=str(rows))
+            raise FormatError(where, expected=f"{most} voxels", found=str(rows), advice="the store is damaged")
         if rows:
             columns = self._read_group(frame, most is None)
         else:
@@ -175,7 +175,7 @@ class FieldTable:
             about = self._metadata.row_group(group) if group < self._metadata.num_row_groups else None
             if about is None or about.num_rows != rows:
                 found = "none" if about is None else str(about.num_rows)
-                raise FormatError(where, expected=f"{rows} rows", found=found)
+                raise FormatError(where, expected=f"{rows} rows", found=found, advice="the store is damaged")
             if bounded:
                 for type_ in self._types.values():
                     check_size((rows,), np.dtype("u1" if type_ == "binary" else type_), where)

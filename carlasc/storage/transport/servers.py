@@ -124,6 +124,7 @@ def _leads_nowhere(url: str) -> CarlascError:
         without_credentials(url),
         expected="a file",
         found="a redirection in a loop, to another scheme, or from https to http",
+        advice="check the URL",
     )
 
 

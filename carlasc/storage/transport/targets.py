@@ -155,6 +155,7 @@ class RemoteTarget(Target):
                 self.location,
                 expected="a folder, or a URL of an object store",
                 found="a web server, which can only be read",
+                advice="write to a local folder, then upload it",
             )
         if self.tree.requests.scheme == HUB:
             raise ArgumentError(
