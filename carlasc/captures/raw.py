@@ -336,8 +336,7 @@ def find_captures(source: str | os.PathLike[str]) -> dict[str, Capture]:
     """Find the captures in a folder.
 
     Args:
-        source: a path or a URL: the folder of a sequence with raw/ in it, raw/ itself, or a folder up to three levels above such
-            sequences.
+        source: a path or a URL: the folder of a sequence with raw/ in it, raw/ itself, or a folder up to three levels above such sequences.
 
     Returns:
         Captures by the path of their sequence relative to `source`, in sorted order. The path is "" if `source` is the sequence.

@@ -60,7 +60,7 @@ def stack_scans(
 
 
 def look_up(labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype: np.dtype[Any]) -> NDArray[Any] | None:
-    """Return `table[labels]` as `dtype`, or None if a label is not in the table (after its end, or with the value -1)."""
+    """Return `table[labels]` as `dtype`, with the shape of `labels`; None if a label is not in the table (after its end, or its value is -1)."""
     found = np.empty(labels.shape, dtype)
     flat = np.ascontiguousarray(labels).reshape(-1)
     return found if _look_up(_read_only(flat), table, found.reshape(-1)) else None

@@ -86,6 +86,7 @@ class RayIoU(Summed):
     Attributes:
         num_classes: K; ids are 0..K-1.
         free: id of free space.
+        thresholds_m: maximum differences of distances, metres.
         skip_unknown: leave out rays that cross an unknown voxel before the first surface of the ground truth. In the original metric, unknown
             voxels count as free.
     """
@@ -127,7 +128,7 @@ class RayIoU(Summed):
 
         Args:
             prediction: (X, Y, Z) class ids, NumPy or a torch tensor; rays are cast on the device of a tensor.
-            truth: (X, Y, Z) class ids, likewise.
+            truth: (X, Y, Z) class ids, NumPy or a torch tensor.
             spec: geometry of both, Cartesian.
             origins: (O, 3) ray origins, metres, in the frame of the grid (see `ray_origins`).
             known: (X, Y, Z) bool, known voxels of the ground truth; only used with `skip_unknown`.
@@ -190,10 +191,10 @@ class RayIoU(Summed):
 
 
 class RayPQ:
-    """Panoptic quality of rays (SparseOcc): segments are sets of rays, and rays are common only if their depths agree.
+    """Panoptic quality of rays (SparseOcc): segments are sets of rays, and rays are common only if their depths agree within a threshold.
 
     Segments match at an IoU above 0.5. All rays of a stuff class are one segment. Segments with fewer than 10 rays are not counted as false
-    negatives or false positives.
+    negatives or false positives. The arguments are those of `RayIoU`; `things` are the ids of classes with separate instances.
     """
 
     def __init__(

@@ -51,7 +51,13 @@ class Consistency(Summed):
     _SETTINGS, _SUMS = ("moving",), ("matrix",)
 
     def __init__(self, num_classes: int, moving: Iterable[int], *, free: int = 0) -> None:
-        """Create an empty metric. `moving` are the ids of classes that can move; they are left out."""
+        """Create an empty metric.
+
+        Args:
+            num_classes: K; ids are 0..K-1.
+            moving: ids of classes that can move, which are left out.
+            free: id of free space.
+        """
         self.moving = frozenset(moving)
         self.matrix = ConfusionMatrix(num_classes, free=free)
 

@@ -144,7 +144,7 @@ class Run:
 
 
 class StepCounter:
-    """Counts the steps of a run for its progress callback. A stage adds its steps when it knows their number."""
+    """Counts the steps of a run for its progress callback. A stage adds its steps as soon as their number is known."""
 
     def __init__(self, progress: Callable[[int, int], None] | None, total: int = 0, done: int = 0) -> None:
         self._progress, self._done, self._total = progress, done, total

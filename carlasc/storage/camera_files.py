@@ -86,6 +86,11 @@ def scan_T_camera(sequence: Sequence, camera: CameraModel, frame: int) -> Transf
 
     The ego motion between the image and the scan is interpolated from poses.txt.
 
+    Args:
+        sequence: the sequence, with poses and times.
+        camera: one of its cameras.
+        frame: frame number.
+
     Raises:
         FormatError: image and scan are more than one frame apart.
     """
@@ -173,7 +178,7 @@ def image_bytes(sequence: Sequence, camera: CameraModel, frame: int, folder: str
 
 
 def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -> NDArray[Any]:
-    """Return the pixels of a JPEG or PNG of a camera, as `read_image` does.
+    """Return the pixels of a JPEG or PNG file of a camera, as `read_image` does. With `color`, they are (H, W, 3) RGB, otherwise (H, W).
 
     Raises:
         FormatError: the image is cut short or damaged, or has another size than the camera's calibration.

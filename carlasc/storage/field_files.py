@@ -50,7 +50,7 @@ class Field:
         suffix: ending of the file name.
         per: unit of one row of the file: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
             "vote" (one row per vote), "mover" (one row per moving voxel), "box" (one row per box), or "scan" (one file per scan).
-        kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (class
+        kind: kind of the values: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (class
             and probability), "id" (unsigned integers, such as actors), "value" (any number), "count", "probability" (0 to 1),
             "flags" (bits), "votes", "velocities" and "boxes" (tables), "picture" (the bytes of a file).
         dtype: NumPy type on disk, little-endian; "" for tables, whose columns have different types.
@@ -184,7 +184,7 @@ def _decode_velocities(data: bytes | memoryview, where: str, shape: tuple[int, .
 
 
 def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
-    """Check a field `<grid>/velocity` of a grid of `count` voxels.
+    """Check a field `<grid>/velocity`, (M,) rows of voxel and velocity, of a grid of `count` voxels.
 
     Raises:
         FormatError: a voxel is not in the grid, or a velocity is not finite; the message names `where`.
@@ -197,7 +197,7 @@ def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
 
 
 def dense_velocity(velocity: NDArray[Any], size: tuple[int, ...], where: str) -> NDArray[np.float32]:
-    """Return (X, Y, Z, 3) float32 m/s, the velocity of each voxel of a grid of shape `size`; zero if it does not move. See `check_velocity`."""
+    """Return (X, Y, Z, 3) float32 m/s of a grid of shape `size`; zero where nothing moves. Checks `velocity` with `check_velocity`."""
     check_velocity(velocity, math.prod(size), where)
     dense = np.zeros((*size, 3), np.float32)
     dense.reshape(-1, 3)[velocity["voxel"]] = velocity["velocity"]

@@ -44,7 +44,7 @@ class FolderSource(PublishedSource):
         """Return the sequences found up to four levels down, by path.
 
         Raises:
-            MissingDataError: no sequence was found; says what was looked for.
+            MissingDataError: no sequence was found; the message says what was expected.
         """
         return {path: FolderSequence(self.folder, path) for path in super().sequences()}
 
@@ -74,10 +74,10 @@ class FolderSink(Sink):
     is_readable = True
 
     def __init__(self, out: str | os.PathLike[str] | Target, **storage_options: Any) -> None:
-        """Take a folder, or the URL of one with options of fsspec; nothing is written yet.
+        """Keep a folder, or its URL with options of fsspec. Nothing is written yet.
 
         Raises:
-            ArgumentError: nothing can be written to the URL.
+            ArgumentError: the URL cannot be written to.
             DependencyError: the URL needs a package that is not installed.
         """
         self.target = target_of(out, **storage_options)

@@ -83,7 +83,7 @@ def as_source(source: str | os.PathLike[str] | Source) -> Source:
 def open_sink(
     path: str | os.PathLike[str] | Target, options: PackOptions | None, overwrite: bool, **storage_options: Any
 ) -> PackedSink | ZarrSink:
-    """Start a packed store. The suffix determines its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`.
+    """Start a packed store. The suffix determines its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`. None as `options` takes the defaults.
 
     Raises:
         ArgumentError: the suffix is another one, the store lacks an option, or `path` is a URL and the store can be written locally only.

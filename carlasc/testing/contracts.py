@@ -97,7 +97,7 @@ class SourceContract:
         assert sequence.read("labels", 5).dtype.kind == "u"
         assert sequence.read("evaluation/labels", 5).dtype.kind == "u"
 
-    def test_boxes_are_whole_none_where_nothing_was_and_absent_where_nobody_looked(
+    def test_boxes_are_the_same_empty_without_objects_and_absent_without_annotation(
         self, source: Source, expected: dict[str, Sequence]
     ) -> None:
         sequence = source.sequences()[WHOLE]

@@ -56,7 +56,7 @@ class ConverterContract:
         return np.concatenate(values)
 
     def run(self, source: Path, out: Path, axes: str = "right") -> Sequence:
-        """Convert to the classes of the data set, and return the only sequence."""
+        """Convert `source` to a new data set `out` with `axes` and the classes of the data set, and return the only sequence."""
         classes = self._class().classes.name
         result = convert(
             self.converter,

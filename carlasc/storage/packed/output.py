@@ -33,7 +33,7 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
             path,
             expected="a new path",
             found=f"a {kind}",
-            advice="choose another name, remove it, or give `overwrite=True` where there is such an option",
+            advice="choose another name, remove it, or give `overwrite=True` if the command has this option",
         )
     if not _is_store(path):
         raise ConflictError(

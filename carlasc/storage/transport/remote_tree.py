@@ -35,7 +35,7 @@ _CHANGES = (
 
 
 class RemoteTree(Tree):
-    """A folder, or a single file (path ""), at any URL that fsspec knows: http, s3, memory, ...
+    """A folder, or a single file (path ""), at any URL that fsspec supports: http, s3, memory, ...
 
     A folder is listed once. `size`, `read` and `paths` send a request each time.
     """

@@ -88,7 +88,7 @@ class StoreRoot:
                 self._target.location,
                 expected="a new path, or a store with the same options",
                 found=f"one with {', '.join(f'{name} {root.get(name)}' for name in differs if name != 'type')}",
-                advice="choose another name, remove it, or give `overwrite=True` where there is such an option",
+                advice="choose another name, remove it, or give `overwrite=True` if the command has this option",
             )
         return False
 
