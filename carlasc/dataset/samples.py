@@ -219,8 +219,8 @@ class Dataset(_MapStyle):
             sample |= read_cameras(part.scans, frame)
         sample["valid"] = np.array([number is not None for number in past])
         sample |= {"sequence": part.scans.name, "frame": frame}
-        made = cast(Sample, {name: sample[name] for name in (*self.fields, *ALWAYS)})
-        return made if self.transform is None else cast(Sample, self.transform(made))
+        requested = cast(Sample, {name: sample[name] for name in (*self.fields, *ALWAYS)})
+        return requested if self.transform is None else cast(Sample, self.transform(requested))
 
     def _part_of(self, chosen: slice) -> Self:
         """Return a Dataset of a slice of the samples."""
@@ -382,9 +382,7 @@ class Dataset(_MapStyle):
         lengths = {name: len(array) for name, array in sample.items()}
         if len(set(lengths.values())) > 1:
             found = ", ".join(f"{length} {name}" for name, length in lengths.items())
-            raise FormatError(
-                f"{part.scans.location}: frame {frame}", expected="one value per point in each field", found=found
-            )
+            raise FormatError(f"{part.scans.location}: frame {frame}", expected="one value per point", found=found)
         return sample
 
 

@@ -121,7 +121,7 @@ def find_grid_sequences(chosen: list[Sequence], source: Source, coordinates: Coo
     """
     groups = _groups(source)
     only = list(groups.values()) if len(groups) == len(chosen) == 1 else []
-    found = []
+    matches = []
     for scans in chosen:
         candidates = [
             group
@@ -139,8 +139,8 @@ def find_grid_sequences(chosen: list[Sequence], source: Source, coordinates: Coo
                 expected=f"{coordinates} grids of {scans.split or '?'}/{scans.name}",
                 found=f"only {', '.join(group)}" if group else f"the sequences {existing}",
             )
-        found.append(group[coordinates])
-    return found
+        matches.append(group[coordinates])
+    return matches
 
 
 def find_grid_name(grids: Sequence, grid: str | GridSpec) -> str:

@@ -228,10 +228,10 @@ def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, fr
         for side in range(2):
             if not (has_pred if side == 0 else has_true):
                 continue
-            one, other = (pred_class[n], pred_ids[n]) if side == 0 else (true_class[n], true_ids[n])
-            key = np.int64(one) << 32
-            if all_things or is_thing[one]:
-                key |= np.int64(other)
+            label, instance = (pred_class[n], pred_ids[n]) if side == 0 else (true_class[n], true_ids[n])
+            key = np.int64(label) << 32
+            if all_things or is_thing[label]:
+                key |= np.int64(instance)
             slot = (key ^ key >> 32) & (_SLOTS - 1)
             if latest[side, slot] != key:
                 place = key << 1 | side

@@ -203,12 +203,12 @@ class TrackingQuality(Summed):
         for number, size in _counts(pred[(pred > 0) & ~np.isin(pred_class, sorted(self.ignored))]):
             self.predicted[sequence, number] += size
         for label in self.things:
-            own = (true_class == label) & (true > 0)
-            for number, size in _counts(true[own]):
+            of_class = (true_class == label) & (true > 0)
+            for number, size in _counts(true[of_class]):
                 if size > self.fewest:
                     self.true[sequence, label, number] += size
-                    for other, common in _counts(pred[own & (true == number) & (pred > 0)]):
-                        self.common[sequence, label, number, other] += common
+                    for predicted_number, common in _counts(pred[of_class & (true == number) & (pred > 0)]):
+                        self.common[sequence, label, number, predicted_number] += common
         return self
 
     def compute(self) -> TrackingScore:

@@ -52,28 +52,28 @@ def find_predictions(root: Path, sequences: Mapping[str, Sequence], chosen: Fram
         MissingDataError: a sequence has no folder, or a frame no file.
         FormatError: a sequence has several folders, or a folder has files with several suffixes.
     """
-    found: dict[tuple[str, ...], PredictedFiles] = {}
+    by_folder: dict[tuple[str, ...], PredictedFiles] = {}
     for folder, _, names in os.walk(root):
         for suffix in SUFFIXES:
             stems = [name.removesuffix(suffix) for name in names if layout.frame_of(name, suffix) is not None]
             if numbers := sorted(int(stem) for stem in stems if stem == f"{int(stem):06d}"):
                 parts = Path(folder).relative_to(root).parts
-                if parts in found:
+                if parts in by_folder:
                     raise FormatError(
-                        folder, expected="files with one suffix", found=f"{found[parts].suffix} and {suffix}"
+                        folder, expected="files with one suffix", found=f"{by_folder[parts].suffix} and {suffix}"
                     )
-                found[parts] = PredictedFiles(Path(folder), suffix, tuple(numbers))
+                by_folder[parts] = PredictedFiles(Path(folder), suffix, tuple(numbers))
     result, lacking = {}, []
     for path, sequence in sequences.items():
-        named = [parts for parts in found if sequence.name in parts and not _others(sequence) & set(parts)]
-        if not named and len(sequences) == 1:
-            named = [parts for parts in found if parts in ((), *((leaf,) for leaf in _LEAVES))]
-        named = [parts for parts in named if parts and parts[-1] in _LEAVES] or named
-        if len(named) != 1:
-            folders = ", ".join("/".join(parts) or "." for parts in sorted(named or found)[:_NAMED]) or "none"
+        matching = [parts for parts in by_folder if sequence.name in parts and not _others(sequence) & set(parts)]
+        if not matching and len(sequences) == 1:
+            matching = [parts for parts in by_folder if parts in ((), *((leaf,) for leaf in _LEAVES))]
+        matching = [parts for parts in matching if parts and parts[-1] in _LEAVES] or matching
+        if len(matching) != 1:
+            folders = ", ".join("/".join(parts) or "." for parts in sorted(matching or by_folder)[:_NAMED]) or "none"
             expected = f"one folder of files such as {sequence.name}/000000{SUFFIXES[0]} ({', '.join(SUFFIXES[1:])})"
-            raise (FormatError if named else MissingDataError)(root, expected=expected, found=folders)
-        files = found[named[0]]
+            raise (FormatError if matching else MissingDataError)(root, expected=expected, found=folders)
+        files = by_folder[matching[0]]
         wanted = chosen.select(sequence.frames("points"))
         if len(missing := np.setdiff1d(wanted, files.frames)):
             first = ", ".join(f"{frame:06d}" for frame in missing[:_NAMED]) + ", ..." * (len(missing) > _NAMED)

@@ -189,15 +189,17 @@ class SimulatedDrive:
         reach, hit = self._nearest(origins, directions, at)
         seen = reach < 60.0
         reach, hit, poses, turn = reach[seen], hit[seen], poses[seen], turn[seen]
-        own = (rays[seen] * reach[:, None]).astype(np.float32)
-        world = np.einsum("nij,nj->ni", poses[:, :3, :3], own.astype(np.float64)) + poses[:, :3, 3]
-        then = transform_points(invert(self.world_T_vehicle(frame * self.period_s) @ mount), world).astype(np.float32)
+        points = (rays[seen] * reach[:, None]).astype(np.float32)
+        world = np.einsum("nij,nj->ni", poses[:, :3, :3], points.astype(np.float64)) + poses[:, :3, 3]
+        deskewed = transform_points(invert(self.world_T_vehicle(frame * self.period_s) @ mount), world).astype(
+            np.float32
+        )
         remission = np.round(0.1 + 0.05 * hit % 0.8, 2).astype(np.float32)[:, None]
         kinds = np.array([KINDS.index("road"), *(KINDS.index(thing.kind) for thing in self.things)], np.uint8)
         tracks = {thing: track for track, thing in enumerate(self._movable, 1)}
         instances = np.array([0, *(tracks.get(thing, 0) for thing in self.things)], np.uint32)
         return DriveScan(
-            np.hstack([own, remission]), np.hstack([then, remission]), kinds[hit], instances[hit], turn, poses
+            np.hstack([points, remission]), np.hstack([deskewed, remission]), kinds[hit], instances[hit], turn, poses
         )
 
     @property

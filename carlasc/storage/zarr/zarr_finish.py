@@ -180,21 +180,23 @@ def _finish_sequence(
         if tables.get(group):
             fields[name] = FieldLayout.read(f"{target.location}/{group}", name, about)
             nodes.group(group, about)
-    found = {name: tables[f"{node}/{field_node(name)}"] for name in sorted(fields)}
-    _count(target, node, attributes["path"], paths, found, result)
-    frames, counts, columns = count_elements(fields, found)
-    for place, most in zip(columns, counts.max(axis=0, initial=0).tolist(), strict=True):
-        kind, _, column = place.rpartition("/")
+    frames_by_field = {name: tables[f"{node}/{field_node(name)}"] for name in sorted(fields)}
+    _count(target, node, attributes["path"], paths, frames_by_field, result)
+    frames, counts, columns = count_elements(fields, frames_by_field)
+    for column_path, most in zip(columns, counts.max(axis=0, initial=0).tolist(), strict=True):
+        kind, _, column = column_path.rpartition("/")
         name = kind.partition("/")[2]
         if most > 0:
-            room = -(-(max(found[name]) + 1) // block) * block
-            nodes.metadata[f"{node}/{place}"] = column_metadata(fields[name], fields[name].columns[column], block, room)
+            room = -(-(max(frames_by_field[name]) + 1) // block) * block
+            nodes.metadata[f"{node}/{column_path}"] = column_metadata(
+                fields[name], fields[name].columns[column], block, room
+            )
     documents = sorted(
         path.removeprefix(f"{node}/{document_node('')}")
         for path in paths
         if path.startswith(f"{node}/{document_node('')}")
     )
-    nodes.group(node, {**attributes, "fields": sorted(found), "documents": documents})
+    nodes.group(node, {**attributes, "fields": sorted(frames_by_field), "documents": documents})
     nodes.small(f"{node}/frames", frames, {"type": "carlasc.frames", "unit": "frame"})
     nodes.small(f"{node}/counts", counts, {"type": "carlasc.counts", "unit": "element", "columns": columns})
 
