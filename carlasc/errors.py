@@ -69,7 +69,7 @@ class CarlascError(Exception):
 
 
 def printable(text: str) -> str:
-    r"""Escape control characters, and marks for the direction of writing, such as `\\x1b`, so that a text can be printed in a terminal.
+    r"""Escape control characters, and marks for the direction of writing, as in `\\x1b`, so that a text can be printed in a terminal.
 
     Names of sequences, classes and files come from untrusted data. They must not clear a screen, hide a line, or write to a clipboard.
     """

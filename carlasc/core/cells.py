@@ -122,7 +122,7 @@ def fast_azimuth(x: float, y: float) -> float:
 
 
 def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return (N,) bool: whether each of (N, 3) cells differs from the previous one; True for the first cell."""
+    """Return (N,) bool: whether each of (N, 3) cells is the first occurrence of this cell."""
     first = np.zeros(len(cells), np.bool_)
     first[numbered(cells)[0]] = True
     return first

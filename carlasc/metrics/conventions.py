@@ -294,7 +294,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 },
                 SEMANTICKITTI,
                 SEMANTICKITTI,
-                notes="Classes outside the 19 are ignored in the ground truth, and empty in predictions (the official script raises an error).",
+                notes="Classes outside the 19 are ignored in the ground truth, and empty in predictions (the official script stops).",
             ),
             Convention(
                 "sscbench",

@@ -116,7 +116,7 @@ class LabelFolder(GridFrames):
             size = invalid.stat().st_size
             packed = (
                 self._file(frame, ".label").stat().st_size >= size * _BITS
-            )  # packed bits with labels of two or four bytes per voxel
+            )  # because labels have two or four bytes per voxel
             return size * _BITS if packed else size
         return None
 

@@ -193,7 +193,7 @@ class RayIoU(Summed):
 class RayPQ:
     """Panoptic quality of rays (SparseOcc): segments are sets of rays, and rays are common only if their depths agree within a threshold.
 
-    Segments match at an IoU above 0.5. All rays of a stuff class are one segment. Segments with fewer than 10 rays are not counted as false
+    Segments match at an IoU above 0.5. Each stuff class of the ground truth is one segment. Segments with fewer than 10 rays are not counted as false
     negatives or false positives. The arguments are those of `RayIoU`; `things` are the ids of classes with separate instances.
     """
 

@@ -143,7 +143,7 @@ def _started(start: Callable[[], Any]) -> Iterator[Any]:
     """Start a cluster, yield it, and stop it at the end."""
     from multiprocessing import resource_tracker
 
-    resource_tracker.ensure_running()  # started here, because started with the first process it would not ignore Ctrl-C
+    resource_tracker.ensure_running()  # here, because its start unblocks Ctrl-C
     with inherited_by_workers():
         cluster = start()
     try:

@@ -31,7 +31,7 @@ from carlasc.storage.transport.targets import check_shared
 from carlasc.storage.transport.trees import is_url
 
 Progress = Callable[[int, int], None]
-_FEW = 4  # up to this many tasks, another process does not save time
+_FEW = 4  # minimum number of tasks per process, because starting a process takes time
 _SAMPLED = 5  # number of frames that are read to estimate the size of frames
 
 

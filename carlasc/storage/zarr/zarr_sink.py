@@ -50,7 +50,7 @@ class ZarrSink(Sink):
 
         Args:
             out: the store.
-            options: options of the store; None takes those of an existing store, otherwise the defaults.
+            options: options of the store; None takes those of an existing store unless `overwrite` is given, otherwise the defaults.
             overwrite: replace a finished store, or a store with other options. A finished local store is kept as `<name>.replaced` until
                 the new store is finished; in an object store it is removed first.
 
