@@ -148,9 +148,9 @@ def _horizons(source: Place, grid: str | None) -> dict[float, str]:
     names = sorted({name for sequence in opened.sequences().values() for name in sequence.grids})
     for match in filter(None, map(_NAMED.fullmatch, names)):
         if match[1] == (grid or match[1]) and (other := found.setdefault(float(match[2]), match[0])) != match[0]:
-            found = f"{other} and {match[0]}"
+            both = f"{other} and {match[0]}"
             raise ArgumentError(
-                "grid", expected="one forecast grid per horizon", found=found, advice="choose a name with `grid`"
+                "grid", expected="one forecast grid per horizon", found=both, advice="choose a name with `grid`"
             )
     if not found:
         expected = f"grids of forecasts such as {grid or 'forecast'}_1s"
