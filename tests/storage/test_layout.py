@@ -107,7 +107,7 @@ def test_boxes_come_back_bit_for_bit():
 
 def test_boxes_of_another_size_or_type_are_refused():
     field = layout.field_named("boxes")
-    with pytest.raises(FormatError, match=r"boxes/0.bin: expected a multiple of 89 bytes \(a box each\), found 90"):
+    with pytest.raises(FormatError, match=r"boxes/0.bin: expected a multiple of 89 bytes \(one box\), found 90"):
         field.decode(bytes(90), "boxes/0.bin")
     with pytest.raises(FormatError, match="expected a table of boxes, found float64"):
         field.encode(np.zeros((2, 13)), "boxes/0.bin")

@@ -411,5 +411,5 @@ def test_a_chunk_of_an_hdf5_store_that_unpacks_to_more_than_its_array_is_refused
         frames.attrs.update(attributes)
         # Level 9 gives 16 kB: HDF5 1.14 takes at most 64 kB for a chunk as small as this one.
         frames.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 24), 9))
-    with pytest.raises(FormatError, match=f"{name}: expected 32 bytes, found others: carlasc did not write this"):
+    with pytest.raises(FormatError, match=f"{name}: expected 32 bytes, found another size: carlasc did not write this"):
         carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].frames("labels")
