@@ -164,7 +164,7 @@ INVALID = {  # folder -> (array that is written over it, what the error says)
         "expected finite coordinates, found .*nan.* at point 0",
     ),
     "infinite": ("velodyne0", np.full((300, 3), np.inf, np.float32), "expected finite coordinates, found .*inf.*"),
-    "beyond the table": ("labels0", np.full(300, 25, np.uint32), "expected class ids 0..24 .*, found 25 on 300 of 300"),
+    "beyond the table": ("labels0", np.full(300, 25, np.uint32), "expected class ids 0..24 .*, found 25 in 300 of 300"),
     "short labels": ("labels0", np.zeros(299, np.uint32), "expected 300 values, one per point .*, found 299"),
     "long instances": ("instances0", np.zeros(301, np.uint32), "expected 300 values, one per point .*, found 301"),
     "signed labels": ("labels0", np.zeros(300, np.int32), "expected uint32 values, found int32"),
