@@ -84,7 +84,9 @@ def test_carla_0914_tags_become_ours():
 
 def test_ids_beyond_the_vote_channels_are_named():
     CARLA.check(np.array([0, 24], np.uint32), "a.label")
-    with pytest.raises(FormatError, match=r"a.label: expected class ids 0..24 \(table carla\), found 30 in 2 of 3 labels"):
+    with pytest.raises(
+        FormatError, match=r"a.label: expected class ids 0..24 \(table carla\), found 30 in 2 of 3 labels"
+    ):
         CARLA.check(np.array([0, 30, 30], np.uint32), "a.label")
 
 
