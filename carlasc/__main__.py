@@ -1,4 +1,4 @@
-"""`python -m carlasc` is `carlasc`."""
+"""Run the command `carlasc` with `python -m carlasc`."""
 
 from carlasc.cli import main
 

@@ -1,4 +1,4 @@
-"""The demonstration: a simulated capture, its ground truth, and pictures of it."""
+"""`carlasc demo`: a simulated capture, its ground truth, and pictures of it."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ Step = Callable[[str], AbstractContextManager[Progress]]
 
 TRAIN, VAL = Path("Train", "Demo_Heavy"), Path("Val", "Demo_Light")
 """The simulated sequences, relative to the folder of the demonstration."""
-_MODULES = ("trimesh", "embreex", "PIL", "imageio_ffmpeg")  # what it needs, apart from what every installation has
-_EXTRA_MB = 240  # what the extra `demo` adds, as docs/studies/sizes.py measures it
-_VAL_SHARE = 5  # of the LiDARs, one in so many records the drive for validation
+_MODULES = ("trimesh", "embreex", "PIL", "imageio_ffmpeg")  # required packages of the extra `demo`
+_EXTRA_MB = 240  # size of the extra `demo`, measured by docs/studies/sizes.py
+_VAL_SHARE = 5  # one in five LiDARs records the drive for validation
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demonstration made.
+    """Result of `demonstrate`.
 
     Attributes:
-        sequences: folders of the simulated sequences, with their raw captures and their ground truth.
+        sequences: folders of the simulated sequences, with raw captures and ground truth.
         grids: folders of the grids of the first sequence.
         pictures: files of the pictures.
-        page: file of the page, which opens in any browser.
-        validation: result of validating everything.
+        page: file of the page for a browser.
+        validation: result of the validation of all files.
         statistics: class statistics.
         elapsed_s: duration, seconds.
     """
@@ -65,24 +65,25 @@ def demonstrate(
     step: Step | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> DemoResult:
-    """Simulate two short drives, make their ground truth in the published grids, validate them, count their classes, and draw them.
+    """Simulate two short drives, make their ground truth in the published grids, validate it, count classes, and draw pictures.
 
-    One drive is for training, one for validation. A second run with the same arguments makes only what is missing, and draws the pictures and the page again.
+    One drive is for training, one for validation. A second run with the same arguments makes missing files only, and draws the pictures and
+    the page again.
 
     Args:
         out: folder to write to.
-        count: number of frames of each drive. Stacks of five scans need five.
-        sensors: number of LiDARs of the drive for training; a fifth of them record the other one.
+        count: number of frames of each drive, at least 5 to train with stacks of five scans.
+        sensors: number of LiDARs of the drive for training; a fifth of them record the drive for validation.
         seed: seed of the simulated towns.
-        step: called with the name of each step. Returns a context manager that gives the step's progress callback.
-        run: how the work is spread; `step` is told of its progress.
+        step: called with the name of each step. Returns a context manager that yields the progress callback of the step.
+        run: how the work is distributed. Progress is reported to `step`.
 
     Returns:
-        What was made.
+        Paths of the created files, the validation and the class statistics.
 
     Raises:
         ArgumentError: an argument is out of its range.
-        ConflictError: `out` holds something else.
+        ConflictError: `out` holds other files.
         DependencyError: a package of the extra `demo` is missing. Nothing is written.
     """
     from carlasc.captures import simulate
@@ -96,7 +97,7 @@ def demonstrate(
     train, val = out / TRAIN, out / VAL
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not train.is_dir())):
         raise ConflictError(
-            out, expected="an empty folder or an earlier demo", found="something else", advice="choose another folder"
+            out, expected="an empty folder or an earlier demo", found="other files", advice="choose another folder"
         )
 
     drives: tuple[tuple[Path, int, TrafficLevel], ...] = (
@@ -133,7 +134,7 @@ def demonstrate(
 
 
 def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, CameraOptions]]:
-    """Return file, scene, contents and camera of each picture."""
+    """Return the file, the scene, the content and the camera of each picture."""
     from carlasc.viewing import CameraOptions, Scene
 
     coarse, fine, cylindrical = (Scene(grid, frames=(frame, frame + 1)) for grid in grids)
@@ -147,7 +148,7 @@ def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path,
 
 
 def _check_packages() -> None:
-    """Raise DependencyError for what is not installed, with the size of what brings it."""
+    """Raise DependencyError for a missing package, with the size of the extra that installs it."""
     try:
         for module in _MODULES:
             import_extra(module, "demo")

@@ -1,7 +1,7 @@
-"""The few kinds of error that a user can meet, numbers and names in messages, the check for optional packages, and Ctrl-C that waits.
+"""The exceptions of carlasc, helpers for messages, the check for optional packages, and postponed Ctrl-C.
 
-Every message is one line: what it is about (a file, a field, an argument), what was expected, what was found, what to do. Parts of it come
-from files and from other libraries: `printable` shows what a terminal would obey, and no part is longer than a few lines.
+Every message is one line: where (a file, a field, an argument), what was expected, what was found, what to do. Parts of it come from files
+and other libraries, so `printable` escapes control characters, and long parts are shortened.
 """
 
 from __future__ import annotations
@@ -18,32 +18,36 @@ from types import FrameType, ModuleType
 from typing import Any, Self, get_args
 
 _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
-# What a terminal obeys, or what changes the order in which a line is read: control characters (ESC starts the terminal's commands), the marks
-# that turn the direction of writing (Unicode's Bidi_Control), ends of lines and of paragraphs, and halves of characters, which no
-# terminal can show: Python uses them for bytes of file names that are not UTF-8.
+# Characters that control a terminal or change the order of a line: control characters (ESC starts commands of a terminal), marks for the
+# direction of writing (Bidi_Control of Unicode), ends of lines and paragraphs, and lone surrogates, which Python uses for bytes of file
+# names that are not UTF-8.
 _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-_LONGEST = 400  # characters of a part of a message; other libraries put whole headers into theirs
-_QUERY = re.compile(r"(\b[a-z][a-z0-9+.-]*://[^\s?'\"]*)\?[^\s'\"]+=[^\s'\"]*")  # a signature or a token
+_LONGEST = 400  # maximum characters of a part of a message; messages of other libraries can contain whole headers
+_QUERY = re.compile(
+    r"(\b[a-z][a-z0-9+.-]*://[^\s?'\"]*)\?[^\s'\"]+=[^\s'\"]*"
+)  # query, which may be a signature or a token
 
 
 class CarlascError(Exception):
-    """Base of every error that `carlasc` raises on purpose.
+    """Base class of all exceptions of `carlasc`.
 
-    The message is one line, made of the attributes that are not empty: `WHERE: PROBLEM: expected EXPECTED, found FOUND: ADVICE`.
+    The message is one line of all attributes that are not empty: `WHERE: PROBLEM: expected EXPECTED, found FOUND: ADVICE`.
 
     Attributes:
-        where: what it is about: a file, a URL, a field, or the name of an argument.
-        problem: what went wrong, where "expected ..., found ..." does not say it.
-        expected: what should have been found.
-        found: what was found instead.
-        advice: what to do about it. It names arguments as `` `overwrite=True` ``, which the command line replaces by its options.
+        where: place of the error: a file, a URL, a field, or the name of an argument.
+        problem: what went wrong, if "expected ..., found ..." is not sufficient.
+        expected: the expected value or state.
+        found: the actual value or state.
+        advice: what the user can do. It names arguments as `` `overwrite=True` ``, which the command line replaces by its options.
     """
 
     def __init__(
         self, where: object, *, problem: str = "", expected: str = "", found: str = "", advice: str = ""
     ) -> None:
         shown = without_credentials(str(where))
-        super().__init__(shown)  # the only positional argument, so that errors pickle: the rest travels in __dict__
+        super().__init__(
+            shown
+        )  # the only positional argument, so that errors can be pickled: other attributes are in __dict__
         self.where, self.problem = shown, problem
         self.expected, self.found, self.advice = expected, found, advice
 
@@ -55,7 +59,7 @@ class CarlascError(Exception):
         return without_credentials(": ".join(part for part in (where, problem, comparison, advice) if part))
 
     def within(self, where: object) -> Self:
-        """Return a copy that also names what contains the place: `within("a.zip")` of an error at "b" is at "a.zip: b"."""
+        """Return a copy whose place is prefixed with the place that contains it: "b" becomes "a.zip: b" with `within("a.zip")`."""
         error = type(self).__new__(
             type(self), *self.args
         )  # not copy.copy: packages that pickle tracebacks change what it does
@@ -65,43 +69,42 @@ class CarlascError(Exception):
 
 
 def printable(text: str) -> str:
-    r"""Return a text as a terminal may show it: control characters, and marks that turn the direction of writing, as `\\x1b`.
+    r"""Escape control characters, and marks for the direction of writing, as in `\\x1b`, so that a text can be printed in a terminal.
 
-    Names of sequences, classes and files come from data that anybody may have made: they must not clear a screen, hide a line, or write
-    to a clipboard. Everything else is shown as it is.
+    Names of sequences, classes and files come from untrusted data. They must not clear a screen, hide a line, or write to a clipboard.
     """
     return _UNSAFE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def _one_line(text: str) -> str:
-    """Return a part of a message as a printable line of bounded length, without its middle where it is too long."""
+    """Return a part of a message as a printable line. A long part is shortened in the middle."""
     line = printable(" ".join(text.splitlines()))
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST * 2 // 3]} [...] {line[-_LONGEST // 3 :]}"
 
 
 def without_credentials(text: str) -> str:
-    """Return a text without what its URLs say of credentials: user and password, and queries, which may be signatures."""
+    """Remove credentials from the URLs in a text: user, password, and queries, which may be signatures."""
     return _QUERY.sub(r"\1", _USER.sub("", text)) if "://" in text else text
 
 
 class FormatError(CarlascError, ValueError):
-    """A file or store does not hold what the format says it must."""
+    """The content of a file or store does not have the required format."""
 
 
 @contextmanager
 def reading(where: object, expected: str, advice: str = "") -> Iterator[None]:
-    """Turn whatever goes wrong in a block that interprets data from a file into a FormatError.
+    """Turn any error in a block that parses data from a file into a FormatError.
 
-    Data that anybody may have made can fail in any way: NumPy, zlib, zipfile, h5py, pyarrow and the JSON parser raise two dozen types between
-    them, of which few are documented. The block should therefore hold the call that interprets the data, and nothing else.
+    For untrusted data, NumPy, zlib, zipfile, h5py, pyarrow and the JSON parser raise two dozen types of exceptions, few of them documented.
+    The block should therefore contain only the call that parses the data.
 
     Args:
         where: the file.
-        expected: what it should hold.
-        advice: what to do about it.
+        expected: expected content of the file.
+        advice: what the user can do.
 
     Raises:
-        FormatError: anything but a CarlascError was raised; that is the cause.
+        FormatError: the block raised another error than a CarlascError. That error is the cause.
     """
     try:
         yield
@@ -114,19 +117,19 @@ def reading(where: object, expected: str, advice: str = "") -> Iterator[None]:
 
 
 def describe(error: BaseException) -> str:
-    """Return the message of another library's error; its type where the message alone says nothing."""
+    """Return the message of an error of another library, or its type if the message is not sufficient."""
     text = str(error).strip()
     if isinstance(error, LookupError):
-        return f"{type(error).__name__}: {text}"  # the message of a KeyError is the key
+        return f"{type(error).__name__}: {text}"  # the message of a KeyError is only the key
     return text or type(error).__name__
 
 
 class MissingDataError(CarlascError):
-    """Something that was asked for does not exist: a file, a frame, a field, a sequence."""
+    """Requested data do not exist: a file, a frame, a field, a sequence."""
 
 
 class MissingKeyError(MissingDataError, KeyError):
-    """A mapping, such as a Source, has no value of a key."""
+    """A key of a mapping, such as a Source, does not exist."""
 
 
 class DependencyError(CarlascError, ImportError):
@@ -134,27 +137,27 @@ class DependencyError(CarlascError, ImportError):
 
 
 class ArgumentError(CarlascError, ValueError):
-    """A value given by the caller makes no sense (the command line exits with 2 for these). `where` is the argument's name."""
+    """An argument has an invalid value. `where` is the name of the argument. The command line exits with 2."""
 
 
 class ConflictError(CarlascError):
-    """Writing would destroy, or mix with, something that already exists."""
+    """Writing would destroy existing data, or mix with them."""
 
 
 class StorageError(CarlascError):
-    """The output cannot be written: a full disk, a folder without write permission. Every further write would fail alike."""
+    """The output cannot be written: a full disk, a folder without write permission. Further writes would fail too."""
 
 
 def check_choice(name: str, value: object, choices: Any) -> None:
-    """Check that an argument has one of the values that it may have.
+    """Check that an argument has one of the allowed values.
 
     Args:
-        name: the argument's name.
-        value: what was given.
-        choices: a `Literal` of words, or the words.
+        name: name of the argument.
+        value: value of the argument.
+        choices: the allowed values: a `Literal` of strings, or an iterable of strings.
 
     Raises:
-        ArgumentError: it has another value.
+        ArgumentError: the value is not allowed.
     """
     allowed = get_args(choices) or tuple(choices)
     if value not in allowed:
@@ -162,11 +165,11 @@ def check_choice(name: str, value: object, choices: Any) -> None:
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
-    """Import an optional module, or say in one line which extra to install.
+    """Import an optional module, or raise an error that names the extra to install.
 
     Args:
         module: dotted name of the module.
-        extra: the extra of `carlasc` that brings it.
+        extra: the extra of `carlasc` that installs it.
 
     Returns:
         The imported module.
@@ -184,14 +187,14 @@ def import_extra(module: str, extra: str) -> ModuleType:
 
 
 def install_command(extra: str) -> str:
-    """Return the command that adds an extra to this installation, from where it came: a checkout, a file, or an index."""
+    """Return the pip command that adds an extra to this installation, from the same origin: a checkout, a file, or an index."""
     import json
     import shlex
     from importlib import metadata
     from urllib.parse import unquote, urlsplit
 
     found, editable = "carlasc", ""
-    with suppress(metadata.PackageNotFoundError, ValueError):  # not installed, only on the path; not JSON
+    with suppress(metadata.PackageNotFoundError, ValueError):  # not installed (only on the path), or not JSON
         origin = json.loads(metadata.distribution("carlasc").read_text("direct_url.json") or "{}")  # PEP 610
         url = urlsplit(origin.get("url", ""))
         if url.scheme == "file":
@@ -202,11 +205,11 @@ def install_command(extra: str) -> str:
 
 @contextmanager
 def postponed_interrupts() -> Iterator[None]:
-    """Within the block, Ctrl-C waits for its end.
+    """Postpone Ctrl-C to the end of the block.
 
-    For blocks that give work to an executor: a thread whose start is interrupted runs, but its executor does not know it, and the interpreter waits
-    for it for ever when it ends. And for imports: packages such as trimesh catch every exception of what they import, and go on without it.
-    In other threads than the main one, which Ctrl-C does not reach, nothing changes.
+    This is for blocks that submit work to an executor: if the start of a thread is interrupted, the executor does not register the running
+    thread, and the interpreter hangs at exit. It is also for imports: packages such as trimesh catch all exceptions of their imports, and
+    continue without the imported package. In threads other than the main thread, which Ctrl-C does not reach, this has no effect.
     """
     handler = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or handler is None:
@@ -225,7 +228,7 @@ def postponed_interrupts() -> Iterator[None]:
 
 
 def carlasc_version() -> str:
-    """Return the version of the installed package; "unknown" if it is only found on the path."""
+    """Return the version of the installed package; "unknown" if it is only on the path."""
     from importlib import metadata
 
     try:
@@ -235,11 +238,11 @@ def carlasc_version() -> str:
 
 
 def count(number: int, noun: str, plural: str = "") -> str:
-    """Return "1 frame", "2 frames"."""
+    """Return a number with its noun: "1 frame", "2 frames". `plural` is for irregular nouns."""
     return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def first_names(names: Iterable[str], most: int = 8) -> str:
-    """Return names separated by commas, without those after the first few."""
+    """Return the first `most` names, separated by commas, and the number of further names."""
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

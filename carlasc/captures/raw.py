@@ -31,9 +31,9 @@ from carlasc.storage.transport.remote_tree import RemoteTree, tree_of
 from carlasc.storage.transport.trees import LocalTree, Tree
 
 RAW = "raw"
-"""Name of the folder that holds a capture, in the folder of its sequence."""
+"""Name of the folder of a capture, in the folder of its sequence."""
 
-FOLDERS = {  # value -> folder, to which the sensor's number is appended
+FOLDERS = {  # folder by value; the sensor number is appended
     "points": "velodyne",
     "labels": "labels",
     "instances": "instances",
@@ -56,33 +56,33 @@ def array_path(name: str, sensor: int, frame: int) -> str:
 
 
 def times_path(sensor: int) -> str:
-    """Return the path of a sensor's times file."""
+    """Return the path of the times file of a sensor."""
     return f"times{sensor}.txt"
 
 
 def bev_path(frame: int) -> str:
-    """Return the path of a frame's bird's-eye picture."""
+    """Return the path of the bird's-eye picture of a frame."""
     return f"{_BEV}/{frame}.jpg"
 
 
 def image_path(field: str, frame: int) -> str:
-    """Return the path of an image of a frame, by the name of its field in the layout."""
+    """Return the path of an image of a frame. `field` is its name in the layout."""
     entry = layout.field_named(field)
     return f"{entry.folder}/{frame}{entry.suffix}"
 
 
 def parse_times(data: bytes | memoryview, where: str) -> dict[int, tuple[float, str]]:
-    """Return the time in seconds and the line of each frame of a times file. Where a frame has several lines, the last one is valid.
+    """Return the time in seconds and the line of each frame of a times file. If a frame has several lines, the last one is valid.
 
     Raises:
-        FormatError: a line of the file is not in CARLA's form; `where` names the file.
+        FormatError: a line does not have the format of CARLA. `where` is the file named in the message.
     """
     found: dict[int, tuple[float, str]] = {}
     for number, line in enumerate(bytes(data).decode(errors="replace").splitlines(), 1):
         match = re.match(r"\s*([0-9]{1,18})\s*,.*\belapsed_seconds=([-+0-9.eE]+)", line)
         try:
             if match is None:
-                raise ValueError("another form")
+                raise ValueError("another format")
             found[int(match[1])] = float(match[2]), line
         except ValueError as error:
             raise FormatError(
@@ -93,18 +93,18 @@ def parse_times(data: bytes | memoryview, where: str) -> dict[int, tuple[float, 
     return found
 
 
-_SEARCH_DEPTH = 3  # levels: <root>/<split>/<sequence>, and one folder around them
+_SEARCH_DEPTH = 3  # levels of folders: <root>/<split>/<sequence>, and one folder around them
 
 
 @dataclass(frozen=True)
 class SensorRecording:
-    """What one sensor recorded in one frame.
+    """The recording of one sensor in one frame.
 
     Attributes:
-        scan: points in the sensor's frame, with labels (0 is unlabelled) and instances (0 is no actor).
+        scan: points in the sensor frame, with labels (0 is unlabelled) and instances (0 is no actor).
         world_T_sensor: (4, 4) float64 pose.
-        velocities: (K, 4) float64, one row per actor that was hit: the actor's id, and its velocity over ground in m/s, on the axes
-            of the sensor's frame.
+        velocities: (K, 4) float64, one row per actor that was hit: actor id, and velocity over ground in m/s on the axes of the sensor
+            frame.
     """
 
     scan: Scan
@@ -112,7 +112,7 @@ class SensorRecording:
     velocities: NDArray[np.float64]
 
     def flow(self) -> NDArray[np.float32]:
-        """Return the (N, 3) float32 velocity of the actor that each point lies on, m/s, sensor frame; zero on points of no actor."""
+        """Return (N, 3) float32 velocities of the actors hit by the points, m/s, sensor frame; zero for points without an actor."""
         flow = np.zeros((len(self.scan), 3), np.float32)
         if self.scan.instances is None or not len(self.velocities):
             return flow
@@ -125,19 +125,19 @@ class SensorRecording:
 
 
 class Capture:
-    """A capture, read per sensor and frame. It holds paths only, so it can be pickled.
+    """A capture, read by sensor and frame. It keeps only paths, so it can be pickled.
 
     Attributes:
-        tree: the files of the sequence, or those of raw/ itself.
+        tree: the files of the sequence, or of raw/ itself.
         location: name of the folder raw/ in errors: a folder or a URL.
         classes: class table of the labels.
     """
 
     def __init__(self, source: str | os.PathLike[str] | Tree, classes: ClassTable = CARLA) -> None:
-        """Take a capture's folder. Its sensors and frames are listed when they are asked for.
+        """Keep the folder of a capture. Sensors and frames are listed on first use.
 
         Args:
-            source: the folder of a sequence, which holds raw/, or raw/ itself: a path, a URL, or a tree of files.
+            source: the folder of a sequence with raw/, or raw/ itself: a path, a URL, or a tree of files.
             classes: class table of the labels.
 
         Raises:
@@ -151,10 +151,10 @@ class Capture:
 
     @cached_property
     def sensors(self) -> tuple[int, ...]:
-        """The sensors' numbers in ascending order: all sensors that have a folder of any of the five kinds.
+        """The sorted numbers of sensors: all sensors with at least one of the five folders.
 
         Raises:
-            MissingDataError: no sensor has one, or sensor 0 has none.
+            MissingDataError: no sensor, or not sensor 0, has such a folder.
         """
         found = set()
         for name, is_folder in self._entries("").items():
@@ -164,17 +164,17 @@ class Capture:
         if 0 not in found:
             raise MissingDataError(
                 self.location,
-                expected="the ego sensor's folder velodyne0",
+                expected="the folder velodyne0 of the ego sensor",
                 found=f"only the sensors {sorted(found)}" if found else "no sensor",
-                advice="give a folder that holds raw/, or raw/ itself",
+                advice="give a folder with raw/ in it, or raw/ itself",
             )
         return tuple(sorted(found))
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
-        """The frame numbers of sensor 0 in ascending order.
+        """The sorted frame numbers of sensor 0.
 
-        A frame is listed when any of its files exists; reading it raises an error where another file, or another sensor's, is missing.
+        A frame is listed if any of its files exists. Reading it raises an error if another file, or a file of another sensor, is missing.
 
         Raises:
             MissingDataError: the capture has no frames.
@@ -189,11 +189,11 @@ class Capture:
         return np.array(sorted(found), np.int64)
 
     def read(self, sensor: int, frame: int) -> SensorRecording:
-        """Read what a sensor recorded in a frame; its files are requested together. The arrays may be read-only.
+        """Read the recording of a sensor in a frame. Its files are requested together. The arrays may be read-only.
 
         Raises:
             MissingDataError: a file does not exist.
-            FormatError: a file is cut short, or has another type or shape, or invalid values.
+            FormatError: a file is cut short, has another type or shape, or has invalid values.
         """
         path = {name: self._folder + array_path(name, sensor, frame) for name in FOLDERS}
         where = {name: self.tree.where(file) for name, file in path.items()}
@@ -213,7 +213,7 @@ class Capture:
         return SensorRecording(scan, check_rigid(arrays["pose"], where["pose"]), arrays["velocities"])
 
     def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
-        """Return the (3,) velocity over ground, m/s, world frame, of each actor that a sensor hit in a frame.
+        """Return the (3,) velocity over ground, m/s, world frame, of each actor that a sensor hit in a frame, by actor id.
 
         Raises:
             MissingDataError: a file does not exist.
@@ -236,13 +236,13 @@ class Capture:
 
         Raises:
             MissingDataError: the file does not exist.
-            FormatError: it holds no rigid transform.
+            FormatError: it is not a rigid transform.
         """
         path = self._folder + array_path("pose", sensor, frame)
         return self._pose_of(path, self.tree.read(path))
 
     def read_poses(self, sensor: int, frames: Iterable[int]) -> NDArray[np.float64]:
-        """Return (F, 4, 4) world_T_sensor of several frames, which are requested together; NaN where one cannot be read."""
+        """Return (F, 4, 4) float64 world_T_sensor of several frames, requested together; NaN for poses that cannot be read."""
         paths = [self._folder + array_path("pose", sensor, frame) for frame in frames]
         found = np.full((len(paths), 4, 4), np.nan)
         try:
@@ -259,11 +259,11 @@ class Capture:
         return check_rigid(parse_npy(data, FORMATS["pose"], where), where)
 
     def read_time(self, frame: int, sensor: int = 0) -> float:
-        """Return the simulation's time at a frame, in seconds. Where a frame has several lines, the last one is valid.
+        """Return the simulation time of a frame, seconds. If a frame has several lines, the last one is valid.
 
         Raises:
             MissingDataError: the times file does not exist, or has no line for the frame.
-            FormatError: a line of the file is not in CARLA's form.
+            FormatError: a line does not have the format of CARLA.
         """
         times = self.read_times(sensor)
         if frame not in times:
@@ -272,18 +272,18 @@ class Capture:
         return times[frame]
 
     def read_times(self, sensor: int = 0) -> Mapping[int, float]:
-        """Return the simulation's time in seconds per frame number.
+        """Return the simulation time by frame number, seconds.
 
         Raises:
             MissingDataError: the times file does not exist.
-            FormatError: a line of it is not in CARLA's form.
+            FormatError: a line does not have this format.
         """
         path = self._folder + times_path(sensor)
         found = parse_times(self.tree.read(path), self.tree.where(path))
         return {frame: elapsed_s for frame, (elapsed_s, _) in found.items()}
 
     def read_bev(self, frame: int) -> bytes | None:
-        """Return a frame's bird's-eye picture as JPEG bytes, or None where it has none."""
+        """Return the bird's-eye picture of a frame as JPEG bytes; None if it does not exist."""
         try:
             return bytes(self.tree.read(self._folder + bev_path(frame)))
         except MissingDataError:
@@ -295,7 +295,7 @@ class Capture:
 
     @cached_property
     def cameras(self) -> dict[str, CameraModel]:
-        """The cameras of cameras.json by name; none where it does not exist. They are in the frame of the ego sensor.
+        """The cameras of cameras.json by name, in the frame of the ego sensor; empty if the file does not exist.
 
         Raises:
             FormatError: the file is damaged.
@@ -306,7 +306,7 @@ class Capture:
         return cameras_from_json(bytes(self.tree.read(path)), self.tree.where(path), "left")
 
     def image_fields(self, frame: int) -> tuple[str, ...]:
-        """Return the names in the layout of the images that a frame has, such as `images.front.jpg`."""
+        """Return the layout names of the images of a frame, such as `images.front.jpg`."""
         names = [
             f"{folder}.{camera}.{suffix}"
             for camera in self.cameras
@@ -316,13 +316,13 @@ class Capture:
         return tuple(name for name in names if self.tree.is_file(self._folder + image_path(name, frame)))
 
     def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
-        """Return the bytes of the files of a frame's images, by their names in the layout."""
+        """Return the image files of a frame as bytes, by their layout names."""
         names = self.image_fields(frame)
         files = self.tree.read_many([self._folder + image_path(name, frame) for name in names])
         return {name: np.frombuffer(data, np.uint8) for name, data in zip(names, files, strict=True)}
 
     def light(self) -> Capture:
-        """Return a copy without the listings that this one has read, to be sent to other processes with every frame."""
+        """Return a copy without cached listings, to be sent to other processes with every frame."""
         return Capture(self.tree, self.classes)
 
     def _entries(self, folder: str) -> Mapping[str, bool]:
@@ -336,14 +336,13 @@ def find_captures(source: str | os.PathLike[str]) -> dict[str, Capture]:
     """Find the captures in a folder.
 
     Args:
-        source: the folder of a sequence, which holds raw/; or raw/ itself; or a folder of such sequences, up to three levels above them;
-            a path or a URL.
+        source: a path or a URL: the folder of a sequence with raw/ in it, raw/ itself, or a folder up to three levels above such sequences.
 
     Returns:
-        Captures by the path of their sequence relative to `source`, in sorted order. The path is "" where `source` is the sequence.
+        Captures by the path of their sequence relative to `source`, in sorted order. The path is "" if `source` is the sequence.
 
     Raises:
-        MissingDataError: the folder does not exist, or holds no capture.
+        MissingDataError: the folder does not exist, or contains no capture.
     """
     tree = tree_of(source, mapped=False)
     _check_folder(tree)
@@ -355,8 +354,8 @@ def find_captures(source: str | os.PathLike[str]) -> dict[str, Capture]:
         raise MissingDataError(
             tree.location,
             expected="a capture (a folder raw/ with velodyne0/, labels0/, ...)",
-            found=f"none down to {_SEARCH_DEPTH} levels",
-            advice="give a sequence's folder that holds raw/, or a folder of such sequences",
+            found=f"none within {_SEARCH_DEPTH} levels of folders",
+            advice="give the folder of a sequence with raw/ in it, or a folder of such sequences",
         )
     return {path: Capture(tree.below(path)) for path in paths}
 
@@ -372,12 +371,12 @@ def _find(tree: Tree, path: str, depth: int) -> Iterator[str]:
 
 
 def _check_folder(tree: Tree) -> None:
-    """Raise MissingDataError where a tree's folder does not exist; a folder in an object store exists if something is in it."""
+    """Raise MissingDataError if the folder of a tree does not exist. A folder in an object store exists if it contains a file."""
     if isinstance(tree, LocalTree):
         if not tree.root.is_dir():
             found = "a file" if tree.root.exists() else "nothing"
             raise MissingDataError(tree.location, expected="a folder", found=found)
-    elif isinstance(tree, RemoteTree) and tree.size() is not None:  # a web server would send all of it to be listed
+    elif isinstance(tree, RemoteTree) and tree.size() is not None:  # to list it, a web server would send the whole file
         raise MissingDataError(tree.location, expected="a folder", found="a file")
     elif not tree.entries():
         raise MissingDataError(tree.location, expected="a folder", found="nothing")

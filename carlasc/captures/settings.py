@@ -1,4 +1,4 @@
-"""What the simulated town and a CARLA server share: the model of the LiDARs and where they are mounted, traffic, bird's-eye pictures."""
+"""Settings of both the simulated town and a CARLA server: model and positions of LiDARs, traffic, bird's-eye pictures."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from carlasc.core.choices import TrafficLevel as TrafficLevel  # noqa: PLC0414 (
 from carlasc.errors import ArgumentError
 
 TRAFFIC: Mapping[TrafficLevel, int] = {"light": 25, "medium": 50, "heavy": 100}
-"""Number of moving vehicles per level of traffic, and of pedestrians."""
+"""Number of moving vehicles, and of pedestrians, by level of traffic."""
 
 
 BEV_SIZE = (1920, 1080)
 """Width and height of a bird's-eye picture in pixels, as published."""
 
 BEV_HEIGHT_M = 50.0
-"""Height of the camera of bird's-eye pictures above the ego vehicle's origin."""
+"""Height of the camera of bird's-eye pictures above the origin of the ego vehicle."""
 
 BEV_QUALITY = 88
 """JPEG quality of bird's-eye pictures."""
 
 
 def check_at_least(minimum: int, **values: int) -> None:
-    """Check whole numbers against a lower bound.
+    """Check integers against a lower bound.
 
     Raises:
-        ArgumentError: a value is below the bound. It names the argument.
+        ArgumentError: a value is below the bound; the message names the argument.
     """
     for name, value in values.items():
         if value < minimum:
@@ -38,13 +38,13 @@ def check_at_least(minimum: int, **values: int) -> None:
 
 
 EGO_SENSOR_M = (-0.5, 0.0, 1.8)
-"""Offset of sensor 0, the ego sensor, in the vehicle's frame."""
+"""Offset of sensor 0, the ego sensor, in the vehicle frame."""
 
 MAX_OFFSET_M = 20.0
-"""The other sensors are at most this far from the vehicle's origin, along x and along y."""
+"""Maximum distance of the other sensors from the origin of the vehicle, along x and along y."""
 
 HEIGHTS_M = (1.0, 5.0)
-"""Lowest and highest z of the other sensors, in the vehicle's frame."""
+"""Minimum and maximum z of the other sensors, in the vehicle frame."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class Lidar:
 
     Attributes:
         channels: number of channels, one above the other.
-        points: number of rays per scan, all channels together. Every channel has the same number.
-        range_m: greatest distance of a return.
-        upper_deg: elevation of the highest channel.
-        lower_deg: elevation of the lowest channel.
-        noise_m: greatest error of a coordinate. Errors are uniform.
+        points: number of rays per scan over all channels. All channels have the same number.
+        range_m: maximum distance of a return, metres.
+        upper_deg: elevation of the highest channel, degrees.
+        lower_deg: elevation of the lowest channel, degrees.
+        noise_m: maximum error of a coordinate, metres. Errors are uniform.
 
     Raises:
         ArgumentError: a value is out of its range.
@@ -90,9 +90,9 @@ class Lidar:
 
     @cached_property
     def directions(self) -> NDArray[np.float64]:
-        """(R, 3) unit vectors of the rays in the sensor's frame.
+        """(R, 3) unit vectors of the rays in the sensor frame.
 
-        Channels follow each other from the highest to the lowest. The azimuth of a channel's rays grows from -pi: x towards y.
+        Channels are ordered from the highest to the lowest. The azimuth of the rays of a channel increases from -pi: x towards y.
         """
         elevation = np.radians(np.linspace(self.upper_deg, self.lower_deg, self.channels))[:, None]
         columns = self.points // self.channels
@@ -102,15 +102,15 @@ class Lidar:
 
 
 def sensor_offsets(sensors: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw where the sensors are mounted.
+    """Draw random positions of the sensors.
 
     Args:
         sensors: number of sensors.
         rng: source of the random numbers.
 
     Returns:
-        (sensors, 3) float64 offsets in the vehicle's frame, metres. The first is the ego sensor's, which is always the same; the
-        others are uniform in their box.
+        (sensors, 3) float64 offsets in the vehicle frame, metres. The first is the constant offset of the ego sensor; the others are
+        uniformly distributed in a box.
     """
     low, high = (-MAX_OFFSET_M, -MAX_OFFSET_M, HEIGHTS_M[0]), (MAX_OFFSET_M, MAX_OFFSET_M, HEIGHTS_M[1])
     return np.vstack([EGO_SENSOR_M, rng.uniform(low, high, (sensors - 1, 3))])

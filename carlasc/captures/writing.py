@@ -30,7 +30,7 @@ from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 
 
 class CaptureWriter:
-    """Writes a capture, to a folder or to an object store. Every file is written whole. A writer can be pickled.
+    """Writes a capture to a folder or an object store. Every file is written whole. A writer can be pickled.
 
     Attributes:
         out: name of the folder of the sequence.
@@ -39,7 +39,7 @@ class CaptureWriter:
     """
 
     def __init__(self, out: str | os.PathLike[str] | Target, **storage_options: Any) -> None:
-        """Take the folder of a sequence. Files go to `<out>/raw`.
+        """Keep the folder of a sequence. Files are written to `<out>/raw`.
 
         Args:
             out: a folder, its URL, or a Target.
@@ -50,24 +50,24 @@ class CaptureWriter:
         self.location = self.target.location
 
     def check_settings(self, file: str, settings: Mapping[str, Any], command: str) -> None:
-        """Check that the folder is empty, or holds a capture that was made with the same settings.
+        """Check that the folder is empty, or has a capture with the same settings.
 
         Args:
-            file: the file in raw/ that holds the settings.
-            settings: those of this run, as JSON has them.
-            command: the command that makes such captures, for the error.
+            file: the file in raw/ with the settings.
+            settings: settings of this run, as JSON values.
+            command: the command that makes such captures, for errors.
 
         Raises:
-            ConflictError: the folder holds another capture. The error names the settings that differ.
+            ConflictError: the folder has another capture; the message names the different settings.
         """
         where = self.target.tree.where(file)
         if not self.target.tree.is_file(file):
             if any(
                 not name.startswith(".") for name in self.target.tree.entries()
-            ):  # one that begins so is what a killed run left
+            ):  # files with this prefix were left by a killed run
                 raise ConflictError(
                     self.location,
-                    expected=f"nothing, or a capture of `{command}`",
+                    expected=f"an empty folder, or a capture of `{command}`",
                     found=f"a capture without {file}",
                     advice="choose another folder",
                 )
@@ -86,23 +86,23 @@ class CaptureWriter:
             )
 
     def write_settings(self, file: str, settings: Mapping[str, Any]) -> None:
-        """Write the settings of a capture as JSON; the unfinished files of a run that was killed are removed."""
+        """Write the settings of a capture as JSON. Temporary files of a killed run are removed."""
         if isinstance(self.target, LocalTarget):
             remove_stale(self.target.folder)
         self.target.put(file, to_json(dict(settings)))
 
     def has(self, sensor: int, frame: int) -> bool:
-        """Whether all of a sensor's files of a frame exist. An existing file is whole unless a power failure left it empty."""
+        """Whether all files of a sensor and a frame exist. An existing file is complete, unless a power failure left it empty."""
         return all(self._has(array_path(name, sensor, frame)) for name in FOLDERS)
 
     def has_frame(self, frame: int, sensors: int, bev: bool, images: Sequence[str] = ()) -> bool:
         """Whether all files of a frame exist.
 
         Args:
-            frame: number of the frame.
-            sensors: number of sensors whose files are looked for.
-            bev: whether the bird's-eye picture is looked for too.
-            images: fields of images that are looked for.
+            frame: frame number.
+            sensors: number of sensors.
+            bev: whether the bird's-eye picture is required too.
+            images: fields of the required images.
         """
         complete = all(self.has(sensor, frame) for sensor in range(sensors))
         complete = complete and all(self._has(image_path(field, frame)) for field in images)
@@ -117,12 +117,12 @@ class CaptureWriter:
         """Return the frames whose times are written for all sensors.
 
         Raises:
-            FormatError: a line of a times file is not in CARLA's form.
+            FormatError: a line of a times file does not have the format of CARLA.
         """
         return frozenset.intersection(*(frozenset(self._times_of(sensor)) for sensor in range(sensors)))
 
     def write(self, sensor: int, frame: int, recording: SensorRecording) -> None:
-        """Write what a sensor recorded in a frame. Existing files are replaced.
+        """Write the recording of a sensor in a frame. Existing files are replaced.
 
         Args:
             sensor: number of the sensor; 0 is the ego sensor.
@@ -135,12 +135,12 @@ class CaptureWriter:
         """
         scan, where = recording.scan, f"{self.location}: sensor {sensor}, frame {frame}"
         if scan.labels is None or scan.instances is None:
-            raise FormatError(where, expected="labels and instances", found="none")
+            raise FormatError(where, expected="a scan with labels and instances", found="a scan without one of them")
         arrays: dict[str, NDArray[Any]] = {
             "points": scan.points,
             "labels": scan.labels,
             "instances": scan.instances,
-            # An empty list of actors has no columns in the authors' files.
+            # In the published files, an empty list of actors has no columns.
             "velocities": recording.velocities if len(recording.velocities) else np.empty(0, np.float64),
             "pose": check_rigid(recording.world_T_sensor, where),
         }
@@ -152,15 +152,15 @@ class CaptureWriter:
         self.target.put_many(files)
 
     def write_times(self, times_s: Mapping[int, Sequence[float]]) -> None:
-        """Write the simulation's times of frames: each sensor's times file is written whole, in the order of frames.
+        """Write the simulation times of frames. The times file of each sensor is written whole, in the order of frames.
 
-        Lines of other frames that the files have already are kept. See `TimesLog` for the times of one frame after the other.
+        Existing lines of other frames are kept. To write times frame by frame, see `TimesLog`.
 
         Args:
-            times_s: for each frame number, the time of each sensor in seconds.
+            times_s: time of each sensor, seconds, by frame number.
 
         Raises:
-            FormatError: a line of an existing file is not in CARLA's form.
+            FormatError: a line of an existing file does not have the format of CARLA.
             StorageError: the disk is full, or the folder cannot be written to.
         """
         files: dict[str, bytes | memoryview] = {}
@@ -176,14 +176,14 @@ class CaptureWriter:
         self.target.put_many(files)
 
     def _times_of(self, sensor: int) -> dict[int, str]:
-        """Return the lines of a sensor's times file by frame; none if the file does not exist."""
+        """Return the lines of the times file of a sensor by frame; empty if the file does not exist."""
         path = times_path(sensor)
         if (data := self.target.read(path)) is None:
             return {}
         return {frame: line for frame, (_, line) in parse_times(data, self.target.tree.where(path)).items()}
 
     def write_bev(self, frame: int, jpeg: bytes) -> None:
-        """Write a frame's bird's-eye picture, given as JPEG bytes."""
+        """Write the bird's-eye picture of a frame, given as JPEG bytes."""
         self.target.put(bev_path(frame), jpeg)
 
     def write_images(self, frame: int, images: Mapping[str, NDArray[np.uint8]]) -> None:
@@ -195,13 +195,13 @@ class CaptureWriter:
 
 
 class TimesLog:
-    """Collects the times of frames, and writes the times files now and then, and at its end, also after an error or Ctrl-C.
+    """Collects the times of frames, and writes the times files regularly and at the end, also after an error or Ctrl-C.
 
-    Object stores cannot append to a file, and lines in the order in which frames were finished would differ between runs.
+    Times are not appended line by line, because object stores cannot append, and because the order of lines would differ between runs.
     """
 
     def __init__(self, writer: CaptureWriter, every: int = 50) -> None:
-        """Write to a capture's times files after every so many frames; one process at a time does so."""
+        """Write the times files of a capture after `every` frames. Only one process may do this at a time."""
         self.writer, self.every = writer, every
         self._waiting: dict[int, Sequence[float]] = {}
 
@@ -212,7 +212,7 @@ class TimesLog:
             self.flush()
 
     def flush(self) -> None:
-        """Write what was added."""
+        """Write the collected times."""
         if self._waiting:
             self.writer.write_times(self._waiting)
             self._waiting = {}

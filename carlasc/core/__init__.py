@@ -1,4 +1,4 @@
-"""Values that know nothing of files: transforms, cells and grids, scans, boxes, class tables and the remaps between them."""
+"""Values without files: transforms, cells and grids, scans, boxes, class tables and the remaps between them."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""Between right-handed axes (y to the left) and CarlaSC's left-handed ones (y to the right): y changes its sign; and all choices of axes.
+"""Conversion between right-handed axes (y to the left) and the left-handed axes of CarlaSC (y to the right), and all permutations of axes.
 
-Mirroring is its own inverse, so each function serves both directions.
+The conversion changes the sign of y. It is its own inverse, so each function works in both directions.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def choices_of_axes() -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Yield the 48 choices of axes: what the new x, y, z are in the old ones, such as "-y, x, z", and the (3, 3) matrix; the old ones first."""
+    """Yield the 48 signed permutations of axes, the identity first: the new axes in terms of the old ones, such as "-y, x, z", and the (3, 3) matrix."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
@@ -36,28 +36,28 @@ def choices_of_axes() -> Iterator[tuple[str, NDArray[np.float64]]]:
 
 
 def mirror_points(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mirror (N, 3) or (N, 4) points or vectors; a fourth column is kept."""
+    """Mirror (N, 3) or (N, 4) points or vectors. A fourth column is unchanged."""
     return points * _SIGNS[: points.shape[1]]
 
 
 def mirror_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mirror (..., 4, 4) poses: both the frame that a pose leads from and the one that it leads to."""
+    """Mirror (..., 4, 4) poses, in both the source and the destination frame."""
     return _MIRROR @ poses @ _MIRROR
 
 
 def mirror_boxes(boxes: Boxes) -> Boxes:
-    """Mirror boxes: each box's own axes are mirrored too, so that x stays its length and the rotation stays one."""
+    """Mirror boxes. The frame of each box is mirrored too, so that x is still along its length and the rotation is proper."""
     return Boxes.from_poses(boxes.tracks, boxes.labels, mirror_poses(boxes.sensor_T_box), boxes.sizes, boxes.annotated)
 
 
 def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:
-    """Mirror an (X, Y, Z) grid: y of a Cartesian one, the azimuth of a cylindrical one."""
+    """Mirror an (X, Y, Z) grid along its second axis: y (Cartesian) or azimuth (cylindrical)."""
     mirrored: NDArray[Any] = grid[:, ::-1]
     return mirrored
 
 
 def mirror_spec(spec: GridSpec) -> GridSpec:
-    """Return the geometry of a mirrored grid: the bounds of y, or of the azimuth, change places and signs."""
+    """Return the geometry of a mirrored grid: the bounds of y, or of the azimuth, are swapped and negated."""
     (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
     return GridSpec(spec.coordinates, spec.size, (x0, -y1, z0), (x1, -y0, z1))
 
@@ -69,7 +69,7 @@ def mirror_voxels(grid: Grid) -> Grid:
 
 
 def mirror_scan(scan: Scan) -> Scan:
-    """Mirror the points of a scan, their flow, the places where their rays began, and the boxes."""
+    """Mirror a scan: points, flow, ray origins and boxes."""
     return replace(
         scan,
         points=mirror_points(scan.points),

@@ -9,7 +9,7 @@ from carlasc.core.classes import ClassTable, Color, Remap
 from carlasc.core.tables import CARLA, SEMANTICKITTI, SEMANTICKITTI19, remap_named
 
 IGNORED = -1
-"""Target of the classes that a benchmark leaves out: voxels of such a class do not count."""
+"""Target of classes that a benchmark ignores: voxels of such a class are not scored."""
 
 
 def _table(name: str, names: str, free: int) -> ClassTable:
@@ -31,17 +31,17 @@ _NUSCENES = (
 OCC3D = _table("occ3d", f"others {_NUSCENES} free", 17)
 OPENOCCUPANCY = _table("openoccupancy", f"empty {_NUSCENES}", 0)
 
-# CARLA class -> (Occ3D, SSCBench), as CarlaOcc publishes the map; the 23 old tags have one Vehicle, a car.
+# CARLA class -> (Occ3D, SSCBench), as in the published map of CarlaOcc. The 23 old tags have one class Vehicle, mapped to car.
 _CARLA = {
     0: (17, 0), 1: (15, 11), 2: (1, 12), 3: (0, 18), 4: (7, 6), 5: (15, 15), 6: (11, 7), 7: (11, 7), 8: (13, 9), 9: (16, 13), 10: (4, 1),
     11: (15, 17), 12: (0, 16), 13: (17, 0), 14: (14, 10), 15: (15, 17), 16: (12, 10), 17: (1, 12), 18: (0, 16), 19: (0, 18), 20: (0, 18),
     21: (12, 10), 22: (14, 14),
 }  # fmt: skip
-# The paper's 11 classes do not tell these apart: Barrier is fence, wall and guard rail; Pole holds signs and lights; Ground is terrain too.
+# The 11 classes of the paper merge others: Barrier has fences, walls and guard rails; Pole has signs and lights; Ground includes terrain.
 _CARLASC11 = {
     0: (17, 0), 1: (15, 11), 2: (1, 12), 3: (0, 18), 4: (7, 6), 5: (15, 15), 6: (11, 7), 7: (14, 14), 8: (13, 9), 9: (16, 13), 10: (4, 1),
 }  # fmt: skip
-# SSCBench's column is the set's own table. Occ3D's follows CarlaOcc: riders are people, signs are others. Its outliers are noise.
+# The column of SSCBench is its own table. The column of Occ3D follows CarlaOcc: riders are people, signs are others, outliers are noise.
 _SEMANTICKITTI = {
     0: (17, 0), 1: (IGNORED, IGNORED), 10: (4, 1), 11: (2, 2), 13: (3, 5), 15: (6, 3), 16: (9, 5), 18: (10, 4), 20: (0, 5), 30: (7, 6),
     31: (7, IGNORED), 32: (7, IGNORED), 40: (11, 7), 44: (11, 8), 48: (13, 9), 49: (12, 10), 50: (15, 11), 51: (1, 12), 52: (15, 17),

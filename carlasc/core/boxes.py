@@ -1,4 +1,4 @@
-"""The tracked boxes of one frame: where objects are, how large they are, and which object each one is."""
+"""The tracked boxes of one frame: pose, size and track of each object."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BOXES_DTYPE = np.dtype(
     + [(name, "<f8") for name in ("x", "y", "z", "qw", "qx", "qy", "qz", "length", "width", "height")]
     + [("annotated", "u1")]
 )
-"""One row per box, as in the files of the layout: see `Boxes` for what the columns mean."""
+"""One row per box, as in the files of the layout. See `Boxes` for the meaning of the columns."""
 
 _CENTER, _QUATERNION, _SIZE = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("length", "width", "height")
 _UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1, as for the rotations of poses
@@ -31,18 +31,18 @@ _UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1, as f
 class Boxes:
     """The tracked boxes of one frame.
 
-    A box has a frame of its own: the origin is its centre, x points forward along its length, z up along its height.
+    Each box has a frame: its origin is the centre of the box, x points forward along the length, z up along the height.
 
     Attributes:
-        tracks: (N,) uint32 numbers of the objects, 1 or more, the same throughout a sequence, and the same as in the field
-            `instances` where that exists. No object has two boxes in a frame.
+        tracks: (N,) uint32 track numbers of 1 or more, constant over a sequence, and equal to the field `instances` if it exists. A
+            track has at most one box per frame.
         labels: (N,) uint32 class ids.
         centers: (N, 3) float64, metres, sensor frame.
-        quaternions: (N, 4) float64, unit quaternions w, x, y, z of the rotation from the box to the sensor frame. Boxes that are
-            upright in the world are tilted in the frame of a sensor that is.
+        quaternions: (N, 4) float64, unit quaternions w, x, y, z of the rotation from the box to the sensor frame. If the sensor is
+            tilted, boxes that are upright in the world are tilted too.
         sizes: (N, 3) float64, metres: length, width, height, along x, y, z of the box.
-        annotated: (N,) bool: whether the box was annotated in this frame. Others were filled in, for example between two
-            annotated frames.
+        annotated: (N,) bool: whether the box was annotated in this frame. Other boxes are interpolated, for example between two annotated
+            frames.
 
     Raises:
         FormatError: shapes do not match, a number is not finite, a size is not positive, a quaternion is not a rotation, or a
@@ -97,12 +97,12 @@ class Boxes:
         Args:
             tracks: (N,) numbers of the tracks.
             labels: (N,) class ids.
-            sensor_T_box: (N, 4, 4) poses of the centres.
+            sensor_T_box: (N, 4, 4) poses of the boxes.
             sizes: (N, 3) length, width and height, metres.
             annotated: (N,) whether a box was annotated; None for all.
 
         Raises:
-            FormatError: as for the constructor. Poses are not checked: `carlasc.core.check_rigid` does that.
+            FormatError: as for the constructor. The poses are not checked; use `carlasc.core.check_rigid`.
         """
         return cls(
             np.asarray(tracks, np.uint32),
@@ -165,15 +165,15 @@ class Boxes:
         )
 
     def joined(self, others: Boxes) -> Boxes:
-        """Return these boxes and others of the same frame.
+        """Return the union of these boxes and others of the same frame.
 
         Raises:
-            FormatError: an object has a box in both.
+            FormatError: a track has a box in both.
         """
         return Boxes(*(np.concatenate([own, vars(others)[name]]) for name, own in vars(self).items()))
 
     def transform(self, dst_T_sensor: Transform) -> Boxes:
-        """Return the boxes in another frame, for example in the world's: `dst_T_sensor` is (4, 4) and rigid."""
+        """Return the boxes in another frame, for example the world frame. `dst_T_sensor` is (4, 4) and rigid."""
         return Boxes.from_poses(self.tracks, self.labels, dst_T_sensor @ self.sensor_T_box, self.sizes, self.annotated)
 
     def contains(self, points: NDArray[np.floating], margin_m: float = 0.0) -> NDArray[np.bool_]:
@@ -181,7 +181,7 @@ class Boxes:
 
         Args:
             points: (M, 3) metres, sensor frame.
-            margin_m: distance by which the boxes are grown on all sides; they shrink where it is negative.
+            margin_m: margin by which the boxes are enlarged on all sides, metres; a negative margin shrinks them.
 
         Returns:
             (N, M) bool.
@@ -194,7 +194,7 @@ class Boxes:
         return inside
 
     def owners(self, points: NDArray[np.floating], margin_m: float = 0.0) -> NDArray[np.int64]:
-        """Return (M,) the row of the box that each of (M, 3) points is in: the smallest of several, -1 where there is none."""
+        """Return (M,) int64, the row of the box that contains each of (M, 3) points: the smallest of several boxes, -1 for no box."""
         owners = np.full(len(points), -1, np.int64)
         inside = self.contains(points, margin_m)
         for row in np.argsort(-np.prod(self.sizes, axis=1), kind="stable").tolist():

@@ -1,6 +1,6 @@
-"""Cameras of a recording: how points become pixels, where each camera was, and the text file cameras.json that says so.
+"""Cameras of a recording: projection, pose, and their description in cameras.json.
 
-A camera's own frame has x to the right, y down and z forward along its axis, in metres. Pixel (0, 0) is the centre of the upper left pixel,
+The camera frame has x to the right, y down and z forward along its axis, in metres. Pixel (0, 0) is the centre of the upper left pixel,
 so an image covers -0.5 <= u < width - 0.5.
 """
 
@@ -20,33 +20,33 @@ from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import FormatError
 
 Lens = Literal["pinhole", "radial-tangential", "fisheye"]
-"""The models of cameras: without distortion; OpenCV's k1, k2, p1, p2, k3 .. k6; OpenCV's equidistant fisheye with k1 .. k4."""
+"""Camera models: without distortion; k1, k2, p1, p2, k3 .. k6 of OpenCV; the equidistant fisheye of OpenCV with k1 .. k4."""
 
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"pinhole": (0,), "radial-tangential": (4, 5, 8), "fisheye": (4,)}
 _WIDEST = {"pinhole": 1e3, "radial-tangential": 8.0, "fisheye": math.radians(110)}  # radius in the plane of `_distort`
-_STEPS, _ROUNDS = 4096, 8  # of the table of radii, and of Newton's method
+_STEPS, _ROUNDS = 4096, 8  # length of the table of radii, and iterations of Newton's method
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _KEYS = ("name", "width", "height", "model", "matrix", "distortion", "sensor_T_camera", "times", "images")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraModel:
-    """A camera of a recording: its lens, its place, and when its images were taken.
+    """A camera of a recording: its lens, its pose, and the times of its images.
 
     Attributes:
-        name: letters, digits, "-" and "_": also the name of the folder of its images.
-        width: columns of an image.
-        height: rows of an image.
+        name: letters, digits, "-" and "_". This is also the name of the folder of its images.
+        width: columns of an image, pixels.
+        height: rows of an image, pixels.
         model: "pinhole", "radial-tangential" or "fisheye" (equidistant).
         matrix: (3, 3) float64 intrinsic matrix, pixels.
-        distortion: coefficients in OpenCV's order: none, four, five or eight (k1, k2, p1, p2, k3, ...), or four of a fisheye.
-        sensor_T_camera: (4, 4) float64 from the camera's frame to that of the scans; a rotation if the scans' axes are right-handed, else a
-            reflection, because the camera's frame is right-handed.
-        times: (F,) seconds of the image of each frame, by the clock of times.txt, NaN where there is none; None: those of the scans.
-        images: where the image of each frame lies, "" for none, relative to the folder of the sequence; None: in the folder of the images.
+        distortion: coefficients in the order of OpenCV: none, four, five or eight (k1, k2, p1, p2, k3, ...), or four for a fisheye.
+        sensor_T_camera: (4, 4) float64, from the camera frame to the frame of the scans. It is a rotation if the axes of the scans are
+            right-handed, otherwise a reflection, because the camera frame is right-handed.
+        times: (F,) time of the image of each frame, seconds by the clock of times.txt, NaN for no image; None for the times of the scans.
+        images: path of the image of each frame, relative to the folder of the sequence, "" for no image; None for the folder of images.
 
     Raises:
-        FormatError: the model is unknown, the coefficients do not fit it, or a number is not possible.
+        FormatError: the model is unknown, the coefficients do not fit it, or a number is out of its range.
     """
 
     name: str
@@ -91,9 +91,9 @@ class CameraModel:
         object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return (N, 2) pixel column and row of (N, 3) points in the camera's frame, metres.
+        """Return (N, 2) float64 pixel column and row of (N, 3) points in the camera frame, metres.
 
-        NaN where a point is behind the camera, or so far from its axis that the model does not hold. Pixels may be outside of the image.
+        NaN for points behind the camera, or too far from its axis for the model. Pixels may be outside the image.
         """
         x, y, z = np.asarray(points, np.float64).T
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -110,7 +110,7 @@ class CameraModel:
         return pixels
 
     def unproject(self, pixels: ArrayLike) -> NDArray[np.float64]:
-        """Return (N, 3) unit vectors in the camera's frame along which (N, 2) pixels look; NaN where the model does not hold."""
+        """Return (N, 3) unit vectors in the camera frame, the viewing directions of (N, 2) pixels; NaN where the model is not valid."""
         wanted = (np.asarray(pixels, np.float64) - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
         plane = wanted
         if self.distortion:
@@ -137,18 +137,18 @@ class CameraModel:
         return (u >= -0.5) & (u < self.width - 0.5) & (v >= -0.5) & (v < self.height - 0.5)
 
     def resized(self, width: int, height: int) -> CameraModel:
-        """Return the same camera with images of another size, with the matrix that fits them."""
+        """Return the camera for images of another size, with a scaled intrinsic matrix."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # pixel edges instead of pixel centres
         matrix = np.linalg.inv(half) @ scale @ half @ self.matrix
         return self.replaced(width=width, height=height, matrix=matrix)
 
     def replaced(self, **changes: Any) -> CameraModel:
-        """Return a copy in which some attributes differ."""
+        """Return a copy with some attributes replaced."""
         return CameraModel(**{name: getattr(self, name) for name in _KEYS} | changes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what cameras.json says of the camera."""
+        """Return the camera as values for cameras.json."""
         about: dict[str, Any] = {name: getattr(self, name) for name in _KEYS}
         about |= {"matrix": self.matrix.tolist(), "distortion": list(self.distortion)}
         about["sensor_T_camera"] = self.sensor_T_camera.tolist()
@@ -158,16 +158,16 @@ class CameraModel:
 
     @classmethod
     def from_dict(cls, about: Any, where: str) -> CameraModel:
-        """Return a camera from what cameras.json says of it.
+        """Return a camera from its values in cameras.json. `where` is the file named in errors.
 
         Raises:
-            FormatError: a value is missing, or is not possible.
+            FormatError: a value is missing or not valid.
         """
         needed = set(_KEYS[:7]) - {"distortion"}
         if not isinstance(about, dict) or not needed <= about.keys():
             missing = ", ".join(sorted(needed - set(about))) if isinstance(about, dict) else "everything"
             raise FormatError(
-                where, expected=f"a camera with {', '.join(sorted(needed))}", found=f"one without {missing}"
+                where, expected=f"a camera with {', '.join(sorted(needed))}", found=f"a camera without {missing}"
             )
         values = {name: about[name] for name in _KEYS if about.get(name) is not None}
         try:
@@ -184,13 +184,13 @@ class CameraModel:
 
     @cached_property
     def _widest(self) -> float:
-        """Radius in the plane up to which pixels move outwards with it: beyond, the model says nothing."""
+        """Largest radius in the plane for which the distorted radius is monotonic. The model is not valid beyond it."""
         radii = np.linspace(0.0, _WIDEST[self.model], _STEPS)
         falls = np.flatnonzero(np.diff(radii * self._radial(radii * radii)) <= 0)
         return float(radii[falls[0]] if len(falls) else radii[-1])
 
     def _radial(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the factor by which a radius in the plane grows, of squared radii."""
+        """Return the radial scale factor for squared radii in the plane."""
         if not self.distortion:
             return np.ones_like(squared)
         if self.model == "fisheye":
@@ -211,7 +211,7 @@ class CameraModel:
         return bent
 
     def _newton_step(self, plane: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the step of Newton's method towards the plane's point that is distorted to another."""
+        """Return one step of Newton's method towards the undistorted points of the `wanted` distorted points."""
         off, small = self._distort(plane) - wanted, 1e-6
         along_x, along_y = (
             (self._distort(plane + shift) - self._distort(plane - shift)) / (2 * small) for shift in small * np.eye(2)
@@ -224,10 +224,10 @@ class CameraModel:
 
 
 def optical_axes(forward: tuple[float, float], axes: Literal["left", "right"]) -> Transform:
-    """Return the (4, 4) turn of a level camera that looks along a horizontal direction, into the axes of the scans.
+    """Return the (4, 4) sensor_T_camera without translation of a level camera that looks along a horizontal direction.
 
     Args:
-        forward: x and y of the direction.
+        forward: x and y of the direction, sensor frame.
         axes: handedness of the scans.
     """
     x, y = np.array(forward, np.float64) / math.hypot(*forward)

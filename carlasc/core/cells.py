@@ -1,8 +1,8 @@
-"""The cell of a point, compiled: the rule of `GridSpec.to_axes` and `GridSpec.index`, one point at a time.
+"""Compiled functions for the cell of a point: the rule of `GridSpec.to_axes` and `GridSpec.index`, one point at a time.
 
-`find_voxel` is the rule to the letter. Loops over many points call it only for the few points that are too near an edge for the quick
-arithmetic that they use; `fast_azimuth` is the part of that arithmetic that a cylindrical grid needs. The functions are compiled into
-the loops that call them, in `carlasc.groundtruth.voting` and `carlasc.dataset.stacking`. Importing this module loads Numba.
+`find_voxel` is the exact rule. Loops over many points use faster arithmetic, and call it only for the few points near an edge of a cell.
+`fast_azimuth` is the fast arithmetic for cylindrical grids. The functions are compiled into the loops that call them, in
+`carlasc.groundtruth.voting` and `carlasc.dataset.stacking`. Importing this module loads Numba.
 
 See the format page, `docs/format.md#cells`.
 """
@@ -19,14 +19,14 @@ from carlasc.core.compiling import cached, fused, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
 
-Real = Any  # float32 or float64: compiled code keeps them apart, NumPy's stubs do not
+Real = Any  # float32 or float64: compiled code distinguishes them, the stubs of NumPy do not
 Triple = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """The upper 3 x 4 of a transform, row-major, as scalars."""
 
 
 class Cells(NamedTuple):
-    """A GridSpec as scalars, which compiled code keeps in registers."""
+    """A GridSpec as scalars, so that compiled code can keep them in registers."""
 
     cylindrical: bool
     size: tuple[int, int, int]
@@ -59,10 +59,10 @@ def transform(pose: Pose, x: Real, y: Real, z: Real) -> tuple[Real, Real, Real]:
 
 @jit
 def find_voxel(x: float, y: float, z: float, cells: Cells) -> int:
-    """Return the flat index of the voxel of a point in the grid's frame, the number of voxels if the point is outside.
+    """Return the flat index of the voxel of a point in the frame of the grid; the number of voxels if the point is outside.
 
-    Cells are half-open, the index is rounded down and clipped to the last cell. In a cylindrical grid an azimuth outside the bounds
-    is turned by 2 pi where that brings it inside.
+    Cells are half-open. The index is rounded down and clipped to the last cell. In a cylindrical grid, an azimuth outside the bounds is
+    changed by 2 pi if it is then inside.
     """
     first, second = x, y
     if cells.cylindrical:
@@ -97,7 +97,7 @@ _ATAN = (
 )
 _TAN_PI_8 = math.tan(math.pi / 8)
 AZIMUTH_ERROR = 3e-10
-"""Greatest error of `fast_azimuth`, radians."""
+"""Maximum error of `fast_azimuth`, radians."""
 
 
 @fused
@@ -122,14 +122,14 @@ def fast_azimuth(x: float, y: float) -> float:
 
 
 def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return (N,) which of (N, 3) cells are different from those before them."""
+    """Return (N,) bool: whether each of (N, 3) cells is the first occurrence of this cell."""
     first = np.zeros(len(cells), np.bool_)
     first[numbered(cells)[0]] = True
     return first
 
 
 def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the (K,) different ones of (N,) keys, increasing, and the (N,) place of each key among them: `np.unique` without sorting all keys."""
+    """Return the (K,) sorted unique keys, and the (N,) index of each key among them. Like `np.unique`, without sorting all keys."""
     first, number = numbered(keys[:, None])
     order = np.argsort(keys[first])
     place = np.empty_like(order)
@@ -139,10 +139,10 @@ def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int
 
 @cached(error_model="python")
 def numbered(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number (N, K) cells in the order in which they occur, without sorting them.
+    """Number unique (N, K) cells in order of first occurrence, without sorting.
 
     Returns:
-        (C,) the first row of each different cell, and (N,) the number of the cell of each row.
+        (C,) first row of each unique cell, and (N,) number of the cell of each row.
     """
     size = 2
     while size < 2 * len(cells):
@@ -174,13 +174,13 @@ def numbered(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
 def count_points(
     points: NDArray[np.floating], grid_T_points: Transform, spec: GridSpec, counts: NDArray[np.int32] | None = None
 ) -> NDArray[np.int32]:
-    """Return the number of points in each voxel, (V,): those that `GridSpec.flat_index` finds, without an array for each step.
+    """Return the number of points per voxel, (V,). Same result as with `GridSpec.flat_index`, with less memory.
 
     Args:
         points: (N, 3) metres.
-        grid_T_points: (4, 4), from the frame of the points to the grid's.
+        grid_T_points: (4, 4), from the frame of the points to the frame of the grid.
         spec: geometry of the grid.
-        counts: (V,) numbers to which they are added; it is changed, and returned. None: zeros.
+        counts: (V,) existing counts, to which the points are added in place; None starts with zeros.
     """
     counts = np.zeros(spec.num_voxels, np.int32) if counts is None else counts
     _count(np.ascontiguousarray(points), as_pose(grid_T_points), Cells.of(spec), counts)

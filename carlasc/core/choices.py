@@ -1,4 +1,4 @@
-"""The words that options of the library and of its commands may have. Loads nothing, so that the help of a command need not wait."""
+"""The allowed values of options of the library and of its commands. Imports nothing heavy, so that the help of commands is fast."""
 
 from typing import Literal
 
@@ -15,13 +15,13 @@ VoteRule = Literal["sensor", "sample", "ray"]
 """How votes are counted."""
 
 Dynamic = Literal["align", "current", "drop", "tube"]
-"""What happens to moving points where scans are merged."""
+"""Treatment of moving points when scans are merged."""
 
 Complete = Literal["seen", "mirror", "body"]
-"""What happens to the parts of an actor that no scan saw."""
+"""Treatment of the parts of an actor that no scan saw."""
 
 Rays = Literal["all", "enough"]
-"""Which rays are followed where scans are merged."""
+"""Which rays are traced when scans are merged."""
 
 TrafficLevel = Literal["light", "medium", "heavy"]
 """Amount of simulated traffic."""
@@ -36,19 +36,19 @@ Voxels = Literal["known", "all"]
 """Which voxels are scored."""
 
 Around = Literal["present", "future"]
-"""Whose sensor the grids of forecasts are around: that of the frame that they are made in, or that of the frame that they predict."""
+"""The sensor pose around which forecast grids are centred: of the frame in which they are made, or of the frame that they predict."""
 
 Images = Literal["none", "link", "copy"]
-"""What a conversion does with the images of cameras."""
+"""Treatment of camera images in a conversion."""
 
 ViewName = Literal["perspective", "bev", "both"]
-"""Where the pictures of a scene are taken from."""
+"""Viewpoint of the pictures of a scene."""
 
 StyleName = Literal["screen", "paper"]
-"""What a picture is made for."""
+"""Purpose of a picture."""
 
 PaletteName = Literal["class", "colorblind", "height"]
 """The colours of classes, or colours by height."""
 
 GridColor = Literal["class", "confidence", "views", "votes", "inferred", "actor", "seen"]
-"""What the colours of a grid mean: its classes, one of the kinds of evidence (see `docs/format.md#evidence`), or who is in it."""
+"""Meaning of the colours of a grid: its classes, one kind of evidence (see `docs/format.md#evidence`), or its actors."""

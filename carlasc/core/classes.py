@@ -29,16 +29,16 @@ class ClassTable:
     Id 0 means unlabelled for points and free for voxels. It has no role.
 
     Attributes:
-        name: name of the table, as carlasc.json gives it.
-        names: id -> name.
-        colors: id -> RGB 0..255.
+        name: name of the table, as in carlasc.json.
+        names: names by id.
+        colors: RGB 0..255 by id.
         moving: ids of classes that contain only moving objects.
         movable: ids of classes of objects that can move.
-        deformable: ids of classes of objects that change their shape while they move, such as people.
+        deformable: ids of classes of objects that change shape while moving, such as people.
         ground: ids of classes of ground surfaces, such as roads, pavements, grass and water.
-        geometry_only: id that the points of a scan without labels get; None takes the largest id.
-        ground_only: id that the ground points of a scan without labels get; None takes the lowest id of `ground`.
-        num_channels: number of vote channels, which is greater than every id. It may be greater than necessary if the format requires it.
+        geometry_only: id for the points of scans without labels; None takes the largest id.
+        ground_only: id for the ground points of scans without labels; None takes the lowest id of `ground`.
+        num_channels: number of vote channels, greater than every id. It may be greater than necessary if the format requires it.
 
     Raises:
         ArgumentError: an id has no name or no colour, or a value has the wrong type or range.
@@ -62,7 +62,7 @@ class ClassTable:
         if set(self.names) != set(self.colors):
             without = sorted(set(self.names) ^ set(self.colors))
             raise ArgumentError(
-                where, expected="a name and a colour for each id", found=f"one of the two for {_listed(without)}"
+                where, expected="a name and a colour for each id", found=f"only one of them for {_listed(without)}"
             )
         for index, color in self.colors.items():
             if len(color) != 3 or not all(0 <= value <= 255 for value in color):
@@ -83,7 +83,7 @@ class ClassTable:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], where: str) -> Self:
-        """Return the table for values as `to_dict` returns them; `where` is the file named in errors.
+        """Return the table from the values of `to_dict`. `where` is the file named in errors.
 
         Raises:
             FormatError: a key is missing or unknown, or a value is not valid.
@@ -91,7 +91,7 @@ class ClassTable:
         known = [entry.name for entry in fields(cls)]
         if unknown := sorted(set(values) - set(known)):
             raise FormatError(
-                f"{where}: classes", expected=f"the keys {', '.join(known)}", found=", ".join(map(str, unknown))
+                f"{where}: classes", expected=f"only the keys {', '.join(known)}", found=", ".join(map(str, unknown))
             )
         try:
             return cls(
@@ -115,7 +115,7 @@ class ClassTable:
             ) from error
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the table as plain values for JSON, without the roles that no class has."""
+        """Return the table as plain values for JSON. Roles without classes are left out."""
         values: dict[str, Any] = {
             "name": self.name,
             "names": {str(index): name for index, name in self.names.items()},
@@ -134,12 +134,12 @@ class ClassTable:
 
     @property
     def geometry_id(self) -> int:
-        """The id that the points of a scan without labels get."""
+        """The id for the points of scans without labels."""
         return max(self.names) if self.geometry_only is None else self.geometry_only
 
     @property
     def ground_id(self) -> int | None:
-        """The id that the ground points of a scan without labels get; None if the table has no ground classes."""
+        """The id for the ground points of scans without labels; None if the table has no ground classes."""
         return min(self.ground, default=None) if self.ground_only is None else self.ground_only
 
     @property
@@ -156,7 +156,7 @@ class ClassTable:
         return palette
 
     def id_of(self, name: str) -> int:
-        """Return the id of a class by its name, ignoring upper and lower case.
+        """Return the id of a class by its name, case-insensitive.
 
         Raises:
             ArgumentError: no class has that name.
@@ -171,14 +171,14 @@ class ClassTable:
         )
 
     def check(self, labels: NDArray[np.integer], where: str) -> None:
-        """Raise a FormatError if an id, in labels of any shape, is negative or not below `num_channels`; `where` is the file named in the message."""
+        """Raise a FormatError if an id in `labels`, of any shape, is not in [0, `num_channels`). `where` is the file named in the message."""
         if labels.size and (int(labels.max()) >= self.num_channels or int(labels.min()) < 0):
             bad = int(labels.max()) if int(labels.max()) >= self.num_channels else int(labels.min())
             count = int(np.count_nonzero(labels == bad))
             raise FormatError(
                 where,
                 expected=f"class ids 0..{self.num_channels - 1} (table {self.name})",
-                found=f"{bad} on {count} of {labels.size}",
+                found=f"{bad} in {count} of {labels.size} labels",
             )
 
 
@@ -190,7 +190,7 @@ class Remap:
         name: name of the remap on the command line and in `Dataset`.
         source: class table of the input ids.
         target: class table of the output ids.
-        mapping: input id -> output id.
+        mapping: output id by input id.
     """
 
     name: str
@@ -210,7 +210,7 @@ class Remap:
 
     @cached_property
     def table(self) -> NDArray[np.int32]:
-        """Lookup table for 0..max id, -1 for ids that are not in the mapping."""
+        """(max id + 1,) int32 lookup table by input id; -1 for ids that are not in the mapping."""
         table = np.full(max(self.mapping) + 1, -1, np.int32)
         table[list(self.mapping)] = list(self.mapping.values())
         return table
@@ -221,7 +221,7 @@ class Remap:
         return np.where(self.table < 0, 0, self.table).astype(self.target.dtype)
 
     def unknown(self, labels: NDArray[np.integer]) -> dict[int, int]:
-        """Return the number of occurrences of each id, in labels of any shape, that is not in the mapping."""
+        """Return the ids in `labels`, of any shape, that are not in the mapping, with their number of occurrences."""
         ids, counts = np.unique(labels, return_counts=True)
         return {int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in self.mapping}
 
@@ -244,7 +244,7 @@ class Remap:
             where,
             expected=f"class ids of {self.source.name}",
             found=found,
-            advice=f"the remap {self.name} has no target for them",
+            advice=f"the remap {self.name} has no target for these ids: use another remap, or correct the labels",
         )
 
     @cached_property
@@ -255,12 +255,12 @@ class Remap:
 def class_weights(voxel_counts: NDArray[np.integer], remap: Remap | None = None) -> NDArray[np.float64]:
     """Return the loss weight of each class: `1 / ln(count + 0.001)`.
 
-    The formula is used for counts above 1,000 (it is negative for counts below 1). Classes with fewer voxels get the largest of the
+    The formula is used for counts above 1,000, because it is not valid for small counts. Classes with fewer voxels get the largest of the
     other weights, and classes without voxels get 0. See the format page, `docs/format.md#classes`.
 
     Args:
         voxel_counts: number of voxels of each class, by id of the source table of the remap.
-        remap: the counts are first summed over the classes of its target; None leaves them unchanged.
+        remap: remap of the counts: they are first summed per target class; None uses the counts unchanged.
 
     Returns:
         (K,) float64 weights, by id of the target.

@@ -1,8 +1,8 @@
-"""Loops that Numba compiles, once per machine: what is compiled is kept in one folder for all environments.
+"""Compiling loops with Numba once per machine, with one cache folder for all environments.
 
-Numba's own cache lies beside the source, so that each new environment compiles again, and looks at the time of one file, so that it misses changes in
-the other files whose functions are compiled into a loop. The cache here is found by what the code is: the text of every file that takes part,
-and the versions of Numba and NumPy. Of several processes that need the same function, one compiles it. Importing this module loads Numba.
+The cache of Numba is beside the source file, so each new environment compiles again. It checks the time of one file only, so it misses
+changes in other files whose functions are compiled into a loop. The key of this cache is the text of all these files, and the versions of
+Numba and NumPy. If several processes need the same function, one compiles it. Importing this module loads Numba.
 """
 
 from __future__ import annotations
@@ -32,12 +32,14 @@ from carlasc.core import first_use
 first_use.connect()
 
 jit = numba.njit(nogil=True, error_model="numpy")
-inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)  # a loop that calls others is not vectorised
-# Where margins cover the rounding, a product and a sum may become one operation.
+inlined = numba.njit(
+    nogil=True, error_model="numpy", forceinline=True
+)  # inlined, because a loop with function calls is not vectorised
+# Allows fused multiply-add. For code with margins that cover the different rounding.
 fused = numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})
 
-_KEPT_S = 90 * 86400  # how long what earlier versions of a function compiled is kept
-_WAITED_S = 60.0  # for another process that compiles the same function
+_KEPT_S = 90 * 86400  # how long compiled code of earlier versions of a function is kept
+_WAITED_S = 60.0  # longest wait for another process that compiles the same function
 
 
 @overload
@@ -49,12 +51,12 @@ def cached(*, error_model: str = ..., fastmath: bool = ...) -> Callable[[Callabl
 
 
 def cached(function: Any = None, /, *, error_model: str = "numpy", fastmath: bool = False) -> Any:
-    """Compile a function that Python calls, and keep what is compiled; the functions that it calls are compiled into it.
+    """Compile a function, including the compiled functions that it calls, and cache the compiled code.
 
     Args:
-        function: the function. None: the result is a decorator.
+        function: the function; None returns a decorator.
         error_model: "numpy", in which a division by zero is infinite, or "python", in which it raises ZeroDivisionError.
-        fastmath: whether sums may be taken in any order.
+        fastmath: whether sums may be reordered.
     """
     if function is None:
         return partial(_compile, error_model=error_model, fastmath=fastmath)
@@ -71,7 +73,7 @@ def _compile(function: FunctionType, **options: Any) -> Any:
 
 
 def cache_folder() -> Path:
-    """Return the folder of what is compiled: `NUMBA_CACHE_DIR`, or that of the user's caches (`XDG_CACHE_HOME`)."""
+    """Return the folder of compiled code: `NUMBA_CACHE_DIR`, or a folder in the cache folder of the user (`XDG_CACHE_HOME`)."""
     settings: Any = config  # without types
     usual = "~/Library/Caches" if sys.platform == "darwin" else os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     base = settings.CACHE_DIR or Path(usual, "carlasc")
@@ -80,7 +82,7 @@ def cache_folder() -> Path:
 
 
 def fingerprint(function: FunctionType) -> int:
-    """Return a number that changes with the files of a function and of the compiled functions that it calls, and with the constants that they use."""
+    """Return a hash of the files of a function and of the compiled functions that it calls, and of the constants that they use."""
     files, constants = set(), []
     for part in _parts(function, set()):
         files.add(getfile(part))
@@ -96,7 +98,7 @@ def _sum(file: str) -> str:
 
 
 def _parts(function: FunctionType, seen: set[FunctionType]) -> Iterator[FunctionType]:
-    """Yield a function and every compiled function that it calls, directly or through others."""
+    """Yield a function and every compiled function that it calls, directly or indirectly."""
     if function in seen:
         return
     seen.add(function)
@@ -107,7 +109,7 @@ def _parts(function: FunctionType, seen: set[FunctionType]) -> Iterator[Function
 
 
 def _names(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Yield the globals and the enclosed values that a function uses, with their names."""
+    """Yield the global and closure variables that a function uses, with their names."""
     code = function.__code__
     for name in code.co_names:
         if name in function.__globals__:
@@ -118,7 +120,7 @@ def _names(function: FunctionType) -> Iterator[tuple[str, Any]]:
 
 
 class _SourceLocator:
-    """Where a function is kept, and the name that tells its versions apart: what Numba asks of a locator."""
+    """The locator of Numba for a function: its cache folder, and a name for each of its versions."""
 
     def __init__(self, function: FunctionType, file: str) -> None:
         self._py_file = file  # for Numba's warnings
@@ -132,7 +134,7 @@ class _SourceLocator:
 
     def ensure_cache_path(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=self._folder).close()  # raises OSError where nothing can be written
+        TemporaryFile(dir=self._folder).close()  # raises OSError if the folder is not writable
 
     def get_cache_path(self) -> str:
         return str(self._folder)
@@ -149,7 +151,7 @@ class _CompiledFiles(CompileResultCacheImpl):
 
 
 class _SharedCache(FunctionCache):
-    """Keeps what is compiled of a function. Of the processes that need it at the same time, one compiles it and the others wait for that one."""
+    """The cache of a function. If several processes need it at the same time, one compiles it and the others wait."""
 
     _impl_class = _CompiledFiles
 
@@ -181,8 +183,8 @@ class _SharedCache(FunctionCache):
             self._release()
 
     def _acquire(self) -> None:
-        """Wait until no other process compiles the function, but not for ever: it may have been stopped, or its compiling has failed."""
-        self._release()  # what a compilation has left that was interrupted
+        """Wait until no other process compiles the function, up to a limit: the other process may be stopped, or may have failed."""
+        self._release()  # left by an interrupted compilation
         try:
             self._lock = self._lock_path.open("ab")
             until = time.monotonic() + _WAITED_S
@@ -191,7 +193,7 @@ class _SharedCache(FunctionCache):
                     fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     return
                 time.sleep(0.02)
-        except OSError:  # no locks, or no right to write: this process compiles by itself
+        except OSError:  # no locks, or no write permission: this process compiles itself
             self._release()
 
     def _release(self) -> None:

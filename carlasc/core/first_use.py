@@ -1,7 +1,7 @@
-"""Who is told that Numba compiles: on the first use on a machine, loops are compiled for seconds before anything is computed.
+"""Notification that Numba is compiling. On the first use on a machine, compiling loops takes several seconds.
 
-Importing this module loads nothing heavy, so that a program can ask before it knows whether anything will be compiled. `carlasc.core.compiling`,
-from which compiled loops take their decorators, connects what was asked for with Numba.
+Importing this module loads nothing heavy, so a program can request the notification before it imports Numba. `carlasc.core.compiling`
+connects the requests with Numba.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ if TYPE_CHECKING:
     from multiprocessing.synchronize import Semaphore
 
 _asked: list[CompilingNote] = []
-_wishes: list[tuple[Callable[[], None], float]] = []  # what workers are given
+_wishes: list[tuple[Callable[[], None], float]] = []  # passed on to worker processes
 
 
 class CompilingNote:
-    """Calls a function once, as soon as this process has spent a given time compiling. Loading compiled code from the cache does not count."""
+    """Calls a function once, after this process has compiled for a given time. Loading compiled code from the cache does not count."""
 
     def __init__(self, tell: Callable[[], None], after_s: float) -> None:
-        """Prepare the note.
+        """Create a note.
 
         Args:
-            tell: the function. It is called in another thread, while the compiler works.
-            after_s: time of compiling after which it is called, seconds.
+            tell: the function. It is called in another thread during the compilation.
+            after_s: compile time after which it is called, seconds.
         """
         self._tell, self._left_s, self._told = tell, after_s, False
         self._depth, self._started_s = 0, 0.0
         self._timer: Timer | None = None
 
     def start(self) -> None:
-        """Take note that the compiler starts. To compile a loop, it may start again for a loop that this one calls."""
+        """Record that the compiler starts. Calls may be nested, for a loop that another loop calls."""
         self._depth += 1
         if self._depth == 1 and not self._told:
             self._started_s = time.perf_counter()
@@ -43,7 +43,7 @@ class CompilingNote:
             self._timer.start()
 
     def end(self) -> None:
-        """Take note that the compiler ends."""
+        """Record that the compiler ends."""
         self._depth -= 1
         if self._depth == 0 and self._timer is not None:
             self._timer.cancel()
@@ -56,29 +56,29 @@ class CompilingNote:
 
 
 def note_compiling(tell: Callable[[], None], after_s: float = 1.0) -> None:
-    """Call a function once this process, or the first of the worker processes that it starts later, has compiled for some time.
+    """Call a function once, after this process, or one of the worker processes that it starts later, has compiled for some time.
 
     Args:
-        tell: the function; workers find it by its name in its module.
-        after_s: the time, seconds.
+        tell: the function. It must be picklable by name, for worker processes.
+        after_s: compile time after which it is called, seconds.
     """
     _wishes.append((tell, after_s))
     _asked.append(CompilingNote(tell, after_s))
 
 
 def say_compiling() -> None:
-    """Say on stderr that loops are compiled."""
+    """Print on stderr that loops are being compiled."""
     sys.stderr.write("compiling (once per machine) ...\n")
     sys.stderr.flush()
 
 
 def wishes() -> tuple[tuple[Callable[[], None], float], ...]:
-    """Return (function, time) of what `note_compiling` was asked in this process."""
+    """Return the (function, time) pairs given to `note_compiling` in this process."""
     return tuple(_wishes)
 
 
 def note_in_workers(wishes: tuple[tuple[Callable[[], None], float], ...], first: Semaphore) -> None:
-    """Do in a worker process what its parent was asked; `first` lets one worker tell and no other."""
+    """Repeat the requests of the parent in a worker process. `first` is a semaphore by which only one worker calls the function."""
     for tell, after_s in wishes:
 
         def once(tell: Callable[[], None] = tell) -> None:
@@ -89,7 +89,7 @@ def note_in_workers(wishes: tuple[tuple[Callable[[], None], float], ...], first:
 
 
 def connect() -> None:
-    """Connect the notes that were asked for with Numba, which the caller has loaded."""
+    """Connect the requested notes with Numba, which must be imported."""
     from numba.core import event
 
     class Compiling(event.Listener):

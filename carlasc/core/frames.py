@@ -1,4 +1,4 @@
-"""Which frames: a half-open range of frame numbers, or a list of them; and their times in seconds, told from counts of smaller units."""
+"""Selections of frames: a half-open range of frame numbers, or a list; and a check that times are in seconds."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from carlasc.errors import ArgumentError, FormatError
 
 @dataclass(frozen=True)
 class FrameRange:
-    """A half-open range of frame numbers, `start <= frame < stop`, or only some of the numbers in it.
+    """A half-open range of frame numbers, `start <= frame < stop`, or a selection of numbers in it.
 
     Attributes:
-        start: first frame; None leaves this end open.
-        stop: the frame after the last one; None leaves this end open.
-        only: the frames, where not all numbers from `start` to `stop` are chosen; None chooses all.
+        start: first frame; None for no lower bound.
+        stop: end of the range, exclusive; None for no upper bound.
+        only: the selected frames; None selects all numbers from `start` to `stop`.
 
     Raises:
-        ArgumentError: a bound that is not a whole number, or a range that holds no frame.
+        ArgumentError: a bound is not an integer, or the range is empty.
     """
 
     start: int | None = None
@@ -32,16 +32,16 @@ class FrameRange:
     def __post_init__(self) -> None:
         for bound in (self.start, self.stop, *(self.only or ())):
             if bound is not None and (isinstance(bound, bool) or not isinstance(bound, int | np.integer)):
-                raise ArgumentError("frames", expected="whole numbers or None", found=repr(bound))
+                raise ArgumentError("frames", expected="integers or None", found=repr(bound))
         if self.start is not None and self.stop is not None and self.start >= self.stop:
             raise ArgumentError("frames", expected="a range that holds a frame", found=str(self))
 
     @classmethod
     def of(cls, frames: Frames) -> FrameRange:
-        """Return what a `frames` argument means: see `Frames`.
+        """Return the range for a `frames` argument; see `Frames`.
 
         Raises:
-            ArgumentError: it is none of these.
+            ArgumentError: it has none of these forms.
         """
         match frames:
             case None:
@@ -65,7 +65,7 @@ class FrameRange:
         try:
             chosen = sorted({operator.index(frame) for frame in frames})
         except TypeError:
-            raise ArgumentError("frames", expected="a list of whole numbers", found=repr(frames)) from None
+            raise ArgumentError("frames", expected="a list of integers", found=repr(frames)) from None
         if not chosen:
             raise ArgumentError("frames", expected="a range that holds a frame", found=repr(frames))
         gapless = chosen[-1] - chosen[0] == len(chosen) - 1
@@ -76,7 +76,7 @@ class FrameRange:
         """Read "A:B", "A:", ":B", or one frame "A".
 
         Raises:
-            ArgumentError: it is no range.
+            ArgumentError: the text is not a range.
         """
         first, colon, last = text.partition(":")
         try:
@@ -92,7 +92,7 @@ class FrameRange:
         return inside and (self.only is None or frame in self.only)
 
     def select(self, frames: NDArray[Any]) -> NDArray[Any]:
-        """Return those of (N,) frame numbers that are in the range, in their order, as an array of shape (M,)."""
+        """Return the (M,) frame numbers out of (N,) that are in the range, in their order."""
         chosen = np.ones(len(frames), np.bool_)
         if self.start is not None:
             chosen &= frames >= self.start
@@ -109,17 +109,17 @@ class FrameRange:
 
 
 def compact(frames: NDArray[np.int64]) -> range | NDArray[np.int64]:
-    """Return rising frame numbers as a range if none is missing between them: that is pickled in a few bytes."""
+    """Return ascending frame numbers as a range if they are consecutive, because a range is pickled in a few bytes."""
     first, last = (int(frames[0]), int(frames[-1])) if len(frames) else (0, -1)
     return range(first, last + 1) if last - first == len(frames) - 1 else frames
 
 
 def expand(frames: range | NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the array of frame numbers that `compact` was given."""
+    """Return the array of frame numbers from the result of `compact`."""
     return np.arange(frames.start, frames.stop, dtype=np.int64) if isinstance(frames, range) else frames
 
 
-if TYPE_CHECKING:  # at run time it takes no parameters
+if TYPE_CHECKING:  # at run time it is not generic
     _Slice = slice[int | None, int | None, int | None]
 else:
     _Slice = slice
@@ -128,15 +128,15 @@ Frames = FrameRange | tuple[int | None, int | None] | _Slice | range | str | lis
 """What a `frames` argument takes: a range, a slice, "A:B", a list of frame numbers, a FrameRange, a tuple of its bounds, or None for all frames."""
 
 
-_LATEST_S = 1e11  # no clock in seconds says so; milliseconds since 1970 are more
+_LATEST_S = 1e11  # larger than any time in seconds; milliseconds since 1970 are larger
 
 
 def check_seconds(seconds: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Return times, (N,), after checking that they can be seconds: finite, and no count of milliseconds or nanoseconds since 1970.
+    """Check that (N,) times are finite and plausible as seconds, not milliseconds or nanoseconds since 1970, and return them.
 
     Args:
         seconds: the times.
-        where: what the error is about.
+        where: the file or field named in errors.
 
     Raises:
         FormatError: a time is not finite, or too large.

@@ -14,7 +14,7 @@ Floating = TypeVar("Floating", bound=np.floating[Any])
 Transform = NDArray[np.float64]
 """(4, 4) float64, last row 0 0 0 1."""
 
-_FARTHEST_M = 1e9  # no place on Earth is so far from the origin of any map
+_FARTHEST_M = 1e9  # larger than any distance on Earth
 
 
 def rotation_z(yaw_rad: float) -> Transform:
@@ -31,9 +31,9 @@ def translation(xyz: ArrayLike) -> Transform:
 
 
 def multiply(*matrices: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the product of (..., N, K) and (..., K, M) small matrices, from left to right, with the same bits on every processor.
+    """Return the product of (..., N, K) and (..., K, M) small matrices, from left to right, bit for bit equal on every CPU.
 
-    `@` calls BLAS, which adds in another order, and with other roundings, on other processors.
+    `@` calls BLAS, whose order of summation and rounding depend on the CPU.
     """
     product = np.asarray(matrices[0], np.float64)
     for matrix in matrices[1:]:
@@ -57,7 +57,7 @@ def transform_points(dst_T_src: Transform, points: NDArray[np.floating]) -> NDAr
 
 
 def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
-    """Return every N-th of the rows of an array, with the smallest N that leaves at most `most`."""
+    """Return every N-th row of an array, with the smallest N that gives at most `most` rows."""
     return points[:: max(1, -(-len(points) // most))]
 
 
@@ -82,7 +82,7 @@ def invert(dst_T_src: Transform) -> Transform:
 
 
 def rotations_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the (N, 3, 3) rotations of (N, 4) quaternions w, x, y, z, of any length but 0."""
+    """Return the (N, 3, 3) rotations of (N, 4) quaternions w, x, y, z of any non-zero length."""
     w, x, y, z = (np.asarray(quaternions, np.float64) / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -93,7 +93,7 @@ def rotations_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def poses_from(quaternions: NDArray[np.floating], translations: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the (N, 4, 4) transforms of (N, 4) quaternions w, x, y, z, of any length but 0, and (N, 3) translations."""
+    """Return (N, 4, 4) transforms from (N, 4) quaternions w, x, y, z of any non-zero length, and (N, 3) translations."""
     poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
     poses[:, :3, :3] = rotations_of(quaternions)
     poses[:, :3, 3] = translations
@@ -101,7 +101,7 @@ def poses_from(quaternions: NDArray[np.floating], translations: NDArray[np.float
 
 
 def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the (N, 4) unit quaternions w, x, y, z of (N, 3, 3) rotations; the first number that is not 0 is positive."""
+    """Return the (N, 4) unit quaternions w, x, y, z of (N, 3, 3) rotations. The first non-zero number is positive."""
     r = np.asarray(rotations, np.float64)
     xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
     wx, wy, wz = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
@@ -123,22 +123,22 @@ def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def small_motions(motions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 6) the translations and the rotation vectors of (N, 4, 4) motions that turn by a few degrees at most."""
+    """Return (N, 6) translations and rotation vectors of (N, 4, 4) motions. Valid for rotations of a few degrees at most."""
     m = motions
     turns = [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]]
     return np.concatenate([m[:, :3, 3], np.stack(turns, axis=1) / 2], axis=1)
 
 
 def slerp(poses: NDArray[np.float64], seconds: NDArray[np.floating], at: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Interpolate poses in time: positions linearly, rotations by slerp. Outside of the poses, the nearest motion goes on.
+    """Interpolate poses in time: positions linearly, rotations by slerp. Outside of the poses, the motion is extrapolated.
 
     Args:
         poses: (K, 4, 4) rigid transforms.
-        seconds: (K,) their times, increasing.
-        at: (...,) times.
+        seconds: (K,) times of the poses, increasing.
+        at: (...,) times of the result, seconds.
 
     Returns:
-        (..., 4, 4) transforms; the only one if there is one.
+        (..., 4, 4) transforms. With K = 1, all are equal to the one pose.
     """
     if len(poses) < 2:
         return np.broadcast_to(poses, (*np.shape(at), 4, 4)).copy()
@@ -164,7 +164,7 @@ def relative_to(first: Transform, poses: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def inverse_of(transform: Transform) -> Transform:
-    """Return the inverse of a (4, 4) transform that need not be quite rigid, with the same bits on every processor."""
+    """Return the inverse of a (4, 4) transform that may be slightly non-rigid, bit for bit equal on every CPU."""
     x, y, z = transform[:3, 0], transform[:3, 1], transform[:3, 2]
     rows = np.array([np.cross(y, z), np.cross(z, x), np.cross(x, y)])
     inverse = np.eye(4)
@@ -174,12 +174,12 @@ def inverse_of(transform: Transform) -> Transform:
 
 
 def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 1e-3) -> NDArray[np.float64]:
-    """Check that transforms are finite, rigid and proper, and that their positions can be places on Earth.
+    """Check that transforms are finite, rigid and proper, and that their positions are plausible.
 
     Args:
         transforms: (4, 4) or (F, 4, 4).
         name: name of the transforms in errors: a file or an argument.
-        tolerance: greatest deviation of `R @ R.T` from the identity, and of the last row from 0 0 0 1.
+        tolerance: maximum deviation of `R @ R.T` from the identity, and of the last row from 0 0 0 1.
 
     Returns:
         The same transforms as float64.
@@ -192,7 +192,7 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
         raise FormatError(name, expected="4 x 4 transforms", found=f"shape {poses.shape}")
     if _are_rigid(poses.reshape(-1, 4, 4), tolerance):
         return poses
-    for index, pose in enumerate(poses.reshape(-1, 4, 4)):  # one of them is not: find out which, and why
+    for index, pose in enumerate(poses.reshape(-1, 4, 4)):  # find the first one that is not valid, and the reason
         where = name if poses.ndim == 2 else f"{name}: transform {index}"
         if not np.isfinite(pose).all():
             raise FormatError(where, expected="finite numbers", found="NaN or infinity")
@@ -206,12 +206,15 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
             raise FormatError(
                 where,
                 expected="a rigid transform",
-                found=f"one off by {deviation:.3g}",
-                advice="it is scaled or sheared, or is not a pose",
+                found=f"a deviation of {deviation:.3g} from a rigid transform",
+                advice="the transform may be scaled or sheared, or may not be a pose",
             )
         if np.linalg.det(rotation) < 0:
             raise FormatError(
-                where, expected="a rotation", found="a reflection (determinant -1)", advice="the axes may be mirrored"
+                where,
+                expected="a rotation",
+                found="a reflection (determinant -1)",
+                advice="the axes may be mirrored: check their handedness",
             )
     return poses
 

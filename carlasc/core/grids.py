@@ -1,4 +1,4 @@
-"""Voxel grids: the geometry of their cells (GridSpec), the content of the cells (Grid), and how certain it is (VoxelFlag).
+"""Voxel grids: the geometry of cells (GridSpec), their content (Grid), and flags about it (VoxelFlag).
 
 Axes are x, y, z in a Cartesian grid and radius, azimuth = atan2(y, x), z in a cylindrical one; points are Cartesian in both.
 """
@@ -24,7 +24,7 @@ Triple = tuple[float, float, float]
 _PI32 = float(np.float32(np.pi))  # a little above pi: an azimuth of exactly pi is inside the published bounds
 _SIDE = float(np.float32(25.6))
 _PIXELS = 200  # width and height of a small picture
-_DARKEST = (0.3, 0.8)  # brightness of its lowest layer, of heights and of classes; the highest has 1
+_DARKEST = (0.3, 0.8)  # brightness of the lowest layer, for heights and for classes; the highest layer has 1
 _PROPORTION = 128 * 0.234375  # azimuth cells times radial cell of the published cylindrical grid
 
 
@@ -39,7 +39,7 @@ class GridSpec:
         upper: upper bound per axis.
 
     Raises:
-        ArgumentError: the sizes or bounds are not those of a grid.
+        ArgumentError: the sizes or bounds are not valid.
     """
 
     coordinates: Coordinates
@@ -62,7 +62,7 @@ class GridSpec:
                 "grid size",
                 expected="fewer than 2^31 cells",
                 found=" x ".join(map(str, self.size)),
-                advice="take a coarser resolution",
+                advice="use a coarser resolution",
             )
         if any(low >= up for low, up in zip(self.lower, self.upper, strict=True)):
             raise ArgumentError(
@@ -80,9 +80,9 @@ class GridSpec:
 
     @classmethod
     def published(cls, name: Preset | Coordinates = "coarse") -> GridSpec:
-        """Return a grid of the data set: "coarse", "fine" or "cylindrical"; see `docs/format.md#layout`.
+        """Return a grid of the published data set: "coarse", "fine" or "cylindrical"; see `docs/format.md#layout`.
 
-        "cartesian" gives the one that predictions are evaluated in, as "cylindrical" does: the coarse one.
+        The names of coordinates give the grid in which predictions are evaluated: "cartesian" is the coarse grid.
         """
         presets = {
             "coarse": cls("cartesian", (128, 128, 8), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
@@ -94,15 +94,15 @@ class GridSpec:
 
     @classmethod
     def from_params(cls, params: Mapping[str, Any], where: str = "params.json") -> GridSpec:
-        """Return the grid that the keys of a params.json describe, with unchanged numbers; `where` is the file named in errors.
+        """Return the grid from the keys of a params.json, with unchanged numbers. `where` is the file named in errors.
 
         Raises:
-            FormatError: a key is missing, or the values are not those of a grid.
+            FormatError: a key is missing, or a value is not valid.
         """
         try:
             size = [float(v) for v in params["grid_size"]]
             if any(v != int(v) for v in size):
-                raise FormatError(where, expected="whole numbers in grid_size", found=str(size))
+                raise FormatError(where, expected="integers in grid_size", found=str(size))
             lower, upper = tuple(params["min_bound"]), tuple(params["max_bound"])
             return cls(
                 params["coordinates"],
@@ -187,9 +187,9 @@ class GridSpec:
 
     @property
     def voxel_size(self) -> NDArray[np.float64]:
-        """(3,) size of a cell per axis: the float32 difference of the bounds over the size; see `docs/format.md#cells`.
+        """(3,) size of a cell per axis: the float32 difference of the bounds divided by the size; see `docs/format.md#cells`.
 
-        Bounds that are not float32 numbers keep their exact difference.
+        If the bounds are not float32 numbers, their exact difference is used.
         """
         lower, upper = np.array(self.lower), np.array(self.upper)
         rounded = (upper.astype(np.float32) - lower.astype(np.float32)).astype(np.float64)
@@ -227,10 +227,10 @@ class GridSpec:
         return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
     def index(self, axes: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-        """Return the cells of points that are given on the axes of the grid: half-open, floor, clip; see `docs/format.md#cells`.
+        """Return the cells of points on the axes of the grid: half-open, floor, clip; see `docs/format.md#cells`.
 
         Args:
-            axes: (N, 3) as `to_axes` returns.
+            axes: (N, 3) result of `to_axes`.
 
         Returns:
             (N, 3) int32 cells, clamped to the grid, and (N,) bool: whether the point is inside. NaN is outside.
@@ -241,7 +241,7 @@ class GridSpec:
         return np.clip(cells, 0, np.array(self.size) - 1).astype(np.int32), inside
 
     def flat_index(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Return the C-order index of the voxel of each Cartesian point (N, 3), -1 for points outside: `to_axes`, `index`, ravel."""
+        """Return (N,) C-order voxel indices of (N, 3) Cartesian points, -1 outside. The steps are `to_axes`, `index`, ravel."""
         cells, inside = self.index(self.to_axes(points))
         return np.where(inside, np.ravel_multi_index(tuple(cells.T), self.size), -1)
 
@@ -253,7 +253,7 @@ class GridSpec:
         Args:
             labels: (X, Y, Z) class ids, 0 is free.
             palette: (K, 3) RGB by class id; None draws heights in grey.
-            left_handed: False for data whose y points to the left: it points to the left of the picture.
+            left_handed: False for data with y to the left; y then points to the left of the picture.
         """
         occupied, layers = labels > 0, self.size[2]
         top = layers - 1 - np.argmax(occupied[:, :, ::-1], axis=2)
@@ -279,7 +279,7 @@ class GridSpec:
         return self.lower[axis] + np.arange(self.size[axis] + 1) * self.voxel_size[axis]
 
     def centers(self) -> NDArray[np.float64]:
-        """Return the (X, Y, Z, 3) centres of the cells, on the grid's axes."""
+        """Return the (X, Y, Z, 3) centres of the cells, on the axes of the grid."""
         lines = [self.lower[a] + (np.arange(self.size[a]) + 0.5) * self.voxel_size[a] for a in range(3)]
         return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
 
@@ -319,7 +319,7 @@ class Grid:
         return f"<Grid {self.spec}: {occupied:,} occupied and {free:,} free voxels>"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the geometry, and the heights of the occupied voxels from above."""
+        """Return the HTML for notebooks: the geometry, and the heights of the occupied voxels from above."""
         spec = self.spec
         rows = {"bounds": f"{spec.lower} to {spec.upper}", "classes": np.unique(self.labels[self.labels > 0]).tolist()}
         return describe(repr(self), rows, spec.seen_from_above(self.labels))
@@ -338,14 +338,14 @@ def _cells(width: float, step: float) -> int:
 def most_frequent(
     cells: NDArray[np.integer], labels: NDArray[np.integer]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the label that occurs most often in each cell, the lowest of several.
+    """Return the most frequent label in each cell; for a tie, the lowest of them.
 
     Args:
-        cells: (N,) numbers of cells, not negative; times the number of labels they must be below 2**63.
-        labels: (N,) labels, not negative.
+        cells: (N,) cell numbers of 0 or more. The largest one times the number of labels must be below 2**63.
+        labels: (N,) labels of 0 or more.
 
     Returns:
-        (C,) the cells that occur, increasing, and (C,) their labels.
+        (C,) unique cells, increasing, and (C,) their labels.
     """
     channels = int(labels.max(initial=0)) + 1
     pairs, counts = np.unique(cells.astype(np.int64) * channels + labels, return_counts=True)
@@ -361,9 +361,9 @@ class VoxelFlag(IntFlag):
     `(flags & VoxelFlag.INFERRED) != 0` is true for inferred voxels.
 
     Attributes:
-        INFERRED: no scan saw the voxel; it was completed from what was seen of the same object.
+        INFERRED: no scan saw the voxel; it was completed from other parts of the same object.
         CONTESTED: traffic passes through the voxel at other times of the window.
-        SEEN_NOW: the frame's own scan saw the voxel.
+        SEEN_NOW: the scan of the frame itself saw the voxel.
         IN_ACTOR: the voxel is in the body of an actor.
     """
 
@@ -374,12 +374,12 @@ class VoxelFlag(IntFlag):
 
 
 def is_confident(occupied: NDArray[np.floating], min_confidence: float) -> NDArray[np.bool_]:
-    """Return which voxels are free or occupied with at least some probability.
+    """Return which voxels are free or occupied with a minimum probability.
 
     Args:
-        occupied: probability that each voxel is occupied, of any shape. It is compared as float16, as in the file, so that a grid
-            and its file give the same result.
-        min_confidence: least value of max(p, 1 - p); 0 to 0.5 accepts every voxel.
+        occupied: probability that each voxel is occupied, of any shape. It is compared as float16, as in the file, so that a grid and
+            its file give the same result.
+        min_confidence: minimum of max(p, 1 - p); 0 to 0.5 accepts every voxel.
 
     Returns:
         bool array of the same shape; False where the probability is NaN.

@@ -1,4 +1,4 @@
-"""How objects show themselves: in words, in notebooks as a table with a small picture, and as tables of pandas."""
+"""Display of objects: HTML tables with a small picture for notebooks, and pandas tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def describe(title: str, rows: Mapping[str, object], picture: NDArray[np.uint8] | None = None) -> str:
-    """Return HTML: a title, a table, and a picture, (H, W, 3) RGB, where there is one."""
+    """Return HTML with a title, a table, and an optional picture, (H, W, 3) uint8 RGB."""
     lines = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>{html.escape(str(value))}</td></tr>"
         for name, value in rows.items()
@@ -29,7 +29,7 @@ def describe(title: str, rows: Mapping[str, object], picture: NDArray[np.uint8] 
 
 
 def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> pandas.DataFrame:
-    """Return rows as a table of pandas, which is no dependency: whoever asks for such a table has it.
+    """Return rows as a pandas DataFrame. pandas is not a dependency of carlasc.
 
     Args:
         rows: the values of each row by column.
@@ -47,7 +47,7 @@ def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> pandas.DataF
 
 
 def _png(rgb: NDArray[np.uint8]) -> str:
-    """Return an (H, W, 3) picture as a PNG file in base64: Pillow is an extra, and a picture this small needs no filter."""
+    """Return an (H, W, 3) picture as a PNG file in base64, without Pillow, which is optional."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

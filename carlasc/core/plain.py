@@ -1,4 +1,4 @@
-"""Values from JSON, checked by the types of a dataclass: what is read is what code may rely on."""
+"""Conversion of JSON values to types and dataclasses, with checks."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import Any
 
 
 def from_plain(value: Any, kind: Any, name: str = "the value") -> Any:
-    """Return a value of JSON as a type: lists become tuples, and objects become mappings or dataclasses.
+    """Convert a JSON value to a type. Lists become tuples, and objects become mappings or dataclasses.
 
     Args:
         value: the value.
         kind: int, float, str, bool, None, Any, a union of types, `tuple[...]`, `Mapping[str, ...]`, a dataclass or a TypedDict. Keys
-            that a dataclass lacks are left out.
-        name: what it is called in errors.
+            that a dataclass lacks are ignored.
+        name: name of the value in errors.
 
     Raises:
-        ValueError: it has another type, lacks a key, or is a number that is not finite, or that has more than 64 bits.
+        ValueError: the value has another type, lacks a key, or is a number that is not finite or has more than 64 bits.
     """
     origin, parts = typing.get_origin(kind) or kind, typing.get_args(kind)
     if kind is Any:
@@ -48,7 +48,7 @@ def from_plain(value: Any, kind: Any, name: str = "the value") -> Any:
 
 
 def _as_one_of(value: Any, kinds: tuple[Any, ...], name: str) -> Any:
-    """Return a value as the first type that it has; the error is that of the first type that is not None."""
+    """Convert a value to the first type that fits. If none fits, raise the error of the first type that is not None."""
     first: ValueError | None = None
     for kind in kinds:
         try:
@@ -59,7 +59,7 @@ def _as_one_of(value: Any, kinds: tuple[Any, ...], name: str) -> Any:
 
 
 def _as_record(value: Any, kind: Any, name: str) -> Any:
-    """Return an object as a dataclass, or as a mapping with the keys of a TypedDict."""
+    """Convert an object to a dataclass, or to a mapping with the keys of a TypedDict."""
     if not isinstance(value, dict):
         raise ValueError(f"{type(value).__name__} in {name}")
     hints = typing.get_type_hints(kind)

@@ -1,4 +1,4 @@
-"""A LiDAR scan: the labels, flow and other values of its points, and the boxes around its objects."""
+"""LiDAR scans: points with labels, flow and other values, and boxes; and the rays of a scan."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from carlasc.core.grids import GridSpec
 from carlasc.core.notebook import describe
 from carlasc.errors import FormatError, count
 
-_TURN = 65_000  # steps of azimuth, of 0.1 mrad: they fit 16 bits
+_TURN = 65_000  # steps of azimuth per turn, of about 0.1 mrad; they fit into 16 bits
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Scan:
         instances: (N,) uint32 actor ids, 0 is none; or None.
         remission: (N,) float32, the 4th column of the file (zero in CarlaSC); or None.
         others: other fields of the layout with one row per point, by name.
-        boxes: tracked boxes of the frame, sensor frame, none if nothing was there; or None where the frame was not annotated.
+        boxes: tracked boxes of the frame, sensor frame; may be empty; or None if the frame is not annotated.
 
     Raises:
         FormatError: the shapes of the arrays do not match.
@@ -60,7 +60,7 @@ class Scan:
         return len(self.points)
 
     def fields(self) -> tuple[str, ...]:
-        """Return the names of what the scan has for each point, without `points`."""
+        """Return the names of the fields with one row per point, without `points`."""
         own = (name for name in ("labels", "flow", "instances", "remission") if getattr(self, name) is not None)
         return (*own, *self.others)
 
@@ -69,7 +69,7 @@ class Scan:
         return f"<Scan of {count(len(self), 'point')}: {', '.join(self.fields()) or 'no other field'}{boxes}>"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the fields, and the heights of the points from above."""
+        """Return the HTML for notebooks: the fields, and the heights of the points from above."""
         reach = float(np.percentile(np.abs(self.points[:, :2]), 99)) if len(self) else 1.0
         low, high = np.percentile(self.points[:, 2], (1, 99)).tolist() if len(self) else (0.0, 1.0)
         spec = GridSpec("cartesian", (200, 200, 32), (-reach, -reach, low), (reach, reach, max(high, low + 0.1)))
@@ -80,7 +80,7 @@ class Scan:
         return describe(repr(self), rows, spec.seen_from_above(labels.reshape(spec.size)))
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
-        """Return the points that a mask of shape (N,) or indices of shape (M,) select, with all of their fields; boxes are kept."""
+        """Return a scan with the points selected by an (N,) mask or (M,) indices, with all their fields. Boxes are kept."""
 
         def chosen(values: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if values is None else values[keep]
@@ -97,17 +97,17 @@ class Scan:
 
 
 def sorted_by_origin(origins: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the order, (N,), in which points with equal (N, 3) origins are next to each other; the order of equal ones is kept."""
+    """Return (N,) indices that sort points by their (N, 3) origins. The sort is stable."""
     starts = _starts(origins)
     group = np.unique(origins[starts], axis=0, return_inverse=True)[1].reshape(-1)
     return np.argsort(np.repeat(group, np.diff([*starts, len(origins)])), kind="stable")
 
 
 def runs_of_origins(origins: NDArray[np.floating] | None, count: int) -> list[tuple[slice, NDArray[np.floating]]]:
-    """Return the runs of points with equal (N, 3) origins, and the (3,) origin of each.
+    """Return the runs of consecutive points with equal origins, and the (3,) origin of each run.
 
     Args:
-        origins: metres; None if the rays of all points begin at (0, 0, 0).
+        origins: (N, 3) metres; None if all rays begin at (0, 0, 0).
         count: number of points.
     """
     if origins is None or not count:
@@ -118,21 +118,21 @@ def runs_of_origins(origins: NDArray[np.floating] | None, count: int) -> list[tu
 
 def _starts(origins: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return where each run of equal rows begins."""
-    x, y, z = (axis[1:] != axis[:-1] for axis in origins.T)  # column by column: five times as fast as by rows
+    x, y, z = (axis[1:] != axis[:-1] for axis in origins.T)  # five times as fast column by column as row by row
     changes = x | y | z
     return np.concatenate([np.zeros(min(len(origins), 1), np.int64), np.flatnonzero(changes) + 1])
 
 
 @dataclass(frozen=True)
 class RaysFromPlace:
-    """Those rays of a scan that began at one place.
+    """The rays of a scan with one common origin.
 
     Attributes:
-        part: the points of the scan to which they go.
-        sensor_T_place: (4, 4), from the place where they began, in the axes of the sensor, to the sensor's frame.
-        points: (M, 3) float32, the same points seen from there, metres.
+        part: slice of the points of the scan at which these rays end.
+        sensor_T_place: (4, 4), from the frame at the ray origin, with the axes of the sensor, to the sensor frame.
+        points: (M, 3) float32, these points relative to the ray origin, metres.
         order: (M,) int32, indices of `points` by increasing azimuth.
-        azimuth: (M,) uint16, their azimuths in this order, in steps of which `_TURN` are a full circle, from -pi.
+        azimuth: (M,) uint16, sorted azimuths from -pi, in steps; a full circle has `_TURN` steps.
     """
 
     part: slice
@@ -143,16 +143,16 @@ class RaysFromPlace:
 
     @classmethod
     def of(cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]) -> RaysFromPlace:
-        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan, which are given as seen from there."""
+        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan, given relative to the origin."""
         own = points[part]
         azimuth = _steps(np.arctan2(own[:, 1], own[:, 0])).astype(np.uint16)
-        order = np.argsort(azimuth, kind="stable").astype(np.int32)  # of 16 bits: by their digits
+        order = np.argsort(azimuth, kind="stable").astype(np.int32)  # a radix sort, because they have 16 bits
         return cls(part, translation(origin), own, order, azimuth[order])
 
     def through(
         self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.int32]:
-        """Return the indices of the points whose rays, from where they began to the point, intersect a box.
+        """Return the indices of the points whose rays, from the origin to the point, intersect a box.
 
         Args:
             box_T_sensor: (4, 4), from the frame of `points` to the frame in which the box is axis-aligned.
@@ -164,7 +164,7 @@ class RaysFromPlace:
         rays = transform_points(box_T_sensor, self.points[candidates]) - origin
         with np.errstate(divide="ignore", invalid="ignore"):
             one, other = (lower - origin) / rays, (upper - origin) / rays
-        # A ray that lies in a face gives 0/0 there: fmin and fmax ignore the NaN.
+        # A ray in the plane of a face gives 0/0: fmin and fmax ignore the NaN.
         enter = np.fmin(one, other).max(axis=1)
         leave = np.fmax(one, other).min(axis=1)
         return candidates[(enter <= leave) & (leave >= 0) & (enter <= 1)]
@@ -192,24 +192,24 @@ class RaysFromPlace:
 
 
 def _steps(azimuth_rad: Any) -> Any:
-    """Return azimuths in steps, counted from -pi, not rounded."""
+    """Return azimuths in steps from -pi, not rounded."""
     return (azimuth_rad + np.pi) * (_TURN / (2 * np.pi))
 
 
 def lengths(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the (N,) lengths of (N, 3) vectors, in their type."""
+    """Return the (N,) lengths of (N, 3) vectors, in the same dtype."""
     x, y, z = vectors.T
     return np.sqrt(x * x + y * y + z * z)
 
 
 def finite(points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return (N,) which of (N, 3) points have three finite coordinates."""
+    """Return (N,) bool: whether each of (N, 3) points has three finite coordinates."""
     x, y, z = (np.isfinite(axis) for axis in points.T)
     return x & y & z
 
 
 def check_finite(points: NDArray[np.floating], name: str) -> None:
-    """Raise a FormatError that names the first point that is NaN or infinite; `name` is the file."""
+    """Raise a FormatError for the first of (N, 3) points that is NaN or infinite. `name` is the file named in the message."""
     if not np.isfinite(points).all():
         row = int(np.flatnonzero(~np.isfinite(points).reshape(len(points), -1).all(axis=1))[0])
         raise FormatError(name, expected="finite coordinates", found=f"{points[row].tolist()} at point {row}")

@@ -46,7 +46,7 @@ CARLA = ClassTable(
     ground=frozenset({6, 7, 8, 14, 15, 16, 21, 22}),
     geometry_only=3,  # Other
     ground_only=14,  # Ground
-    num_channels=25,  # as every published params.json says, although 23 classes exist
+    num_channels=25,  # as in every published params.json, although only 23 classes exist
 )
 CARLASC11 = ClassTable(
     "carlasc11",
@@ -124,7 +124,7 @@ SEMANTICKITTI19 = ClassTable(
 
 
 def _ranges(table: str) -> dict[int, int]:
-    """Return the mapping that a text such as "1->7 14..19->10 12,13->4" describes."""
+    """Return the mapping for a text such as "1->7 14..19->10 12,13->4"."""
     mapping: dict[int, int] = {}
     for entry in table.split():
         left, right = entry.split("->")
@@ -236,11 +236,11 @@ def table_from_json(value: object, where: str) -> ClassTable:
     """Return the class table that a JSON file names or contains.
 
     Args:
-        value: the name of a table in `TABLES`, or what `ClassTable.to_dict` returns.
+        value: the name of a table in `TABLES`, or the result of `ClassTable.to_dict`.
         where: the file, for errors.
 
     Raises:
-        FormatError: no table has this name, the values are not those of a table, or a table in `TABLES` has the same name and other values.
+        FormatError: no table has this name, the values are not valid, or a table in `TABLES` has the same name and other values.
     """
     if not isinstance(value, Mapping):
         try:
@@ -253,14 +253,14 @@ def table_from_json(value: object, where: str) -> ClassTable:
         raise FormatError(
             f"{where}: classes",
             expected=f"a name that is not in use, or the table {table.name} of carlasc",
-            found=f"another table called {table.name}",
-            advice="give the table a name of its own",
+            found=f"a different table with the name {table.name}",
+            advice="give the table a new name",
         )
     return table if known is None else known
 
 
 def table_to_json(table: ClassTable) -> str | dict[str, Any]:
-    """Return what a JSON file contains for a class table: its name if it is in `TABLES`, otherwise the whole table."""
+    """Return a class table for JSON: its name if it is in `TABLES`, otherwise the whole table."""
     return table.name if TABLES.get(table.name) == table else table.to_dict()
 
 
@@ -275,17 +275,17 @@ def remap_named(name: str) -> Remap:
 
 
 def benchmark_remap(classes: ClassTable) -> Remap | None:
-    """Return the remap to the classes that are usually trained and scored on: carlasc11, semantickitti19, or None for other tables."""
+    """Return the remap to the classes that are usually used for training and scores: carlasc11, semantickitti19, or None for other tables."""
     return next(
         (r for r in REMAPS.values() if r.source == classes and r.name in ("carlasc11", "semantickitti19")), None
     )
 
 
 def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
-    """Return the remaps to apply, in order, to convert ids of one table to another: none, one, or two by way of the table CARLA.
+    """Return the remaps that convert ids of one table to another, in order: none, one, or two with the table CARLA in between.
 
     Raises:
-        ArgumentError: there are no such remaps.
+        ArgumentError: no such remaps exist.
     """
 
     def direct(one: ClassTable, other: ClassTable) -> Remap | None:
@@ -307,7 +307,7 @@ def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
 def to_table(
     labels: NDArray[np.unsignedinteger], source: ClassTable, target: ClassTable, where: str
 ) -> NDArray[np.unsignedinteger]:
-    """Return labels of one table as ids of another.
+    """Convert labels of one table to ids of another.
 
     Args:
         labels: ids of `source`, any shape.

@@ -1,4 +1,4 @@
-"""`Dataset`: samples for training, from any Source."""
+"""`Dataset`: training samples from any Source."""
 
 import lazy_loader
 

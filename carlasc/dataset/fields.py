@@ -1,4 +1,4 @@
-"""The fields of a sample: their names, their types, and how they become those of a batch."""
+"""The fields of a sample: names, types, and collation to a batch."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ FIELDS = (
     "remission",
     "poses",
 )
-"""Fields that samples of published data may have."""
+"""Fields that are available with published data."""
 EVIDENCE_FIELDS = ("posterior", "occupied", "flags", "views")
-"""Fields of grids that say how certain each voxel is, which published grids do not."""
+"""Fields of grids about the certainty of each voxel. Published grids do not have them."""
 ACTOR_FIELDS = ("instances", "voxel_flow")
-"""Fields of grids that say who is in each voxel, and how fast it moves."""
+"""Fields of grids about the actor and the velocity of each voxel."""
 CAMERA_FIELDS = ("camera_visible", "images", "cameras")
 """Fields of data with cameras."""
 ALWAYS = ("valid", "sequence", "frame")
@@ -37,7 +37,7 @@ RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of
 
 
 class Sample(TypedDict, total=False):
-    """What `Dataset` gives: the fields that were asked for, and `valid`, `sequence` and `frame`. Shapes and units: see `Dataset`."""
+    """A sample of a `Dataset`: the requested fields, and `valid`, `sequence` and `frame`. For shapes and units, see `Dataset`."""
 
     occupancy: NDArray[np.uint8]
     density: NDArray[np.uint16]
@@ -65,13 +65,13 @@ class Sample(TypedDict, total=False):
 
 
 Values = dict[str, Any]
-"""Some fields of a sample, by names that are known at run time only."""
+"""Some fields of a sample, with names that are known at run time only."""
 
 
 def collate(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
-    """Return a batch of samples that may hold fields with one row per point. Give it to a DataLoader as `collate_fn`.
+    """Return a batch of samples, also with fields that have one row per point. Use it as the `collate_fn` of a DataLoader.
 
-    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, and `cameras` a list, one per sample. All other fields are stacked as torch's
+    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, and `cameras` a list, one per sample. All other fields are stacked as by torch's
     default_collate does.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The fields of a sample that come from labels and grids: mapped class ids, which voxels are known, and how certain they are."""
+"""The fields of a sample from labels and grids: mapped class ids, known voxels, and their certainty."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from carlasc.storage import Sequence, layout
 from carlasc.storage.field_files import dense_velocity
 
 RemapLike = str | Remap | Mapping[int, int] | ArrayLike | None
-"""What a `remap` argument takes: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids, "auto"; None keeps the ids."""
+"""Type of `remap` arguments: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids, "auto"; None keeps the ids."""
 
 _GREY = (128, 128, 128)
 
 
 class LabelMap:
-    """Maps the labels of one class table to those that samples hold.
+    """Maps the labels of one class table to the labels of samples.
 
     Attributes:
-        name: name of the remap; "none" if ids are kept.
-        source: class table of the labels that are read.
+        name: name of the remap; "none" if ids are unchanged.
+        source: class table of the input labels.
         target: class table of the labels in samples.
     """
 
     def __init__(self, remap: RemapLike, classes: ClassTable) -> None:
-        """Prepare the lookup table; `classes` is the table of the data."""
+        """Create the lookup table. `classes` is the class table of the data."""
         if isinstance(remap, str) and remap == "auto":
             remap = benchmark_remap(classes)
         self._remap = None if remap is None else _as_remap(remap, classes)
@@ -43,16 +43,16 @@ class LabelMap:
         self._table = self._remap.table if self._remap else np.arange(classes.num_channels, dtype=np.int32)
 
     def __call__(self, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.unsignedinteger]:
-        """Return the labels of any shape in the dtype of the target table.
+        """Map labels of any shape to the target table, in its dtype.
 
         Raises:
-            FormatError: an id is not in the source table; `where` names the labels.
+            FormatError: an id is not in the source table. `where` is the file named in the message.
         """
         from carlasc.dataset.stacking import look_up
 
         found = look_up(labels, self._table, self.target.dtype)
         if found is None and self._remap is not None:
-            return self._remap(labels, where)  # raises, naming the id
+            return self._remap(labels, where)  # raises an error with the id
         if found is None:
             self.source.check(labels, where)
             raise FormatError(where, expected=f"class ids of {self.source.name}")
@@ -72,7 +72,7 @@ def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: Class
             raise ArgumentError("remap", expected="a name, a mapping or a table of ids", found=type(remap).__name__)
         mapping = dict(enumerate(table.tolist()))
     if not mapping or min(mapping.values()) < 0:
-        raise ArgumentError("remap", expected="ids of 0 or more", found="a negative one" if mapping else "none")
+        raise ArgumentError("remap", expected="ids of 0 or more", found="a negative id" if mapping else "no ids")
     ids = sorted(set(mapping.values()))
     target = ClassTable("custom", {i: f"class {i}" for i in ids}, dict.fromkeys(ids, _GREY))
     return Remap("custom", classes, target, mapping)
@@ -103,15 +103,15 @@ _PLAIN: dict[str, type[np.generic]] = {
 
 @dataclass(frozen=True)
 class GridFields:
-    """Which fields of a sample come from a grid, and which of its voxels are known.
+    """The fields of a sample that come from a grid, and the rule for known voxels.
 
     Attributes:
-        fields: names of fields; those that do not come from a grid are ignored.
-        inferred: whether voxels that no scan saw, but that were completed, are known.
-        min_confidence: voxels that are neither free nor occupied with at least this probability are not known.
+        fields: names of fields. Fields that do not come from a grid are ignored.
+        inferred: whether completed voxels, which no scan saw, count as known.
+        min_confidence: minimum probability of known voxels: a voxel is known if it is free or occupied with at least this probability.
 
     Raises:
-        ArgumentError: a confidence outside of 0 <= c < 1.
+        ArgumentError: `min_confidence` is not in 0 <= c < 1.
     """
 
     fields: frozenset[str]
@@ -124,20 +124,20 @@ class GridFields:
             raise ArgumentError("min_confidence", expected="a probability from 0 to below 1", found=found)
 
     def parts(self, grids: Sequence, grid: str) -> set[str]:
-        """Return the names of the grid's fields that a frame must have."""
+        """Return the names of the required fields of the grid."""
         parts = {part for field in self.fields & OF_GRID for part in _PARTS[field]}
         if self._needs_known:
             parts |= set() if self.inferred else {"flags"}
             parts |= {"occupied"} if self.min_confidence else set()
         if "counts" in parts and "counts" not in self.fields and not len(grids.frames(f"{grid}/counts")):
-            parts = parts - {"counts"} | {"labels"}  # every voxel is known, in all frames that have labels
+            parts = parts - {"counts"} | {"labels"}  # all voxels are known in all frames with labels
         return parts
 
     def read(self, grids: Sequence, grid: str, frame: int, label_map: LabelMap) -> Values:
         """Read the fields of a frame.
 
         Raises:
-            FormatError: a file does not hold what it must; names the file.
+            FormatError: the content of a file is not valid; the message names the file.
         """
 
         def read(part: str) -> NDArray[Any]:
@@ -180,19 +180,19 @@ def soft_labels(
 ) -> NDArray[np.float32]:
     """Return the probability of each class in each voxel.
 
-    With the probability p of a voxel and that of a class c if the voxel is occupied, the voxel is free (class 0) with probability
-    1 - p, and occupied by c with p * c. Classes that the map takes to the same id are added up. If the classes of a voxel do not add
-    up to 1, its soft labels do not either: nothing is known of the rest.
+    If a voxel is occupied with probability p, and by a class with probability c given that it is occupied, the soft labels are 1 - p for
+    free (class 0) and p * c for the class. Classes that map to the same id are added up. If the class probabilities of a voxel do not sum
+    to 1, neither do its soft labels.
 
     Args:
         occupied: (X, Y, Z), the field `<grid>/occupied`.
         classes: (M,), the field `<grid>/classes`.
-        known: (X, Y, Z), voxels that are known; the others get zeros.
+        known: (X, Y, Z) bool; other voxels get zeros.
         label_map: maps the class ids of the grid.
         where: the field, for errors.
 
     Returns:
-        (K, X, Y, Z) float32, where K is the largest id of the map's target plus 1.
+        (K, X, Y, Z) float32, where K is the largest id of the target table plus 1.
 
     Raises:
         FormatError: a voxel is not in the grid, or a class id is not in the map.

@@ -1,4 +1,4 @@
-"""The fields of a sample that come from cameras: images, and the cameras that took them."""
+"""The fields of a sample from cameras: images and camera models."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ OF_CAMERAS = frozenset({"images", "cameras"})
 
 
 def frames_with_images(scans: Sequence, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return those of some frames of which every camera of a sequence has an image.
+    """Return the frames for which every camera of a sequence has an image.
 
     Raises:
-        MissingDataError: there are no cameras, or no such frame.
+        MissingDataError: the sequence has no cameras, or no frame has all images.
     """
     cameras = cameras_of(scans)
     kept = [all(has_image(scans, camera, frame) for camera in cameras.values()) for frame in frames.tolist()]
     if not cameras or not any(kept):
-        found = "no frame that has it" if cameras else f"no {layout.CAMERAS}"
+        found = "no frame with all images" if cameras else f"no {layout.CAMERAS}"
         advice = "convert with --images copy or link"
         raise MissingDataError(scans.location, expected="an image of each camera", found=found, advice=advice)
     return frames[kept]
 
 
 def stored_images(scans: Sequence) -> dict[tuple[Sequence, str], None]:
-    """Return the fields of the images that lie in a sequence, as its frames are chosen by."""
+    """Return the image fields of a sequence that are stored in it, as keys for `common_frames`."""
     return {(scans, field): None for field in image_fields(scans).values()}
 
 
 def read_cameras(scans: Sequence, frame: int) -> Values:
-    """Return the images of a frame and the cameras that took them, each where it was then, by name.
+    """Return the images of a frame, and the camera models with their poses at the time of the images, both by camera name.
 
     Raises:
         FormatError: an image is damaged, or does not fit its camera.
@@ -57,11 +57,11 @@ def read_cameras(scans: Sequence, frame: int) -> Values:
 
 @dataclass(frozen=True)
 class ResizeImages:
-    """Gives the images of samples another size, and their cameras the matrices that fit it: a `transform` of a Dataset.
+    """Resizes the images of samples, and scales the camera matrices. It is a `transform` of a Dataset.
 
     Attributes:
-        width: columns.
-        height: rows.
+        width: number of columns, pixels.
+        height: number of rows, pixels.
 
     Raises:
         ArgumentError: a size below 1.
@@ -75,7 +75,7 @@ class ResizeImages:
             raise ArgumentError("width", expected="1 or more pixels", found=f"{self.width} x {self.height}")
 
     def __call__(self, sample: Sample) -> Sample:
-        """Return the sample with images of this size. The input is not changed.
+        """Return the sample with resized images. The input is not changed.
 
         Raises:
             DependencyError: Pillow is not installed.
@@ -84,7 +84,7 @@ class ResizeImages:
         picture = import_extra("PIL.Image", "render")
         if "images" in made:
             images: Mapping[str, NDArray[np.uint8]] = made["images"]
-            shrunk = picture.Resampling.BILINEAR  # Pillow averages over all pixels that become one
+            shrunk = picture.Resampling.BILINEAR  # when shrinking, Pillow averages over all source pixels
             made["images"] = {
                 name: np.array(picture.fromarray(one).resize(size, shrunk)) for name, one in images.items()
             }

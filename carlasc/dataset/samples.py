@@ -1,7 +1,7 @@
 """`Dataset`: the frames of any Source as training samples, which are dicts of NumPy arrays.
 
-It is a map-style data set for torch's DataLoader, and does not import torch. A sample is one frame: the grid to predict, and
-the last `history` scans, moved into the frame's own sensor frame and binned. See the format page, `docs/format.md#training-samples`.
+It is a map-style data set for the DataLoader of torch, and does not import torch. A sample is one frame: the grid to predict, and the
+last `history` scans, moved to the sensor frame of the frame and binned. See the format page, `docs/format.md#training-samples`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _STACKS = frozenset({"occupancy", "density", "visibility"})
 # field of a sample -> field of the scan
 _OF_SCAN = {"points": "points", "point_labels": "labels", "flow": "flow", "remission": "points"}
 
-if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; torch is not imported at run time
+if TYPE_CHECKING:  # for type checkers it is a torch Dataset; torch is not imported at run time
     from torch.utils.data import Dataset as TorchDataset
 
     _MapStyle = TorchDataset[Sample]
@@ -52,25 +52,25 @@ else:
 class Dataset(_MapStyle):
     """Frames of one or more sequences as training samples.
 
-    A sample is a dict with the `fields` that were asked for. T is `history`, and (X, Y, Z) is the size of the grid:
+    A sample is a dict with the requested `fields`. T is `history`, and (X, Y, Z) is the size of the grid:
 
-        occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the frame's own scan last
+        occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the scan of the frame last
         density       (T, X, Y, Z) uint16, number of points per voxel
-        visibility    (T, X, Y, Z) uint8, 2 where a scan has a point, 1 where only its rays passed, 0 where it saw nothing
+        visibility    (T, X, Y, Z) uint8, 2 where a scan has a point, 1 where only its rays passed, 0 elsewhere
         labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and also unknown
-        known         (X, Y, Z) bool, voxels that have a vote: leave the others out of losses and metrics
+        known         (X, Y, Z) bool, voxels with a vote: ignore all other voxels in losses and metrics
         counts        (X, Y, Z) float32, number of votes per voxel
         posterior     (K, X, Y, Z) float32, soft labels: probability of each class, 0 for free; zeros where not known. K is the
                       largest id of `classes` plus 1
-        occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where nothing is known
+        occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where it is unknown
         flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`
         views         (X, Y, Z) uint16, number of scans that saw the voxel
         instances     (X, Y, Z) int64, number of the actor that the voxel belongs to, 0 for none; the same in all frames of a sequence
-        voxel_flow    (X, Y, Z, 3) float32 m/s, velocity of what is in the voxel, sensor frame; zero where nothing moves
+        voxel_flow    (X, Y, Z, 3) float32 m/s, velocity of the actor in the voxel, sensor frame; zero where nothing moves
         camera_visible (X, Y, Z) uint8, bit i: the i-th camera of cameras.json sees the voxel; see `carlasc.Voting(keep_seen=True)`
-        images        {camera: (H, W, 3) uint8}, RGB; `carlasc.dataset.ResizeImages` gives them another size
-        cameras       {camera: `carlasc.core.CameraModel`}, where they were when they took these images
-        points        (N, 3) float32 metres, the frame's sensor frame; all points of the scan
+        images        {camera: (H, W, 3) uint8}, RGB; `carlasc.dataset.ResizeImages` resizes them
+        cameras       {camera: `carlasc.core.CameraModel`}, with their poses at the times of these images
+        points        (N, 3) float32 metres, sensor frame of the frame; all points of the scan
         point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
         flow          (N, 3) float32 m/s, velocity of each point, sensor frame
         remission     (N,) float32, fourth column of the scan: remission in KITTI, zero in CarlaSC
@@ -79,17 +79,17 @@ class Dataset(_MapStyle):
         sequence      str, name of the sequence; in every sample
         frame         int, number of the frame; in every sample
 
-    The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are empty, and their `valid` is
-    False. Frames that lack a field that was asked for are left out. Only grids made with `carlasc.Voting(keep_evidence=True)` have
-    `posterior`, `occupied`, `flags` and `views`, only those made with `keep_actors=True` `instances` and `voxel_flow`. Points nearer than `min_range_m` or farther than `max_range_m`
-    of carlasc.json are in no grid. Arrays are in the sequences' own axes: right-handed data are not mirrored, and are not mixed
-    with left-handed data.
+    The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are empty, and their `valid` is False.
+    Frames that lack a requested field are left out. `posterior`, `occupied`, `flags` and `views` need grids made with
+    `carlasc.Voting(keep_evidence=True)`; `instances` and `voxel_flow` need grids made with `keep_actors=True`. Points outside the range
+    `min_range_m` to `max_range_m` of carlasc.json are left out. Arrays have the axes of the sequences: right-handed data are not mirrored,
+    and cannot be mixed with left-handed data.
 
     Attributes:
-        sequences: the sequences in use, in order. A sample's `sequence` is the name of one of them.
+        sequences: the sequences in use, in order. `sequence` of a sample is the name of one of them.
         axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
         classes: table of the class ids in samples, after the remap.
-        transform: called with each sample; returns the sample to use. It may be set later (see `carlasc.Flip`).
+        transform: called with each sample; returns the sample to use. It can be set later (see `carlasc.Flip`).
     """
 
     def __init__(
@@ -108,31 +108,31 @@ class Dataset(_MapStyle):
         min_confidence: float = 0.0,
         transform: Callable[[Sample], Mapping[str, object]] | None = None,
     ) -> None:
-        """Find the frames. No scan and no grid is read.
+        """Find the frames. No scans or grids are read.
 
         Args:
             source: anything that `carlasc.open` takes, or a Source.
-            split: "train", "val" or "test" in any case, the name of a sequence, or a list of such names; None takes all sequences.
-            history: T, number of scans in a stack, the frame's own scan included.
+            split: "train", "val" or "test" (case-insensitive), the name of a sequence, or a list of names; None takes all sequences.
+            history: T, number of scans in a stack, including the scan of the frame.
             coordinates: coordinates of the grids: "cartesian" or "cylindrical"; ignored if `grid` is a GridSpec. Scans, poses and
-                times are read from the sequence's folder of that name if it has scans, else from `cartesian/`.
-            grid: name of the grid (its folder), whose params.json gives the geometry. Or a GridSpec: `labels`, `known` and
-                `counts` are then read from the grid with this geometry; without these fields no such grid need exist.
-            grids_source: where grids are read from, if not from `source`, as for eval_fine.zip and eval_cylindrical.zip. Its
-                sequences are matched to those of `source` by split and name.
-            fields: the fields of a sample, any of those above.
-            remap: how `labels` and `point_labels` are mapped: "auto" to the classes that are usually trained on (carlasc11, or
-                semantickitti19; other tables keep their ids), a name in `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a table
-                of new ids by old id; None keeps the ids of the data.
-            align: move past scans into the frame's sensor frame by their poses; False stacks them without moving them.
-            inferred: False leaves voxels that no scan saw, but that were completed, out of `known` and `posterior`.
-            min_confidence: leaves voxels that are neither free nor occupied with at least this probability out of `known` and
-                `posterior`; 0 to 0.5 keeps all.
+                times are read from the folder of that name if it has scans, otherwise from `cartesian/`.
+            grid: name of the grid (its folder); its params.json has the geometry. Or a GridSpec: `labels`, `known` and `counts` are then
+                read from the grid with this geometry; without these fields, the grid need not exist.
+            grids_source: a separate source of grids, such as eval_fine.zip and eval_cylindrical.zip. Its sequences are matched to those of
+                `source` by split and name. None reads grids from `source`.
+            fields: the fields of a sample, from the list above.
+            remap: mapping of `labels` and `point_labels`: "auto" to the usual training classes (carlasc11 or semantickitti19; other tables
+                keep their ids), a name in `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a table of new ids by old id; None keeps
+                the ids of the data.
+            align: move past scans to the sensor frame of the frame by their poses; False stacks them unmoved.
+            inferred: False excludes completed voxels, which no scan saw, from `known` and `posterior`.
+            min_confidence: minimum probability: voxels that are neither free nor occupied with at least this probability are excluded from
+                `known` and `posterior`; 0 to 0.5 keeps all.
             transform: called with each sample.
 
         Raises:
-            ArgumentError: an argument has a wrong value, or the remap is for other classes.
-            MissingDataError: a split or sequence does not exist, or a sequence lacks a field that was asked for.
+            ArgumentError: an argument is not valid, or the remap is for another class table.
+            MissingDataError: a split or sequence does not exist, or a sequence lacks a requested field.
             FormatError: sequences differ in grid, axes or class table, or poses.txt does not fit the scans.
         """
         self.fields = _check_fields(fields)
@@ -160,7 +160,7 @@ class Dataset(_MapStyle):
         self._starts = np.cumsum([0, *(len(part.frames) for part in self._parts)])
         if not len(self):
             raise MissingDataError(
-                opened.location, expected=f"frames with {', '.join(self.fields)}", found="none that has all of them"
+                opened.location, expected=f"frames with {', '.join(self.fields)}", found="no frame with all of them"
             )
 
         self.sequences = tuple(part.scans for part in self._parts)
@@ -175,11 +175,11 @@ class Dataset(_MapStyle):
         """Geometry of the grids.
 
         Raises:
-            ArgumentError: no field that was asked for needs a grid.
+            ArgumentError: no requested field needs a grid.
         """
         if self._spec is None:
             raise ArgumentError(
-                "fields", expected="one that needs a grid, such as occupancy", found=", ".join(self.fields)
+                "fields", expected="a field that needs a grid, such as occupancy", found=", ".join(self.fields)
             )
         return self._spec
 
@@ -191,12 +191,12 @@ class Dataset(_MapStyle):
     @overload
     def __getitem__(self, index: slice) -> Self: ...
     def __getitem__(self, index: SupportsIndex | slice) -> Sample | Self:
-        """Return one sample; a negative index counts from the end. A slice gives a Dataset of these samples.
+        """Return one sample. A negative index counts from the end. A slice returns a Dataset of these samples.
 
         Raises:
-            IndexError: the index is beyond the end.
-            ArgumentError: a slice with a step below 0: samples are in the order of their frames.
-            FormatError: a file does not hold what it must; names the file.
+            IndexError: the index is out of range.
+            ArgumentError: the step of a slice is negative: samples are always in the order of frames.
+            FormatError: the content of a file is not valid; the message names the file.
         """
         if isinstance(index, slice):
             return self._part_of(index)
@@ -219,11 +219,11 @@ class Dataset(_MapStyle):
             sample |= read_cameras(part.scans, frame)
         sample["valid"] = np.array([number is not None for number in past])
         sample |= {"sequence": part.scans.name, "frame": frame}
-        made = cast(Sample, {name: sample[name] for name in (*self.fields, *ALWAYS)})
-        return made if self.transform is None else cast(Sample, self.transform(made))
+        requested = cast(Sample, {name: sample[name] for name in (*self.fields, *ALWAYS)})
+        return requested if self.transform is None else cast(Sample, self.transform(requested))
 
     def _part_of(self, chosen: slice) -> Self:
-        """Return the data set of some of the samples."""
+        """Return a Dataset of a slice of the samples."""
         if chosen.step is not None and chosen.step < 0:
             raise ArgumentError("index", expected="a slice with a step of 1 or more", found=str(chosen.step))
         part, places = copy.copy(self), np.arange(len(self))[chosen]
@@ -237,16 +237,16 @@ class Dataset(_MapStyle):
 
     @property
     def frames(self) -> tuple[NDArray[np.int64], ...]:
-        """Numbers of the frames of each of `sequences`, arrays of shape (N,): samples are in this order."""
+        """(N,) frame numbers of each of `sequences`. Samples are in this order."""
         return tuple(part.frames for part in self._parts)
 
     @property
     def is_cached(self) -> bool:
-        """Whether some of the data are remote, and were opened with a cache."""
+        """Whether at least a part of the data is remote and was opened with a cache."""
         return any(isinstance(sequence.tree, CachedTree) for part in self._parts for sequence, _ in part.fields)
 
     def cached_files(self, indices: Iterable[int]) -> list[tuple[CachedTree, str]]:
-        """Return the files that samples are read from, each once, where they are read through a cache."""
+        """Return the files of samples that are read through a cache, each once."""
         frames: dict[SequenceFrames, list[int]] = {}
         for index in indices:
             part, frame = self._frame_at(index)
@@ -260,10 +260,10 @@ class Dataset(_MapStyle):
         return list(files)
 
     def index_of(self, sequence: str, frame: int) -> int:
-        """Return the index of the sample of a sequence's frame.
+        """Return the index of the sample of a frame of a sequence.
 
         Raises:
-            MissingDataError: no sample is of this frame.
+            MissingDataError: the frame is not a sample.
         """
         for part, start in zip(self._parts, self._starts, strict=False):
             if part.scans.name == sequence and frame in part.frames:
@@ -276,7 +276,7 @@ class Dataset(_MapStyle):
         return f"<Dataset of {count(len(self), 'frame')} in {count(len(self._parts), 'sequence')}: {', '.join(self.fields)}>"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: what the samples hold, and the first one from above."""
+        """Return the HTML for notebooks: the fields of samples, and the first sample from above."""
         rows = {
             "fields": ", ".join(self.fields),
             "history": self.history,
@@ -290,7 +290,7 @@ class Dataset(_MapStyle):
         return describe(repr(self), rows, picture)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the decoded scans: each process keeps its own."""
+        """Leave out the cached scans. Each process has its own cache."""
         return {name: value for name, value in self.__dict__.items() if name != "_recent"}
 
     @cached_property
@@ -334,7 +334,7 @@ class Dataset(_MapStyle):
                 "remap",
                 expected=f"a remap of {where}'s class table {found.name}",
                 found=f"{label_map.name}, which maps {label_map.source.name}",
-                advice="give another `remap`, or None to keep the ids",
+                advice="use another `remap`, or None to keep the ids",
             )
         return label_map
 
@@ -357,7 +357,7 @@ class Dataset(_MapStyle):
 
             try:
                 stacks["visibility"] = stack_visibility(scans, moves, spec, *ranges)
-            except FormatError as error:  # of poses.txt
+            except FormatError as error:  # from poses.txt
                 raise error.within(part.scans.location) from error
         if "occupancy" in self.fields:
             stacks["occupancy"] = (
@@ -382,7 +382,7 @@ class Dataset(_MapStyle):
         lengths = {name: len(array) for name, array in sample.items()}
         if len(set(lengths.values())) > 1:
             found = ", ".join(f"{length} {name}" for name, length in lengths.items())
-            raise FormatError(f"{part.scans.location}: frame {frame}", expected="the same number of each", found=found)
+            raise FormatError(f"{part.scans.location}: frame {frame}", expected="one value per point", found=found)
         return sample
 
 

@@ -1,7 +1,7 @@
-"""The order in which training reads a data set: shards in random order, and frames at random within a window of shards.
+"""The order of samples in training: shards in random order, and frames shuffled within a window of shards.
 
-Frames that are stored together are read at about the same time, so that files of an object store are fetched once, ahead of their use:
-threads fetch those of the next samples into the cache of a remote store, while earlier samples are trained on.
+Frames that are stored together are read at about the same time, so that each file of an object store is fetched once. Threads fetch the
+files of the next samples into the cache of a remote store during training.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from carlasc.dataset.samples import Dataset
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.storage.transport.caching import CachedTree
 
-_STORED_TOGETHER = 16  # frames of a file in packed zarr stores
-_READ_AGAIN = 4  # a shard is at least so many times as long as what is read before it for the histories
+_STORED_TOGETHER = 16  # frames per file of packed zarr stores
+_READ_AGAIN = 4  # minimum length of a shard, relative to the additional frames that are read for histories
 
-if TYPE_CHECKING:  # type checkers see that torch's DataLoader takes it; torch is not imported at run time
+if TYPE_CHECKING:  # for type checkers it is a torch Sampler; torch is not imported at run time
     from torch.utils.data import Sampler as TorchSampler
 
     _Sampler = TorchSampler[int]
@@ -35,17 +35,18 @@ else:
 
 
 class ShardSampler(_Sampler):
-    """Gives the indices of a Dataset's samples in random order, as the `sampler` of a torch DataLoader.
+    """Yields the indices of the samples of a Dataset in random order, as the `sampler` of a torch DataLoader.
 
-    A shard is a run of consecutive frames of one sequence. Shards are put in random order, and each frame moves to a random place among
-    those of the next `window` shards, so that frames of at most `window` shards are mixed at any time. The order depends only on the
-    data, the seed and the epoch, and on `shard` and `window`: not on the number of processes, and not on that of a loader's workers.
-    Process r of n takes every n-th sample, beginning with the r-th: with batches of B / n samples in each process, step s uses the same B
-    samples whatever n is. If n does not divide the number of samples, the first of them are given twice, so that all processes make
-    equally many steps (as torch's DistributedSampler does).
+    A shard is a run of consecutive frames of one sequence. Shards are shuffled, and each frame moves to a random position within the next
+    `window` shards, so that frames of at most `window` shards are mixed at any time. The order depends only on the data, the seed, the
+    epoch, `shard` and `window`, not on the number of processes or of workers of a loader.
 
-    If the data are opened with a cache (`carlasc.open(url, cache=folder)`), a thread fetches the files of the next shards into it while
-    an epoch is iterated. It ends with the iteration.
+    Process r of n takes every n-th sample, beginning with the r-th: with batches of B / n samples per process, step s uses the same B
+    samples for every n. If n does not divide the number of samples, the first samples are repeated, so that all processes make the same
+    number of steps (as with the DistributedSampler of torch).
+
+    If the data are opened with a cache (`carlasc.open(url, cache=folder)`), threads fetch the files of the next shards into it during an
+    epoch. They end with the iteration.
 
         dataset = Dataset(carlasc.open("s3://bucket/carlasc.zarr", cache="/scratch/cache"), "train", history=16)
         sampler = ShardSampler(dataset, seed=0)
@@ -56,8 +57,8 @@ class ShardSampler(_Sampler):
 
     Attributes:
         seed: seed of the order.
-        epoch: the epoch that is iterated now or next.
-        shard: number of frames of a shard.
+        epoch: the current or next epoch.
+        shard: number of frames per shard.
         window: number of shards whose frames are mixed.
         rank: number of this process.
         world: number of processes.
@@ -74,20 +75,20 @@ class ShardSampler(_Sampler):
         world: int = 1,
         read_ahead: int = 2,
     ) -> None:
-        """Number the shards. Nothing is read.
+        """Number the shards. No data are read.
 
         Args:
-            dataset: the samples. A sampler of a part of them is made by a Dataset of this part.
-            seed: 0 or more.
-            shard: number of frames of a shard, a multiple of 16 where files of a store hold 16 frames. None takes 16 if samples have
-                one scan; else 64 or more, because each shard also needs the frames before it for the histories of its first samples.
-            window: number of shards whose frames are mixed: more mix better, and need a larger cache.
+            dataset: the samples. To sample a part of them, give a Dataset of this part.
+            seed: seed of the order, 0 or more.
+            shard: number of frames per shard, a multiple of 16 if files of a store have 16 frames. None takes 16 for samples with one
+                scan, otherwise 64 or more, because each shard also needs earlier frames for the histories of its first samples.
+            window: number of shards whose frames are mixed. A larger window mixes better, and needs a larger cache.
             rank: number of this process, from 0.
             world: number of processes that train together.
-            read_ahead: number of shards that are fetched before their first sample is drawn; 0 fetches none.
+            read_ahead: number of shards that are fetched in advance; 0 turns this off.
 
         Raises:
-            ArgumentError: an argument has a wrong value.
+            ArgumentError: an argument is not valid.
         """
         least = {"seed": 0, "shard": 1, "window": 1, "rank": 0, "world": 1, "read_ahead": 0}
         given = {"seed": seed, "shard": shard, "window": window, "rank": rank, "world": world, "read_ahead": read_ahead}
@@ -106,16 +107,16 @@ class ShardSampler(_Sampler):
         self.world = world
         self.read_ahead = read_ahead
         self._shards = _number_shards(dataset, self.shard)
-        self._next = 0  # the sample that the next iteration begins with
-        self._begun = 0  # that which the current one began with
-        self._drawn = 0  # samples drawn so far, by all processes
+        self._next = 0  # first position of the next iteration
+        self._begun = 0  # first position of the current iteration
+        self._drawn = 0  # number of samples drawn so far by all processes
 
     def __len__(self) -> int:
-        """Return the number of samples that this process takes of a whole epoch."""
+        """Return the number of samples per epoch of this process."""
         return math.ceil(len(self._shards) / self.world)
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch that is iterated next. After `load_state_dict`, its epoch goes on where it was left."""
+        """Set the next epoch. For the epoch of `load_state_dict`, the iteration continues at its position."""
         if epoch != self.epoch:
             self._next = self._begun = self._drawn = 0
         self.epoch = epoch
@@ -127,12 +128,10 @@ class ShardSampler(_Sampler):
         return np.argsort(place[self._shards] + self.window * drawn.random(len(self._shards)), kind="stable")
 
     def __iter__(self) -> Iterator[int]:
-        """Iterate over an epoch, or over what is left of it after `load_state_dict`."""
+        """Iterate over an epoch, or over the rest of it after `load_state_dict`."""
         epoch, start = self.epoch, self._next
         self._next = self._begun = self._drawn = 0
-        if start == len(
-            self._shards
-        ):  # the state of a finished epoch was loaded: nothing is left, and the next one follows
+        if start == len(self._shards):  # the state of a finished epoch was loaded: continue with the next epoch
             self.epoch += 1
         else:
             self._begun = self._drawn = start
@@ -149,32 +148,32 @@ class ShardSampler(_Sampler):
                 yield index
 
     def state_dict(self, trained: int | None = None) -> dict[str, int]:
-        """Return the position in the epoch, to be loaded by a sampler of the same data in any number of processes.
+        """Return the position in the epoch. A sampler of the same data can load it, with any number of processes.
 
-        A DataLoader with workers draws samples before they are trained on. Say how many were trained on:
+        A DataLoader with workers draws samples in advance. Pass the number of samples that were trained on:
 
             for step, batch in enumerate(loader):
                 ...
                 torch.save({"sampler": sampler.state_dict(trained=(step + 1) * batch_size), ...}, path)
 
         Args:
-            trained: number of samples that were trained on since the iteration began, by all processes together. None takes all that
-                were drawn, as torchdata's StatefulDataLoader needs it, which counts by itself.
+            trained: number of samples that were trained on since the start of the iteration, summed over all processes. None takes all
+                drawn samples, for the StatefulDataLoader of torchdata, which counts itself.
         """
         position = self._drawn if trained is None else min(self._begun + trained, len(self._shards))
         return {"seed": self.seed, "epoch": self.epoch, "position": position} | self._about()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue at a position: the next iteration gives what is left of its epoch, and those after it give whole epochs.
+        """Continue at a position. The next iteration yields the rest of its epoch, later iterations whole epochs.
 
         Raises:
-            ArgumentError: the state is not one of a sampler of the same data with the same `shard` and `window`.
+            ArgumentError: the state is from a sampler of other data, or with another `shard` or `window`.
         """
         different = [name for name, value in self._about().items() if state.get(name) != value]
         if different or not 0 <= state.get("position", -1) <= len(self._shards):
             raise ArgumentError(
                 "state",
-                expected=f"that of a ShardSampler with {self._about()}",
+                expected=f"the state of a ShardSampler with {self._about()}",
                 found=str({name: state.get(name) for name in different or ("position",)}),
                 advice="the data and the arguments `shard` and `window` must be the same",
             )
@@ -182,7 +181,7 @@ class ShardSampler(_Sampler):
         self._next = self._begun = self._drawn = int(state["position"])
 
     def _about(self) -> dict[str, int]:
-        """Return what the order depends on besides the seed and the epoch."""
+        """Return the values on which the order depends, except the seed and the epoch."""
         places = zip(self.dataset.sequences, self.dataset.frames, strict=True)
         digest = 0
         for sequence, frames in places:
@@ -191,7 +190,7 @@ class ShardSampler(_Sampler):
 
 
 def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:
-    """Return the number of each sample's shard; all numbers up to the largest exist."""
+    """Return (N,) the shard number of each sample. Numbers are consecutive from 0."""
     numbers: list[NDArray[np.int64]] = []
     first = 0
     for frames in dataset.frames:
@@ -202,32 +201,31 @@ def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:
     return np.concatenate(numbers)
 
 
-_THREADS = 3  # files that are fetched side by side, each in several ranges
+_THREADS = 3  # files that are fetched in parallel, each in several ranges
 
 
 class ReadAhead:
     """Threads that fetch the files of shards, in the order of their first samples, inside a `with` block.
 
-    They start with the first sample that is drawn: a loader forks its workers before that. Data that were opened without a cache need
-    no thread.
+    They start when the first sample is drawn, after a loader has forked its workers. Without a cache, no thread is started.
     """
 
-    # Held by the class: where a program ends in the middle of an iteration, the names of this module may be gone.
+    # Class attributes, because at interpreter exit the globals of this module may be deleted during an iteration.
     _clock = staticmethod(time.monotonic)
     _this_thread = staticmethod(threading.current_thread)
-    _stop_s = 5.0  # how long the end waits for files being fetched: a server that is lost is asked for minutes
+    _stop_s = 5.0  # longest wait for running fetches at the end: requests to a lost server are repeated for minutes
 
     def __init__(
         self, dataset: Dataset, order: NDArray[np.int64], shards: NDArray[np.int64], start: int, count: int
     ) -> None:
-        """Find which shards are needed, and from when.
+        """Compute the order in which shards are needed.
 
         Args:
             dataset: the samples.
             order: (N,) indices of the samples in the order in which they are drawn.
             shards: (N,) number of the shard of each sample, by the sample's index.
-            start: the position in `order` that is drawn first.
-            count: number of shards that are fetched before their first sample is drawn.
+            start: first position in `order`.
+            count: number of shards that are fetched in advance.
         """
         self._dataset = dataset
         self._shards = shards
@@ -247,7 +245,7 @@ class ReadAhead:
             self._next_shards, self._firsts = deque(), np.empty(0, np.int64)
 
     def draw(self, position: int) -> None:
-        """Say how many samples of the order were drawn."""
+        """Record the position in the order that was drawn last."""
         if not len(self._firsts):
             return
         with self._changed:
@@ -271,7 +269,7 @@ class ReadAhead:
             self._changed.notify_all()
         end = self._clock() + self._stop_s
         for thread in self._threads:
-            if thread is not self._this_thread():  # a thread that collects garbage may close an iterator
+            if thread is not self._this_thread():  # the garbage collector may close an iterator in any thread
                 thread.join(max(0.0, end - self._clock()))
 
     def _run(self) -> None:
@@ -282,7 +280,7 @@ class ReadAhead:
                     return
                 file = self._waiting.popleft() if self._waiting else None
                 shard = self._next_shards.popleft() if file is None else -1
-            with suppress(CarlascError):  # whoever needs the file meets the error again, and reports it
+            with suppress(CarlascError):  # the reader of the file gets the same error, and reports it
                 if file is not None:
                     tree, path = file
                     tree.fetch(path, wait=False)
@@ -293,7 +291,7 @@ class ReadAhead:
                     self._changed.notify_all()
 
     def _may_begin_shard(self) -> bool:
-        """Whether the next shard is among the first `count` ones whose samples are not drawn yet."""
+        """Whether the next shard is among the first `count` shards without drawn samples."""
         begun = len(self._firsts) - len(self._next_shards)
         open_shards = int(np.searchsorted(self._firsts, self._drawn, "right"))
         return bool(self._next_shards) and begun < open_shards + self._count

@@ -1,4 +1,4 @@
-"""The sequences and frames of a Dataset: the sequences of a split, their grids, the frames that have all fields, and the scans read last."""
+"""The sequences and frames of a Dataset: sequences of a split, their grids, frames with all fields, and a cache of recent scans."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from carlasc.storage.protocol import Sequence, Source
 
 _T = TypeVar("_T")
 
-_ADVICE = "leave the sequence out with `split`, a list of names, or do not ask for the field"
-_ADVICE_KEEP = "regrid with `voting=Voting(keep_{}=True)`, or do not ask for the field"
-_RIGID = 1e-2  # how far the determinant of a pose's rotation may be from 1
+_ADVICE = "leave the sequence out with `split`, a list of names, or remove the field from `fields`"
+_ADVICE_KEEP = "regrid with `voting=Voting(keep_{}=True)`, or remove the field from `fields`"
+_RIGID = 1e-2  # maximum deviation of the determinant of a rotation from 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +30,12 @@ class SequenceFrames:
     """One sequence of a Dataset.
 
     Attributes:
-        scans: where scans, poses and metadata are read from.
-        grids: where grids are read from: the same sequence, its other `<coordinates>` folder, or a sequence of another source.
+        scans: sequence from which scans, poses and metadata are read.
+        grids: sequence from which grids are read: the same sequence, its other `<coordinates>` folder, or a sequence of another source;
             None if no grid is needed.
         grid: name of the grid in `grids`.
-        frames: numbers of the frames that are samples, increasing.
-        fields: the fields that samples are read from, each with its sequence.
+        frames: frame numbers of the samples, increasing.
+        fields: the fields from which samples are read, each with its sequence.
     """
 
     scans: Sequence
@@ -56,7 +56,7 @@ class SequenceFrames:
         self.__dict__.update(state, frames=expand(state["frames"]))
 
     def history(self, frame: int, length: int) -> list[int | None]:
-        """Return the frame numbers of a stack, oldest first; None before the start of the sequence and before a gap."""
+        """Return the frame numbers of a stack, oldest first; None before the start of the sequence or before a gap."""
         past: list[int | None] = [None] * length
         for back in range(length):
             if frame - back not in self._scanned:
@@ -65,11 +65,11 @@ class SequenceFrames:
         return past
 
     def with_history(self, frames: Iterable[int], length: int) -> list[int]:
-        """Return the frames whose scans are in the stacks of some frames, in rising order."""
+        """Return the sorted numbers of all frames in the stacks of some frames."""
         return sorted({past for frame in frames for past in self.history(frame, length) if past is not None})
 
     def current_T_past(self, frame: int, past: list[int | None]) -> NDArray[np.float64]:
-        """Return (T, 4, 4) transforms from past sensor frames to that of `frame`; the identity for `frame` itself and for None."""
+        """Return (T, 4, 4) float64 transforms from past sensor frames to the sensor frame of `frame`; the identity for `frame` and for None."""
         transforms = np.tile(np.eye(4), (len(past), 1, 1))
         others = {row: number for row, number in enumerate(past) if number is not None and number != frame}
         if others:
@@ -78,7 +78,7 @@ class SequenceFrames:
         return transforms
 
     def check_poses(self) -> None:
-        """Check that every frame has a pose that can be inverted.
+        """Check that every frame has a rigid pose.
 
         Raises:
             MissingDataError: poses.txt does not exist.
@@ -87,7 +87,7 @@ class SequenceFrames:
         where = f"{self.scans.location}/{layout.POSES}"
         poses = self.scans.poses
         if len(self.frames):
-            self.scans.read_pose(int(self.frames[-1]))  # the last frame has a line only if all have
+            self.scans.read_pose(int(self.frames[-1]))  # if the last frame has a line, all frames have
         rotations = np.nan_to_num(poses[:, :3, :3])
         rigid = np.isfinite(poses).all((1, 2)) & (np.abs(np.linalg.det(rotations) - 1) < _RIGID)
         if not rigid.all():
@@ -100,10 +100,10 @@ class SequenceFrames:
 
 
 def choose_sequences(source: Source, split: str | Iterable[str] | None, coordinates: Coordinates) -> list[Sequence]:
-    """Return the sequences of a split, or those with the given names, in the order of the source. Scans are read from them.
+    """Return the sequences of a split or with the given names, in the order of the source. Scans are read from these sequences.
 
     Raises:
-        ArgumentError: `split` is neither one of the splits nor the name of a sequence, nor a list of names.
+        ArgumentError: `split` is not a split, the name of a sequence or a list of names.
         MissingDataError: no sequence has that split or name.
     """
     groups = _groups(source)
@@ -111,17 +111,17 @@ def choose_sequences(source: Source, split: str | Iterable[str] | None, coordina
 
 
 def find_grid_sequences(chosen: list[Sequence], source: Source, coordinates: Coordinates) -> list[Sequence]:
-    """Return, for each sequence, the sequence that its grids are read from.
+    """Return, for each sequence, the sequence from which its grids are read.
 
-    Sequences are matched by split and name, or by name alone if a path has no split. If both sources are a single sequence,
-    these are matched whatever their names.
+    Sequences are matched by split and name, or by name alone if a path has no split. If both sources have a single sequence, these match
+    regardless of their names.
 
     Raises:
         MissingDataError: a sequence has no counterpart.
     """
     groups = _groups(source)
     only = list(groups.values()) if len(groups) == len(chosen) == 1 else []
-    found = []
+    matches = []
     for scans in chosen:
         candidates = [
             group
@@ -139,12 +139,12 @@ def find_grid_sequences(chosen: list[Sequence], source: Source, coordinates: Coo
                 expected=f"{coordinates} grids of {scans.split or '?'}/{scans.name}",
                 found=f"only {', '.join(group)}" if group else f"the sequences {existing}",
             )
-        found.append(group[coordinates])
-    return found
+        matches.append(group[coordinates])
+    return matches
 
 
 def find_grid_name(grids: Sequence, grid: str | GridSpec) -> str:
-    """Return the name of a sequence's grid, given by name or by geometry.
+    """Return the name of a grid of a sequence, given by name or geometry.
 
     Raises:
         MissingDataError: the sequence has no such grid.
@@ -161,7 +161,7 @@ def find_grid_name(grids: Sequence, grid: str | GridSpec) -> str:
         grids.location,
         expected=f"the grid {grid}",
         found=existing,
-        advice="give another `grid`, or a GridSpec if only scans are needed",
+        advice="use another `grid`, or a GridSpec if only scans are needed",
     )
 
 
@@ -178,7 +178,7 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
             raise MissingDataError(
                 sequence.location,
                 expected=f"the field {field}",
-                found="no frame that has it",
+                found="no frame with it",
                 advice=_advice(field.rpartition("/")[2]),
             )
         common = frames if common is None else np.intersect1d(common, frames, assume_unique=True)
@@ -186,16 +186,16 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
 
 
 def _advice(part: str) -> str:
-    """Return what to do if a field, or part of a grid, does not exist."""
+    """Return the advice for a missing field or part of a grid."""
     kept = {"evidence": layout.EVIDENCE_FIELDS, "actors": layout.ACTOR_FIELDS, "seen": ("seen",)}
     return next((_ADVICE_KEEP.format(name) for name, parts in kept.items() if part in parts), _ADVICE)
 
 
 def common_value(values: Mapping[str, _T], what: str) -> _T:
-    """Return the value that all places share; `values` has it by place.
+    """Return the common value of `values`, a mapping from places to values.
 
     Raises:
-        FormatError: two places differ; names both.
+        FormatError: the values of two places differ; the message names both places.
     """
     (place, value), *others = values.items()
     for other, found in others:
@@ -204,12 +204,12 @@ def common_value(values: Mapping[str, _T], what: str) -> _T:
                 other,
                 expected=f"the {what} of {place} ({value})",
                 found=str(found),
-                advice="choose sequences that agree with `split`, a list of names",
+                advice="select sequences with equal values with `split`, a list of names",
             )
     return value
 
 
-_Key = tuple[str | None, str, str]  # split, name, and the path of the sequence's folder
+_Key = tuple[str | None, str, str]  # split, name, and path of the folder of the sequence
 
 
 def _groups(source: Source) -> dict[_Key, dict[str, Sequence]]:
@@ -253,7 +253,7 @@ def _match(source: Source, groups: Mapping[_Key, object], split: str | Iterable[
                 source.location,
                 expected=f"the split {split}",
                 found=existing,
-                advice="give a folder that holds it, or `split=None`",
+                advice="open a folder with this split, or use `split=None`",
             )
         return chosen
     names = list(split)
@@ -271,9 +271,9 @@ def _names(key: _Key) -> set[str]:
 
 
 class RecentScans(threading.local):
-    """Keeps the last scans that a thread read, decoded: consecutive frames share all scans of their stacks but one.
+    """Caches the last decoded scans of a thread, because the stacks of consecutive frames differ by one scan only.
 
-    The memory of a scan that is dropped is used for the next one, so each thread has scans of its own.
+    The memory of a dropped scan is reused for the next one, so each thread has a separate cache.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -283,9 +283,9 @@ class RecentScans(threading.local):
         self._scans: OrderedDict[tuple[Sequence, int], NDArray[np.float32]] = OrderedDict()
 
     def read(self, sequence: Sequence, frames: list[int | None]) -> list[NDArray[np.float32] | None]:
-        """Return the points of each frame as `Sequence.read_xyz` does, and None for None. They are valid until the next call.
+        """Return the points of each frame like `Sequence.read_xyz`, and None for None. They are valid until the next call.
 
-        All scans that are not kept are read in one call.
+        All scans that are not cached are read in one call.
         """
         wanted = [(sequence, frame) for frame in frames if frame is not None]
         for key in wanted:

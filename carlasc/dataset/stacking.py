@@ -1,8 +1,8 @@
-"""Scans to dense arrays: compiled code that transforms, bins and counts points in one pass, and maps labels in another.
+"""Compiled code that turns scans into dense arrays: it transforms, bins and counts points in one pass, and maps labels in another.
 
-The rules are those of `GridSpec` (`to_axes`, `index`), and every voxel is the same: points whose voxel the fast arithmetic could get
-wrong are placed by the rules themselves. A scan is processed in blocks that stay in the cache: the columns are split first, and the
-other steps vectorise. Loading this module loads Numba.
+The result is equal to that of `GridSpec` (`to_axes`, `index`). Points for which the fast arithmetic may be wrong are binned by the exact
+rule. A scan is processed in blocks that fit into the CPU cache: the columns are split first, and the other steps vectorise. Importing
+this module loads Numba.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from carlasc.core.cells import AZIMUTH_ERROR, Cells, fast_azimuth, find_voxel
 from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
 
-_BLOCK = 128  # points at once: their columns and cells take 6 KB of the first-level cache, and half a page of the file
+_BLOCK = 128  # points per block: their columns and cells take 6 KB of the first-level cache
 
 
 def stack_scans(
@@ -35,11 +35,11 @@ def stack_scans(
     Args:
         scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, as rows or as the transpose of contiguous
             x, y and z; None gives an empty grid.
-        grid_T_scans: (T, 4, 4) transforms from each scan's frame to the grid's.
+        grid_T_scans: (T, 4, 4) transforms from the frame of each scan to the frame of the grid.
         spec: the grid.
-        what: "occupancy" marks voxels that hold a point, "density" counts the points of each voxel (at most 65535).
-        min_range_m: points nearer to their own sensor are left out; None keeps all.
-        max_range_m: points farther from it are left out; None keeps all.
+        what: "occupancy" marks voxels with a point, "density" counts points per voxel (at most 65535).
+        min_range_m: points nearer to their sensor than this are left out; None keeps all.
+        max_range_m: points farther from their sensor than this are left out; None keeps all.
 
     Returns:
         (T, X, Y, Z) uint8 0 or 1, or uint16 number of points per voxel.
@@ -60,14 +60,14 @@ def stack_scans(
 
 
 def look_up(labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype: np.dtype[Any]) -> NDArray[Any] | None:
-    """Return `table[labels]` as `dtype`, or None if a label is not in the table (beyond its end, or -1 there)."""
+    """Return `table[labels]` as `dtype`, with the shape of `labels`; None if a label is not in the table (after its end, or its value is -1)."""
     found = np.empty(labels.shape, dtype)
     flat = np.ascontiguousarray(labels).reshape(-1)
     return found if _look_up(_read_only(flat), table, found.reshape(-1)) else None
 
 
 def _geometry(spec: GridSpec) -> tuple[Any, ...]:
-    """Return the constants of the fast arithmetic: lower bounds, cells per metre or radian, sizes, and its largest error in cells."""
+    """Return the constants of the fast arithmetic: lower bounds, cells per metre or radian, sizes, and its maximum error in cells."""
     voxel, sizes = spec.voxel_size, tuple(float(n) for n in spec.size)
     # Rounding, the difference of voxel_size * size from the bounds, and the error of the azimuth.
     doubt = 1e-6 + 1e-7 * max(sizes)
@@ -76,7 +76,7 @@ def _geometry(spec: GridSpec) -> tuple[Any, ...]:
 
 
 def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
-    """Return the bytes of the points as (2 N,) words, x and y in one, z and a fourth number in the next."""
+    """Return the bytes of the points as (2 N,) words: x and y in one, z and the fourth number in the next."""
     if points.shape[1] != 4:
         points = np.column_stack([points[:, :3], np.zeros(len(points), np.float32)])
     words = np.ascontiguousarray(points, np.float32).reshape(-1).view(np.uint64)
@@ -84,14 +84,14 @@ def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the array as the only type that the kernels are compiled for."""
+    """Return a read-only view, the only array type for which the kernels are compiled."""
     if array.flags.writeable:
         array = array.view()
         array.flags.writeable = False
     return array
 
 
-_step = numba.njit(nogil=True, inline="always")  # inlined into the loop over blocks; otherwise it does not vectorise
+_step = numba.njit(nogil=True, inline="always")  # inlined into the loop over blocks, which does not vectorise otherwise
 
 
 @_step
@@ -144,10 +144,10 @@ def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore
 
 @_step
 def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def]
-    """Write the flat index of each point's voxel given on the grid's axes: -1 outside, -2 where it is in doubt.
+    """Write the flat voxel index of each point on the axes of the grid: -1 outside, -2 if it is uncertain.
 
     Three divisions per point would take half of the time. The code multiplies instead, and marks points near the edge of a cell as
-    doubtful.
+    uncertain.
     """
     (l0, l1, l2), (w0, w1, w2), (s0, s1, s2), doubt = geometry
     clear = 0.5 - doubt

@@ -1,4 +1,4 @@
-"""Augmentations of samples. They change all fields of a sample in the same way."""
+"""Augmentations of samples. They change all fields of a sample consistently."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from carlasc.dataset.fields import Sample, Values
 from carlasc.errors import ArgumentError
 
 _DIRECTIONS = ("x", "y")
-_TOLERANCE = 1e-5  # the published azimuth bounds are pi as float32, which is off by 9e-8
+_TOLERANCE = 1e-5  # the published azimuth bounds are pi as float32, with an error of 9e-8
 _FIRST_GRID_AXIS = {"occupancy": 1, "density": 1, "visibility": 1, "posterior": 1} | dict.fromkeys(
     ("labels", "known", "counts", "occupied", "flags", "views", "instances", "voxel_flow", "camera_visible"), 0
 )
 
 
 class Flip:
-    """Mirrors samples in x and in y at random, each with its own probability: grids, points, flow and poses together.
+    """Mirrors samples at random along x and along y, independently: grids, points, flow and poses.
 
-    In a Cartesian grid a flip reverses the grid's axis. In a cylindrical grid a flip of y reverses the azimuth, and a flip of x
-    reverses the azimuth and rolls it by half a turn; the radius is never flipped. Poses are conjugated with the reflection, so
-    they still move the flipped scans onto each other.
+    In a Cartesian grid, a flip reverses an axis. In a cylindrical grid, a flip of y reverses the azimuth, and a flip of x reverses the
+    azimuth and rolls it by half a turn; the radius is never flipped. Poses are conjugated with the reflection, so they still align the
+    flipped scans.
 
-    With a seed, the flips of a sample depend on the seed, the epoch, and the sample's `sequence` and `frame` only: they are the
-    same in every worker process. `set_epoch` reaches workers, also persistent ones; without it, every epoch has the same flips.
-    Without a seed, every call draws again.
+    With a seed, the flips of a sample depend only on the seed, the epoch, and `sequence` and `frame` of the sample: they are equal in
+    every worker process. `set_epoch` also reaches persistent workers; without it, every epoch has the same flips. Without a seed, every
+    call is random.
 
         dataset.transform = flips = Flip(dataset.spec, seed=0)
         for epoch in range(epochs):
@@ -51,13 +51,13 @@ class Flip:
         """Check that the grid can be flipped.
 
         Args:
-            spec: the samples' grid, `dataset.spec`; None if they hold no grid.
-            directions: "x", "y" or both: the directions in which samples may be flipped.
+            spec: the grid of the samples, `dataset.spec`; None if samples have no grid.
+            directions: directions in which samples may be flipped: "x", "y" or both.
             probability: probability of a flip, for each direction.
-            seed: makes the flips repeatable; None draws again at each call.
+            seed: seed for reproducible flips; None for random flips at each call.
 
         Raises:
-            ArgumentError: the grid is not symmetric in a direction, or an argument has a wrong value.
+            ArgumentError: the grid is not symmetric in a direction, or an argument is not valid.
         """
         self.directions = tuple(directions)
         if not set(self.directions) <= set(_DIRECTIONS):
@@ -75,11 +75,11 @@ class Flip:
                 _check_symmetric(spec, direction)
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch that begins. Call it before the DataLoader is iterated, as with a DistributedSampler."""
+        """Set the next epoch. Call this before iterating over the DataLoader, as with a DistributedSampler."""
         self._epoch.value = epoch
 
     def __call__(self, sample: Sample) -> Sample:
-        """Return the sample, flipped or not. The input is not changed."""
+        """Return the sample, possibly flipped. The input is not changed."""
         seed: list[int] | None = None
         if self.seed is not None:
             seed = [self.seed, self._epoch.value, zlib.crc32(sample["sequence"].encode()), sample["frame"]]
@@ -94,15 +94,20 @@ def flip(sample: Sample, direction: str, spec: GridSpec | None) -> Sample:
     """Return a sample mirrored in "x" or "y".
 
     Args:
-        sample: a sample of a Dataset. Fields other than grids, points, flow and poses are kept.
+        sample: a sample of a Dataset. Fields other than grids, points, flow and poses are unchanged.
         direction: "x" or "y".
-        spec: the sample's grid; None if it holds none.
+        spec: the grid of the sample; None if it has no grid.
 
     Raises:
         ArgumentError: the grid is not symmetric in this direction, or the sample has images.
     """
     if {"images", "cameras"} & sample.keys():
-        raise ArgumentError("sample", expected="one without images and cameras to flip", found="one with them")
+        raise ArgumentError(
+            "sample",
+            expected="a sample without images and cameras",
+            found="one with them",
+            advice="leave `images` and `cameras` out of `fields`, or do not flip",
+        )
     column, given = _DIRECTIONS.index(direction), cast(Values, sample)
     flipped = dict(given)
     if spec is not None:
@@ -152,7 +157,7 @@ def _check_symmetric(spec: GridSpec, direction: str) -> None:
 
 
 class _SharedNumber:
-    """A number in memory that worker processes share. Of everything else, persistent workers hold a copy."""
+    """A number in shared memory. Persistent workers have copies of all other attributes."""
 
     def __init__(self, value: int = 0) -> None:
         self._cell = multiprocessing.Value("q", value, lock=False)
@@ -166,7 +171,7 @@ class _SharedNumber:
         self._cell.value = value
 
     def __reduce__(self) -> tuple[Callable[..., _SharedNumber], tuple[Any, ...]]:
-        """Share the memory with a process that is being spawned; in any other pickle, store the number."""
+        """Share the memory when a process is spawned; in any other pickle, store the number."""
         if get_spawning_popen() is not None:
             return _shared, (self._cell,)
         return _SharedNumber, (self.value,)

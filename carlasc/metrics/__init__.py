@@ -1,4 +1,4 @@
-"""Scores of grids: confusion and completeness, rays, segments, uncertainty and time; the conventions of the benchmarks; scores over data sets."""
+"""Scores of grids: confusion, completeness, rays, segments, uncertainty, consistency over time; conventions of benchmarks; whole data sets."""
 
 import lazy_loader
 

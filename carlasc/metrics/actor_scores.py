@@ -1,4 +1,4 @@
-"""Scores of who is in each voxel, and how fast: panoptic quality, numbers over time, velocities."""
+"""Scores of the actor and the velocity of each voxel: panoptic quality, tracking over time, velocity errors."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from carlasc.metrics.temporal import TrackingQuality, TrackingScore
 from carlasc.storage.field_files import dense_velocity
 
 SPEEDS_M_S = (0.0, 2.0, 5.0, 10.0)
-"""Lower ends of the bands of speed that velocities are scored in."""
+"""Lower bounds of the speed bands in which velocities are scored, m/s."""
 Prepared = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
 class ActorScore:
-    """How well a prediction knows who is in each voxel, and how fast.
+    """Scores of the predicted actors and velocities of voxels.
 
     Attributes:
         panoptic: panoptic quality of each class.
         tracking: quality of segmentation and tracking (LSTQ) over the frames of each sequence.
-        velocity_m_s: mean length of the difference of velocities over the voxels that move in the truth; NaN if none does.
-        velocity_by_class: the same by name of the class.
-        velocity_by_speed: the same by the lower end of the band of the true speed, m/s.
+        velocity_m_s: mean length of the velocity error, over voxels that move in the ground truth, m/s; NaN if no voxel moves.
+        velocity_by_class: mean velocity error by class name, m/s.
+        velocity_by_speed: mean velocity error by the lower bound of the band of the true speed, m/s.
     """
 
     panoptic: PanopticScore
@@ -44,7 +44,7 @@ class ActorScore:
     velocity_by_speed: Mapping[float, float]
 
     def to_dict(self, classes: ClassTable) -> dict[str, Any]:
-        """Return every figure by name, as fractions and m/s, for JSON; None for a figure that is not defined."""
+        """Return all scores by name, as fractions and m/s, for JSON; None for undefined scores."""
         pq = {name: self.panoptic.pq[label] for label, name in classes.names.items() if label < len(self.panoptic.pq)}
         means = {what: self.panoptic.mean(what) for what in ("pq", "sq", "rq")}
         figures = means | {"pq_things": self.panoptic.mean(which="things")} | vars(self.tracking)
@@ -61,7 +61,7 @@ def _number(value: float) -> float | None:
 
 
 class ActorScores:
-    """Adds up the frames of all sequences, in the classes of a convention."""
+    """Accumulates frames of all sequences, in the classes of a convention."""
 
     def __init__(self, convention: Convention) -> None:
         self.convention = convention
@@ -69,19 +69,19 @@ class ActorScores:
         k, free = convention.num_classes, convention.free
         self.panoptic = PanopticQuality(k, things, free=free)
         self.tracking = TrackingQuality(k, things, unaveraged={free})
-        self.errors = np.zeros((2, k, len(SPEEDS_M_S)))  # sum and number of voxels by class and band of speed
+        self.errors = np.zeros((2, k, len(SPEEDS_M_S)))  # sum of errors and number of voxels, by class and speed band
 
     @staticmethod
     def check(pair: Pair) -> None:
-        """Check that both sides say who is in their voxels.
+        """Check that the prediction and the ground truth have instances.
 
         Raises:
-            ArgumentError: one does not.
+            ArgumentError: one of them has no field `instance`.
         """
         for side in (pair.truth, pair.prediction):
             if not isinstance(side, SequenceGrid) or f"{side.grid}/instance" not in side.sequence.fields():
                 raise ArgumentError(
-                    "actors", expected="grids with instances on both sides", found=f"{side.location} without",
+                    "actors", expected="grids with instances for prediction and ground truth", found=f"no instances in {side.location}",
                     advice="make the ground truth with `regrid --keep-actors`",
                 )  # fmt: skip
 
@@ -89,9 +89,9 @@ class ActorScores:
         """Add a frame.
 
         Args:
-            pair: both sides.
-            frame: its number.
-            prepared: predicted and true classes of the convention, (X, Y, Z), and the voxels that count.
+            pair: prediction and ground truth.
+            frame: frame number.
+            prepared: predicted and true classes of the convention, (X, Y, Z), and the mask of scored voxels, (X, Y, Z) bool.
 
         Raises:
             FormatError: a file does not fit its grid.
@@ -103,7 +103,7 @@ class ActorScores:
                 known[name] = side.sequence.read(f"{side.grid}/instance", frame)
                 moving[name] = _dense(side, frame, truth.shape)
         numberless = np.isin(truth, sorted(self.panoptic.things)) & (known["truth"] == 0)
-        counted = counted & ~numberless  # nobody knows whose they are
+        counted = counted & ~numberless  # without voxels of movable classes whose actor is not known
         sides = (prediction, known["prediction"]), (truth, known["truth"])
         self.panoptic.update(*sides, mask=counted)
         self.tracking.update(pair.truth.path, *sides, mask=counted)
@@ -115,13 +115,13 @@ class ActorScores:
         np.add.at(self.errors[1], place, 1)
 
     def merge(self, other: ActorScores) -> None:
-        """Add what another one by the same convention has added up."""
+        """Add the sums of another object with the same convention."""
         self.panoptic.merge(other.panoptic)
         self.tracking.merge(other.tracking)
         self.errors += other.errors
 
     def compute(self) -> ActorScore:
-        """Return the scores of everything that was added."""
+        """Return the scores of all added frames."""
         total, count = self.errors
         by_class, by_speed = ratio(total.sum(axis=1), count.sum(axis=1)), ratio(total.sum(axis=0), count.sum(axis=0))
         names = self.convention.classes.names
@@ -135,14 +135,14 @@ class ActorScores:
 
 
 def movable_of(convention: Convention, table: ClassTable) -> frozenset[int]:
-    """Return the classes of a convention that the movable classes of a table become."""
+    """Return the classes of a convention to which the movable classes of a table are mapped."""
     mapping = convention.maps[table.name]
     found = {mapping[label] for label in table.movable if label in mapping}
     return frozenset(label for label in found if label in convention.averaged and label != convention.free)
 
 
 def _dense(side: SequenceGrid, frame: int, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return (V, 3) the velocity of each voxel; zero where nothing moves, or nobody says it."""
+    """Return (V, 3) float32 velocities of voxels, m/s; zero where nothing moves or the grid has no velocities."""
     name = f"{side.grid}/velocity"
     if name not in side.sequence.fields() or frame not in side.sequence.frames(name):
         return np.zeros((math.prod(size), 3), np.float32)

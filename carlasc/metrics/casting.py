@@ -1,6 +1,6 @@
 """Casting rays through voxel grids: the first occupied voxel on each ray and its distance.
 
-Arrays are walked by compiled code on the CPU, ray by ray; torch tensors on their own device, where all rays take a step at a time.
+For arrays, compiled code walks ray by ray on the CPU. For torch tensors, all rays take one step at a time on the device of the tensors.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     import torch
 
 
-_STEPS = 10  # pitches of the first part: one ray per metre on flat ground, 1 m to 10 m away for a sensor 1 m above it
-_HIGHEST_RAD = 0.21  # the last pitch is the first one that reaches this
+_STEPS = 10  # number of pitches of the first part: for a sensor 1 m above flat ground, they hit it every metre from 1 m to 10 m
+_HIGHEST_RAD = 0.21  # the last pitch is the first one at or above this angle
 
 
 def rayiou_directions() -> NDArray[np.float64]:
     """Return the directions of the rays that RayIoU casts from each origin (SparseOcc's evaluation script).
 
-    They are those of a LiDAR: 360 azimuths, one degree apart, for each of 39 pitches from -45 to 12.55 degrees.
+    They are similar to a LiDAR: 360 azimuths, one degree apart, for each of 39 pitches from -45 to 12.55 degrees.
 
     Returns:
         (14040, 3) float64 unit vectors, pitch by pitch.
@@ -49,11 +49,11 @@ def cast_rays(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Cast rays through grids of the same geometry, and return the first occupied voxel on each ray.
 
-    The first voxel on the ray that is not free is returned; it may be the voxel of the origin. If there is none, the last voxel before
-    the ray leaves the grid is returned. A ray that starts outside the grid begins at the point where it enters the grid.
+    For each ray, the result is the first voxel that is not free, possibly the voxel of the origin. If all voxels are free, it is the last
+    voxel before the ray leaves the grid. A ray that starts outside the grid begins at the point where it enters the grid.
 
     Args:
-        grids: (G, X, Y, Z) class ids; rays are cast through all grids in one pass.
+        grids: (G, X, Y, Z) class ids of up to 8 grids; rays are cast through all grids in one pass.
         spec: geometry of the grids, Cartesian.
         origins: (O, 3) metres, in the frame of the grid.
         directions: (R, 3) unit vectors, in the frame of the grid.
@@ -86,18 +86,18 @@ def cast_rays(
 def follow_rays(
     solid: NDArray[np.uint8], spec: GridSpec, origin: NDArray[np.floating], points: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Follow measured rays through a grid: where each first meets something, and what it passes before the measured point.
+    """Trace measured rays through a grid: the first solid voxel on each ray, and the content of the voxels before the measured point.
 
     Args:
-        solid: (X, Y, Z) bits that say what a voxel holds; 0 lets the ray pass.
+        solid: (X, Y, Z) uint8 bits of the content of a voxel; a ray passes voxels with 0.
         spec: geometry of the grid, Cartesian.
-        origin: (3,) metres, where the rays start, in the frame of the grid.
-        points: (N, 3) metres, measured points, all inside the grid.
+        origin: (3,) metres, origin of the rays in the frame of the grid.
+        points: (N, 3) metres, measured points inside the grid.
 
     Returns:
-        (N,) float64 distance in metres from the origin to the middle of the ray's path through its first solid voxel, which may be
-        behind the point; infinite if the ray leaves the grid without one. And (N,) uint8 bits of all voxels that the ray passes before the
-        point, without the voxel of the point and its 26 neighbours.
+        (N,) float64 distance in metres from the origin to the middle of the path of the ray through its first solid voxel, which may be
+        behind the point; infinite if no voxel on the ray is solid. And (N,) uint8 combined bits of all voxels that the ray passes before
+        the point, without the voxel of the point and its 26 neighbours.
 
     Raises:
         ArgumentError: the grid is cylindrical.
@@ -114,7 +114,7 @@ def follow_rays(
 
 @cached
 def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[no-untyped-def]
-    """Walk every ray from voxel to voxel, in units of voxels; the parameter t is 0 at the origin and 1 at the point."""
+    """Walk each ray from voxel to voxel, in voxel units. The parameter t is 0 at the origin and 1 at the point."""
     step, cell, last = np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64)
     crossing, between = np.empty(3), np.empty(3)
     for r in range(len(ends)):
@@ -157,7 +157,7 @@ def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[n
 
 @cached
 def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-def]
-    """Walk every ray from voxel to voxel (Amanatides and Woo), in units of voxels; the distance along the ray is in metres."""
+    """Walk each ray from voxel to voxel (Amanatides and Woo), in voxel units. The distance along the ray is in metres."""
     num_grids = len(found)
     everything = (1 << num_grids) - 1
     nx, ny, nz = size[0], size[1], size[2]
@@ -176,12 +176,12 @@ def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-
             j = min(max(int(np.floor(y + entry * dy)), 0), ny - 1)
             k = min(max(int(np.floor(z + entry * dz)), 0), nz - 1)
             ix, iy, iz = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
-            # distance at which the ray crosses the next face of each axis, and between two faces of it
+            # per axis: distance to the next face that the ray crosses, and between two faces
             tx = (i + (dx > 0) - x) / dx if dx != 0 else np.inf
             ty = (j + (dy > 0) - y) / dy if dy != 0 else np.inf
             tz = (k + (dz > 0) - z) / dz if dz != 0 else np.inf
             sx, sy, sz = np.abs(1 / dx), np.abs(1 / dy), np.abs(1 / dz)
-            # faces still to cross before the ray leaves the grid: counting down is one comparison per step
+            # number of faces before the ray leaves the grid: counting down takes one comparison per step
             left_x, left_y, left_z = (
                 (nx - 1 - i if dx > 0 else i),
                 (ny - 1 - j if dy > 0 else j),
@@ -219,7 +219,7 @@ def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-
 
 @jit
 def _entry(start, step, size):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray from outside enters the grid, -1 if it does not enter the grid."""
+    """Return the distance at which a ray from outside enters the grid; -1 if it misses the grid."""
     near, far = 0.0, np.inf
     for axis in range(3):
         if step[axis] == 0:
@@ -234,17 +234,17 @@ def _entry(start, step, size):  # type: ignore[no-untyped-def]
 def cast_rays_on_device(
     grids: torch.Tensor, spec: GridSpec, origins: ArrayLike, directions: ArrayLike, *, free: int = 0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cast rays as `cast_rays` does, on the device of the grids. Origins must lie inside the grid.
+    """Cast rays like `cast_rays`, on the device of the grids. Origins must be inside the grid.
 
     Args:
         grids: (G, X, Y, Z) integer tensor of class ids.
-        spec: their geometry, Cartesian.
-        origins: (O, 3) metres, the grid's frame.
-        directions: (R, 3) unit vectors, the grid's frame.
+        spec: geometry of the grids, Cartesian.
+        origins: (O, 3) metres, in the frame of the grid.
+        directions: (R, 3) unit vectors, in the frame of the grid.
         free: the id of free space.
 
     Returns:
-        (G, O * R) int64 flat index of the voxel that each ray takes, and (G, O * R) float64 metres to where the ray leaves it.
+        (G, O * R) int64 flat voxel index of each ray, and (G, O * R) float64 distance in metres to the point where the ray leaves it.
     """
     import torch
 

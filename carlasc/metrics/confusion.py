@@ -1,6 +1,6 @@
-"""The confusion matrix, its counting for NumPy arrays and torch tensors, and the figures computed from it.
+"""The confusion matrix, counting for NumPy arrays and torch tensors, and the scores computed from it.
 
-Matrices of frames, sequences and processes can be added. Every figure is computed from the sum, as the paper does over a whole split.
+Matrices of frames, sequences and processes can be added. Scores are computed from the sum, as in the paper for a whole split.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Absent = Literal["zero", "skip"]
 
 @dataclass(frozen=True)
 class Completeness:
-    """Scores of occupied against free space: all classes other than free count as one. NaN where the divisor is zero.
+    """Scores of occupied against free space: all classes except free count as one. NaN if the denominator is zero.
 
     Attributes:
         precision: share of the voxels predicted as occupied that are occupied.
@@ -42,19 +42,19 @@ class Completeness:
 
 
 class ConfusionMatrix:
-    """The number of voxels of each true class that were predicted as each class.
+    """The number of voxels for each pair of true and predicted class.
 
     Attributes:
         num_classes: K; ids are 0..K-1.
         free: the id of free space.
-        counts: (K, K) int64, truth in rows, prediction in columns.
+        counts: (K, K) int64, ground truth in rows, prediction in columns.
     """
 
     def __init__(self, num_classes: int, *, free: int = 0, counts: NDArray[np.integer] | None = None) -> None:
         """Start with an empty matrix, or with `counts`.
 
         Raises:
-            ArgumentError: `num_classes` is less than 1, `free` is not one of the ids, or `counts` has another shape.
+            ArgumentError: `num_classes` is less than 1, `free` is not in 0..K-1, or `counts` has another shape.
         """
         if num_classes < 1:
             raise ArgumentError("num_classes", expected="1 or more", found=str(num_classes))
@@ -71,28 +71,30 @@ class ConfusionMatrix:
             self.counts += counts
 
     def update(self, prediction: Labels, truth: Labels, mask: Labels | None = None) -> Self:
-        """Add the voxels of a prediction and its truth.
+        """Add the voxels of a prediction and its ground truth.
 
-        NumPy arrays and torch tensors are accepted, on any device; tensors are counted on their own device.
+        Accepts NumPy arrays and torch tensors. Tensors are counted on their device.
 
         Args:
             prediction: any shape, integer class ids.
             truth: the same shape, integer class ids.
-            mask: the same shape, bool: only these voxels count. The ids of the others may have any value.
+            mask: the same shape, bool: only these voxels are counted; None counts all. The ids of other voxels may have any value.
 
         Returns:
             The matrix itself.
 
         Raises:
-            FormatError: shapes differ, labels are not integers, or an id that counts is not in 0..K-1.
+            FormatError: shapes differ, labels are not integers, or a counted id is not in 0..K-1.
         """
         for name, array in (("prediction", prediction), ("mask", mask)):
             if array is not None and np.shape(array) != np.shape(truth):
                 raise FormatError(
-                    name, expected=f"the truth's shape {tuple(np.shape(truth))}", found=str(tuple(np.shape(array)))
+                    name,
+                    expected=f"the shape of the ground truth {tuple(np.shape(truth))}",
+                    found=str(tuple(np.shape(array))),
                 )
         device = device_of(prediction, truth, mask)
-        if device is None:  # torch tensors on the CPU are NumPy arrays without a copy
+        if device is None:  # torch tensors on the CPU convert to NumPy without a copy
             known = None if mask is None else np.asarray(mask)
             self.counts += count_arrays(np.asarray(prediction), np.asarray(truth), known, self.num_classes)
         else:
@@ -104,11 +106,11 @@ class ConfusionMatrix:
         self.counts[:] = 0
 
     def merge(self, other: ConfusionMatrix) -> Self:
-        """Add what another matrix has counted, in any order; the same as `+=`."""
+        """Add the counts of another matrix; same as `+=`."""
         return self.__iadd__(other)
 
     def compute(self) -> dict[str, float]:
-        """Return the usual figures by name: `miou`, `accuracy`, and `precision`, `recall` and `iou` of occupied space."""
+        """Return the usual scores by name: `miou`, `accuracy`, and `precision`, `recall` and `iou` of occupied space."""
         return {"miou": self.miou, "accuracy": self.accuracy, **vars(self.completeness())}
 
     def __iadd__(self, other: ConfusionMatrix) -> Self:
@@ -143,49 +145,49 @@ class ConfusionMatrix:
 
     @property
     def true_positives(self) -> NDArray[np.int64]:
-        """(K,) number of voxels of each class that are predicted as this class."""
+        """(K,) number of correctly predicted voxels per class."""
         return np.diagonal(self.counts).copy()
 
     @property
     def false_positives(self) -> NDArray[np.int64]:
-        """(K,) number of voxels of other classes that are predicted as each class."""
+        """(K,) number of voxels per predicted class that have another true class."""
         return self.counts.sum(axis=0) - np.diagonal(self.counts)
 
     @property
     def false_negatives(self) -> NDArray[np.int64]:
-        """(K,) number of voxels of each class that are predicted as another class."""
+        """(K,) number of voxels per true class that are predicted as another class."""
         return self.counts.sum(axis=1) - np.diagonal(self.counts)
 
     @property
     def iou(self) -> NDArray[np.float64]:
-        """(K,) intersection over union of each class; NaN for a class that is in neither the prediction nor the truth."""
+        """(K,) intersection over union per class; NaN for classes that do not occur in the prediction or the ground truth."""
         return ratio(self.true_positives, self.true_positives + self.false_positives + self.false_negatives)
 
     @property
     def precision(self) -> NDArray[np.float64]:
-        """(K,) share of the voxels predicted as a class that are of this class; NaN for a class that is never predicted."""
+        """(K,) precision per class: share of the predicted voxels that are correct; NaN for classes that are never predicted."""
         return ratio(self.true_positives, self.counts.sum(axis=0))
 
     @property
     def recall(self) -> NDArray[np.float64]:
-        """(K,) share of the voxels of a class that are predicted as this class; NaN for a class that is not in the truth."""
+        """(K,) recall per class: share of the true voxels that are predicted correctly; NaN for classes without true voxels."""
         return ratio(self.true_positives, self.counts.sum(axis=1))
 
     @property
     def miou(self) -> float:
-        """The paper's mIoU: the mean over all classes, including free; a class in neither prediction nor truth counts as zero."""
+        """Mean IoU as in the paper: over all classes, including free. Absent classes count as zero."""
         return self.mean_iou()
 
     def mean_iou(self, *, with_free: bool = True, absent: Absent = "zero") -> float:
         """Return the mean IoU over the classes.
 
         Args:
-            with_free: include free space in the mean (CarlaSC's paper does, SemanticKITTI does not).
-            absent: value of a class that is in neither the prediction nor the truth: "zero" (the paper and SemanticKITTI),
-                or "skip", which leaves it out of the mean. The mean of no class is NaN.
+            with_free: whether free space is in the mean (in the paper of CarlaSC it is, in SemanticKITTI not).
+            absent: treatment of classes that do not occur in the prediction or the ground truth: "zero" (the paper and SemanticKITTI)
+                counts them as 0, "skip" leaves them out of the mean. The mean over no class is NaN.
 
         Raises:
-            ArgumentError: `absent` is something else.
+            ArgumentError: `absent` has another value.
         """
         check_absent(absent)
         iou = self.iou if with_free else np.delete(self.iou, self.free)
@@ -194,7 +196,7 @@ class ConfusionMatrix:
 
     @property
     def accuracy(self) -> float:
-        """Share of the voxels that are predicted correctly; NaN if no voxel was counted."""
+        """Share of correctly predicted voxels; NaN if no voxel was counted."""
         return float(ratio(np.trace(self.counts), self.counts.sum()))
 
     def completeness(self) -> Completeness:
@@ -218,17 +220,17 @@ def check_absent(absent: str) -> None:
 
 
 def ratio(numerator: Any, denominator: Any) -> NDArray[np.float64]:
-    """Divide; NaN where the denominator is zero."""
+    """Return the quotient; NaN where the denominator is zero."""
     numerator, denominator = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
     return np.divide(numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0)
 
 
 @dataclass(frozen=True)
 class TruthScore:
-    """The comparison of a ground truth with a reference. Scores of frames are added with `+`.
+    """The comparison of ground truth with a reference. Scores of frames are added with `+`.
 
     Attributes:
-        matrix: confusion matrix over the voxels that are known in both grids, the reference in rows.
+        matrix: confusion matrix over the voxels that are known in both grids, with the reference in rows.
         known: number of voxels that are known in the grid.
         known_reference: number of voxels that are known in the reference.
         known_both: number of voxels that are known in both.
@@ -241,12 +243,12 @@ class TruthScore:
 
     @property
     def coverage(self) -> float:
-        """Share of the voxels known in the reference that are known in the grid too; NaN if the reference has none."""
+        """Share of the known voxels of the reference that are also known in the grid; NaN if the reference has no known voxels."""
         return self.known_both / self.known_reference if self.known_reference else float("nan")
 
     @property
     def accuracy(self) -> float:
-        """Share of the voxels known in both grids whose classes agree."""
+        """Share of the voxels known in both grids that have equal classes."""
         return self.matrix.accuracy
 
     def __add__(self, other: TruthScore) -> TruthScore:
@@ -262,8 +264,8 @@ def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.
     """Score a ground truth grid against a reference, over the voxels that are known in both.
 
     Args:
-        grid: the grid that is scored; voxels with count 0 are unknown.
-        reference: the grid that is taken to be correct, with the same spec.
+        grid: the grid to score; voxels with count 0 are unknown.
+        reference: the grid that is regarded as correct, with the same spec.
         num_classes: number of classes; ids are below it.
         mask: (X, Y, Z) bool: only these voxels are scored, such as a distance band; None scores all.
 
@@ -271,7 +273,8 @@ def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.
         FormatError: the grids differ in geometry, or an id is out of range.
     """
     if grid.spec != reference.spec:
-        raise FormatError("grid", expected=f"the reference's {reference.spec}", found=f"{grid.spec}, or other bounds")
+        expected, found = (f"{spec}, {spec.lower} to {spec.upper}" for spec in (reference.spec, grid.spec))
+        raise FormatError("grid", expected=f"the geometry of the reference, {expected}", found=found)
     selected = np.ones(grid.spec.size, np.bool_) if mask is None else mask
     known, known_reference = grid.known & selected, reference.known & selected
     both = known & known_reference
@@ -280,33 +283,33 @@ def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.
 
 
 def device_of(*arrays: Any) -> Any:
-    """Return the device of the first torch tensor that is not on the CPU, None without one; torch is not imported to find out."""
+    """Return the device of the first torch tensor that is not on the CPU, otherwise None. Does not import torch."""
     torch = sys.modules.get("torch")
     tensors = [array for array in arrays if torch and isinstance(array, torch.Tensor) and array.device.type != "cpu"]
     return tensors[0].device if tensors else None
 
 
 def to_numpy(array: Any) -> NDArray[Any]:
-    """Return a NumPy array, or a torch tensor from any device, as a NumPy array."""
+    """Convert a NumPy array, or a torch tensor on any device, to a NumPy array."""
     return np.asarray(array.detach().cpu() if hasattr(array, "detach") else array)
 
 
 def count_arrays(
     prediction: NDArray[Any], truth: NDArray[Any], mask: NDArray[np.bool_] | None, num_classes: int
 ) -> NDArray[np.int64]:
-    """Count on the CPU.
+    """Count pairs of classes on the CPU.
 
     Args:
         prediction: any shape, integer class ids.
         truth: the same shape, integer class ids.
-        mask: the same shape: only these voxels count; None counts all.
+        mask: the same shape, bool: only these voxels are counted; None counts all.
         num_classes: K.
 
     Returns:
-        (K, K) number of voxels, truth in rows, prediction in columns.
+        (K, K) int64 number of voxels, ground truth in rows, prediction in columns.
 
     Raises:
-        FormatError: labels are not integers, or an id that counts is not in 0..K-1.
+        FormatError: labels are not integers, or a counted id is not in 0..K-1.
     """
     for name, labels in (("prediction", prediction), ("truth", truth)):
         if labels.dtype.kind not in "uib":
@@ -321,7 +324,7 @@ def count_arrays(
 def count_tensors(
     device: torch.device, prediction: Labels, truth: Labels, mask: Labels | None, num_classes: int
 ) -> NDArray[np.int64]:
-    """Count on a device of torch; only the (K, K) result is copied back. Arguments, result and errors as in `count_arrays`."""
+    """Count on a torch device. Only the (K, K) result is copied back. Arguments, result and errors are those of `count_arrays`."""
     import torch
 
     def on_device(array: Labels) -> torch.Tensor:
@@ -343,7 +346,7 @@ def count_tensors(
 
 
 def _in_range(labels: NDArray[Any], counted: NDArray[np.bool_], num_classes: int, name: str) -> NDArray[Any]:
-    """Return labels with all ids in 0..K-1. An id outside is an error in a voxel that counts, and becomes 0 in other voxels."""
+    """Return labels with all ids in 0..K-1. An id out of range is an error in counted voxels, and becomes 0 in other voxels."""
     if not labels.size or (labels.max() < num_classes and (labels.dtype.kind != "i" or labels.min() >= 0)):
         return labels
     wrong = ((labels < 0) | (labels >= num_classes)) & counted
@@ -356,13 +359,13 @@ def _in_range(labels: NDArray[Any], counted: NDArray[np.bool_], num_classes: int
 def _count_pairs(
     prediction: NDArray[Any], truth: NDArray[Any], counted: NDArray[np.bool_], num_classes: int
 ) -> NDArray[np.int64]:
-    """`np.bincount(truth * K + prediction)` of the voxels that count, in one pass.
+    """Return `np.bincount(truth * K + prediction)` of the counted voxels, in one pass.
 
-    Most voxels are free and predicted as free, so that successive voxels increment the same element. Four tables in turn avoid
-    waiting for the previous store to it. They are added up outside: `sum` would take most of the time of compiling.
+    Most voxels are free and predicted as free, so successive voxels increment the same element. Using four tables in turn avoids stalls
+    on the previous store. The caller adds them up, because `sum` would take most of the compile time.
 
     Returns:
-        (4, K * K) int64, whose sum over the first axis is the result.
+        (4, K * K) int64; the result is the sum over the first axis.
     """
     tables = np.zeros((4, num_classes * num_classes), np.int64)
     row = np.uint32(num_classes)  # unsigned: signed indices would be checked for negative values

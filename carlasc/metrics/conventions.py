@@ -1,6 +1,6 @@
-"""Conventions of scores: which voxels count, in which classes, and over which classes the mean is taken. Each benchmark has one.
+"""Conventions of benchmarks: the scored voxels, the classes, and the classes of the mean.
 
-Papers differ in all of these. A score without the name of its convention therefore cannot be compared with another score.
+Papers differ in all of these, so scores can be compared only if their conventions are the same.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ Absent = Literal["zero", "skip", "skip-truth", "nan"]
 
 @dataclass(frozen=True)
 class ConventionScore:
-    """The figures of a convention, as fractions.
+    """The scores of a convention, as fractions.
 
     Attributes:
-        miou: mean IoU over the convention's classes.
-        class_iou: IoU of each class of the mean by name; NaN for a class in neither the prediction nor the truth.
+        miou: mean IoU over the classes of the convention.
+        class_iou: IoU by name of each class of the mean; NaN for classes that do not occur in the prediction or the ground truth.
         precision: share of the voxels predicted as occupied that are occupied.
         recall: share of the occupied voxels that are predicted as occupied.
         iou: intersection over union of the occupied voxels.
@@ -56,24 +56,25 @@ class ConventionScore:
 
 @dataclass(frozen=True)
 class Convention:
-    """How a benchmark scores grids.
+    """The rules by which a benchmark scores grids.
 
     Attributes:
         name: name of the convention on the command line and in results.
         title: readable name of the benchmark.
         classes: the scored classes.
         free: id of free space among them.
-        averaged: ids over which the mean is taken.
-        maps: name of a class table -> id -> scored id, or IGNORED.
-        usual_truth: class table of true labels whose files do not name one: that of the benchmark's own files.
-        usual_prediction: likewise for predictions.
-        seen_by: sensor whose mask says which voxels are known: "lidar" or "camera".
-        unknown: how voxels count that the truth never evaluated (count 0): "left out", or "free" if the benchmark does not distinguish
-            them from free voxels.
-        absent: how a class counts that is in neither the prediction nor the truth: "zero": as 0 in the mean; "skip": it is left out;
-            "skip-truth": a class that is not in the truth is left out even if it was predicted; "nan": the mean is NaN.
+        averaged: ids of the classes of the mean.
+        maps: by name of a class table, the scored id, or IGNORED, by id.
+        usual_truth: default class table of ground truth files that do not name one: the table of the benchmark.
+        usual_prediction: default class table of prediction files that do not name one.
+        seen_by: sensor whose mask defines the known voxels: "lidar" or "camera".
+        unknown: treatment of voxels that are unknown in the ground truth (count 0): "left out", or "free" if the benchmark does not
+            distinguish them from free voxels.
+        absent: treatment of classes that do not occur in the prediction or the ground truth: "zero" counts them as 0 in the mean; "skip"
+            leaves them out; "skip-truth" leaves out classes that are not in the ground truth, even if they were predicted; "nan" makes the
+            mean NaN.
         epsilon: added to the denominator of each IoU.
-        notes: a further remark for readers of the scores, one sentence.
+        notes: a remark about the scores, one sentence.
     """
 
     name: str
@@ -99,12 +100,12 @@ class Convention:
         """Check that labels of a class table can be scored.
 
         Raises:
-            FormatError: the convention has no map from these classes.
+            FormatError: the convention has no map from this table.
         """
         if table.name not in self.maps:
             raise FormatError(
                 where,
-                expected=f"classes that the convention {self.name} has a map for ({', '.join(self.maps)})",
+                expected=f"a class table with a map in the convention {self.name} ({', '.join(self.maps)})",
                 found=table.name,
             )
 
@@ -120,11 +121,11 @@ class Convention:
         Args:
             prediction: labels of any shape, and the table of their ids.
             truth: labels of the same shape, and the table of their ids.
-            known: voxels of the truth that were evaluated, of as many elements; None: all of them.
-            region: voxels that count, of as many elements; None: all of them.
+            known: known voxels of the ground truth, bool, with the same number of elements; None for all.
+            region: voxels to score, bool, with the same number of elements; None for all.
 
         Returns:
-            Predicted and true labels in the scored classes, and the voxels that count.
+            Predicted and true labels in the scored classes, and the mask of scored voxels.
 
         Raises:
             FormatError: an id has no target.
@@ -158,8 +159,8 @@ class Convention:
         Args:
             prediction: predicted labels, shape (X, Y, Z), and their class table.
             truth: true labels of the same shape, and their class table.
-            known: which voxels the data set evaluated, same shape; None for all.
-            region: only voxels where it is true count, same shape; None for all.
+            known: known voxels of the ground truth, bool, same shape; None for all.
+            region: voxels to score, bool, same shape; None for all.
 
         Raises:
             FormatError: an id has no target.
@@ -167,7 +168,7 @@ class Convention:
         return ConfusionMatrix(self.num_classes, free=self.free).update(*self.prepare(prediction, truth, known, region))
 
     def score(self, matrix: ConfusionMatrix) -> ConventionScore:
-        """Return the figures of a confusion matrix, which may be a sum over many frames."""
+        """Return the scores of a confusion matrix, which may be a sum over many frames."""
         union = matrix.true_positives + matrix.false_positives + matrix.false_negatives
         iou = np.divide(matrix.true_positives, union + self.epsilon, out=np.full(len(union), np.nan), where=union > 0)[
             list(self.averaged)
@@ -192,14 +193,14 @@ class Convention:
 
     def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.uint8]:
         lookup = self._lookups[table.name]
-        found = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")  # the last entry is for all ids beyond
+        found = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")  # the last entry is for all larger ids
         if (unknown := found == _UNKNOWN).any():
             bad = int(labels[unknown][0])
             raise FormatError(
                 where,
                 expected=f"class ids of {table.name}",
                 found=f"{bad} ({int(np.count_nonzero(labels == bad))} times)",
-                advice=f"the convention {self.name} has no class for it",
+                advice=f"the convention {self.name} has no class for this id: correct the labels, or use another convention",
             )
         return found
 
@@ -207,7 +208,7 @@ class Convention:
     def _lookups(self) -> dict[str, NDArray[np.uint8]]:
         lookups = {}
         for name, mapping in self.maps.items():
-            lookups[name] = np.full(max(mapping) + 2, _UNKNOWN, np.uint8)  # one more: for all ids beyond the last
+            lookups[name] = np.full(max(mapping) + 2, _UNKNOWN, np.uint8)  # one more entry, for all larger ids
             for old, new in mapping.items():
                 lookups[name][old] = _LEFT_OUT if new == IGNORED else new
         return lookups
@@ -224,7 +225,7 @@ def convention_named(name: str) -> Convention:
 
 
 def own_convention(table: ClassTable, *, free: int = 0) -> Convention:
-    """Return a convention that scores the ids of a class table as they are: known voxels, the mean over all classes, free among them."""
+    """Return a convention that scores the unchanged ids of a class table: known voxels, and the mean over all classes, including free."""
     return Convention(
         "own", f"the data's own classes ({table.name})", table, free, tuple(sorted(table.names)), {table.name: _identity(table)},
         table, table, notes="Scores of other data sets cannot be compared with this one.",
@@ -236,7 +237,7 @@ def _identity(table: ClassTable) -> dict[int, int]:
 
 
 def _without_zero(mapping: Mapping[int, int]) -> dict[int, int]:
-    """Return a map to SemanticKITTI's 19 classes in which every id but 0 that maps to 0 is left out: raw 0 is empty space."""
+    """Return a map to the 19 classes of SemanticKITTI without ids above 0 that map to 0, because 0 is empty space."""
     return {old: IGNORED if new == 0 and old != 0 else new for old, new in mapping.items()}
 
 
@@ -293,7 +294,7 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 },
                 SEMANTICKITTI,
                 SEMANTICKITTI,
-                notes="Classes outside the 19 do not count in the truth; predicted, they are empty (the official script stops there).",
+                notes="Classes outside the 19 are ignored in the ground truth, and empty in predictions (the official script stops).",
             ),
             Convention(
                 "sscbench",
@@ -313,14 +314,14 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 name="occ3d-lidar-sparseocc",
                 title="Occ3D-nuScenes as SparseOcc's script takes the mean",
                 absent="skip-truth",
-                notes="A class that is not in the truth is left out of the mean even if it was predicted.",
+                notes="A class that is not in the ground truth is left out of the mean, even if it was predicted.",
             ),
             replace(
                 _OCC3D_LIDAR,
                 name="occ3d-camera",
                 title="Occ3D-nuScenes, voxels that a camera observed",
                 seen_by="camera",
-                notes="Grids without the field `seen` do not say which voxels a camera observed, so this score does not exist for them.",
+                notes="This score needs grids with the field `seen`, which voxels a camera observed.",
             ),
             Convention(
                 "openoccupancy",

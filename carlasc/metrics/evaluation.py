@@ -1,4 +1,4 @@
-"""Scoring the predicted grids of a whole data set, one frame in memory at a time, by one convention or by all of them."""
+"""Scoring the predicted grids of a whole data set, one frame in memory at a time, by one or all conventions."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from carlasc.metrics.scoring import Scoring
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 
-_FrameBatch = tuple[Pair, list[int]]  # frames of one pair, which a worker scores together
+_FrameBatch = tuple[Pair, list[int]]  # frames of one pair that a worker scores in one task
 _Known = Callable[[Literal["lidar", "camera"]], NDArray[np.bool_] | None]
-# Labels of a prediction and of the truth, and `known` of the truth, which is read once for all conventions.
+# Labels of prediction and ground truth, and `known` of the ground truth, which is read once for all conventions.
 LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], _Known]
-_DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # bands of `by`
+_DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # edges and number of the bands of `by`
 _TOGETHER = 8  # frames that a worker scores in one task
 
 
 class Scorer:
-    """Adds up the frames of all sequences by one convention."""
+    """Accumulates the frames of all sequences by one convention."""
 
     def __init__(
         self, convention: str | Convention | None, pairs: list[Pair], source_classes: str | None, scoring: Scoring
@@ -61,7 +61,7 @@ class Scorer:
             self.impossible = error
 
     def empty(self) -> Scorer:
-        """Return a scorer by the same rules to which nothing was added."""
+        """Return an empty scorer with the same rules."""
         other = copy(self)
         other.matrices = {path: self._matrix() for path in self.matrices}
         other.failures, other.frames = [], []
@@ -73,7 +73,7 @@ class Scorer:
         return other
 
     def merge(self, other: Scorer) -> None:
-        """Add what another scorer by the same rules has added up."""
+        """Add the sums of another scorer with the same rules."""
         for path, matrix in other.matrices.items():
             self.matrices[path] += matrix
         self.failures += other.failures
@@ -85,7 +85,7 @@ class Scorer:
             self.actors.merge(other.actors)
 
     def add(self, pair: Pair, frame: int, content: LabelPair | CarlascError) -> None:
-        """Score a frame, or record the reason why it cannot be scored."""
+        """Score a frame, or record the error that prevents it."""
         if self.impossible is not None:
             return
         path, frame_name = pair.truth.path, pair.truth.name_of(frame)
@@ -102,7 +102,7 @@ class Scorer:
         self.frames.append(FrameScore(path, frame_name, self.convention.score(matrix)))
 
     def result(self, name: str, notes: tuple[str, ...]) -> Evaluation | CarlascError:
-        """Return the scores of all frames that were added, or the error that prevented them."""
+        """Return the scores of all added frames, or the error that prevented them."""
         if self.impossible is not None:
             return self.impossible
         summed = sum(self.matrices.values(), self._matrix())
@@ -116,7 +116,7 @@ class Scorer:
         return ConfusionMatrix(self.convention.num_classes, free=self.convention.free)
 
     def _check(self, pair: Pair, given: ClassTable | None) -> tuple[ClassTable, ClassTable]:
-        """Return the class tables of a pair's sides, after checking that the convention can score them."""
+        """Return the class tables of prediction and ground truth, after checking that the convention can score them."""
         truth = pair.truth.classes or self.convention.usual_truth
         prediction = given or pair.prediction.classes or self.convention.usual_prediction
         self.convention.check(truth, pair.truth.location)
@@ -125,15 +125,15 @@ class Scorer:
         if needs_seen and pair.truth.known(int(pair.truth.frames()[0]), "camera") is None:
             raise MissingDataError(
                 pair.truth.location,
-                expected="which voxels a camera observed",
-                found="data without cameras, or without the field `seen`",
-                advice="make the grids with --keep-seen, or score without what cameras see",
+                expected="cameras and the field `seen`, which voxels a camera observed",
+                found="data without one of them",
+                advice="make the grids with --keep-seen, or leave out the scores by `seen`",
             )
         true_spec, predicted_spec = pair.truth.spec, pair.prediction.spec
         if true_spec and predicted_spec and true_spec != predicted_spec:
             raise FormatError(
                 pair.prediction.location,
-                expected=f"the truth's grid {true_spec} {true_spec.lower} .. {true_spec.upper}",
+                expected=f"the geometry of the ground truth, {true_spec} {true_spec.lower} .. {true_spec.upper}",
                 found=f"{predicted_spec} {predicted_spec.lower} .. {predicted_spec.upper}",
             )
         if self.scoring.actors:
@@ -149,7 +149,7 @@ class Scorer:
         if (self.scoring.rays or "motion" in self.scoring.by) and not isinstance(pair.truth, SequenceGrid):
             raise ArgumentError(
                 "rays" if self.scoring.rays else "by",
-                expected="a data set with poses and scans as the truth",
+                expected="a data set with poses and scans as ground truth",
                 found="files of grids",
             )
         return prediction, truth
@@ -171,24 +171,24 @@ class Scorer:
                 for masks in self._masks(pair, frame, spec, true, known, tables[1]):
                     self.breakdown.update(pred, true, masks, counted)
                 if self.rays is not None and isinstance(pair.truth, SequenceGrid):
-                    # Rays begin where the sensor was in the frames with a true grid.
+                    # Rays begin at the sensor positions of the frames with ground truth.
                     numbers = pair.truth.frames().tolist()
                     poses = np.stack([pair.truth.sequence.read_pose(number) for number in numbers])
                     self.rays.update(pred, true, spec, ray_origins(poses, numbers.index(frame), spec))
-        except FormatError as error:  # the message must name the side
+        except FormatError as error:  # add the location of prediction or ground truth to the message
             side = pair.prediction if error.where == "prediction" else pair.truth
             raise error.within(f"{side.location}: frame {pair.truth.name_of(frame)}") from error
         return matrix
 
     def _known(self, pair: Pair, frame: int, known_by: _Known, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
-        """Return which voxels the truth evaluated; None: all of them."""
+        """Return the known voxels of the ground truth; None for all."""
         if self.scoring.voxels == "all":
             return None
         known = known_by(self.convention.seen_by)
         if known is None and self.convention.unknown == "left out":
             raise MissingDataError(
                 f"{pair.truth.location}: frame {pair.truth.name_of(frame)}",
-                expected="counts or a mask, which say what is known",
+                expected="counts or a mask of known voxels",
                 found="none",
                 advice="give `voxels=all` to score all voxels",
             )
@@ -203,7 +203,7 @@ class Scorer:
         known: NDArray[np.bool_] | None,
         table: ClassTable,
     ) -> Iterator[Masks]:
-        """Yield the masks of each breakdown that was asked for."""
+        """Yield the masks of each requested breakdown."""
         counts = None if known is None else known.astype(np.float32).reshape(spec.size)
         if "distance" in self.scoring.by:
             yield distance_bands(spec, _DISTANCES_M)
@@ -248,26 +248,26 @@ def evaluate(
     Args:
         source: the predictions: anything that `carlasc.open` opens, the folder of one grid, a folder of `.label` files, or files of
             SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc.
-        truth: the ground truth, likewise.
-        convention: the benchmark whose rules are used: a Convention or a name in `carlasc.metrics.CONVENTIONS`. It says which voxels
-            count, in which classes, and how the mean is taken. "own" scores the unchanged classes of the data. None takes the benchmark
-            whose files the ground truth consists of; otherwise "carlasc" for class tables that it has a map for, and "own" for others.
-        grid: the grid that holds the predictions; None takes the name of the true grid, or the only grid of a sequence.
-        truth_grid: the grid that holds the ground truth; None takes `evaluation`, or the only grid of a sequence.
-        source_classes: name of the class table of the predictions, for data that do not name one. None takes the class table of the
-            convention's own files.
-        scoring: which voxels count, and what is scored beside the classes.
-        frames: the frames that are scored; None scores all frames of the ground truth.
-        name: name of the predictions in tables.
-        run: how the work is spread, and who is told of its progress.
+        truth: the ground truth, in the same forms.
+        convention: the rules of a benchmark: a Convention or a name in `carlasc.metrics.CONVENTIONS`. It defines the scored voxels, the
+            classes, and the mean. "own" scores the unchanged classes of the data. None takes the benchmark of the ground truth files; for
+            other data "carlasc" if it has a map for the class table, otherwise "own".
+        grid: name of the predicted grid; None takes the name of the true grid, or the only grid of a sequence.
+        truth_grid: name of the true grid; None takes `evaluation`, or the only grid of a sequence.
+        source_classes: name of the class table of the predictions, for data that do not name one. None takes the default table of the
+            convention.
+        scoring: voxels to score, and additional scores.
+        frames: frames to score; None scores all frames of the ground truth.
+        name: name of the predictions in tables; None takes a name from `source`.
+        run: how the work is distributed, and the progress callback.
 
     Returns:
-        The scores. Frames that could not be scored are listed in `failures`.
+        The scores. Frames that could not be scored are in `failures`.
 
     Raises:
         ArgumentError: an argument has an unknown value, or `scoring` needs data that do not exist.
         MissingDataError: no grid exists, a sequence has no ground truth, or no frame can be scored.
-        FormatError: the grids or the classes of the two sides cannot be compared.
+        FormatError: the grids or classes of prediction and ground truth cannot be compared.
     """
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
     return score_pairs(pairs, convention, source_classes, scoring, frames, name or _name_of(source), run, notes)
@@ -283,7 +283,7 @@ def score_pairs(
     run: Run,
     notes: tuple[str, ...],
 ) -> Evaluation:
-    """Return the scores of predicted grids against the true ones that they are paired with.
+    """Return the scores of pairs of predicted and true grids. For the arguments, see `evaluate`.
 
     Raises:
         CarlascError: no frame can be scored.
@@ -307,20 +307,20 @@ def evaluate_by_all_conventions(
     name: str | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Mapping[str, Evaluation | CarlascError]:
-    """Score predictions by every convention. Each frame is read once. The arguments have the meaning that they have in `evaluate`.
+    """Score predictions by every convention. Each frame is read once. For defaults, see `evaluate`.
 
     Args:
         source: the predictions: a data set, a sequence, the folder of a grid, or files of a benchmark.
-        truth: the ground truth, likewise.
-        grid: the grid that holds the predictions.
-        truth_grid: the grid that holds the ground truth.
+        truth: the ground truth, in the same forms.
+        grid: name of the predicted grid.
+        truth_grid: name of the true grid.
         source_classes: name of the class table of the predictions.
-        frames: the frames that are scored.
+        frames: frames to score.
         name: name of the predictions in tables.
-        run: how the work is spread, and who is told of its progress.
+        run: how the work is distributed, and the progress callback.
 
     Returns:
-        For the name of each convention: the scores, or the error that says why the data cannot be scored by it.
+        By name of the convention: the scores, or the error that prevented them.
     """
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
     scorers = {convention: Scorer(convention, pairs, source_classes, Scoring()) for convention in CONVENTIONS}
@@ -333,10 +333,10 @@ def _name_of(source: Place) -> str:
 
 
 def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, run: Run) -> None:
-    """Read each frame that is asked for once, and add its scores to each scorer.
+    """Read each requested frame once, and add its scores to each scorer.
 
     Raises:
-        MissingDataError: there are none.
+        MissingDataError: no frame can be scored.
     """
     chosen = FrameRange.of(frames)
     frames_of = [(pair, chosen.select(pair.truth.frames()).tolist()) for pair in pairs]
@@ -358,9 +358,9 @@ def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, 
 
 
 def _score_batch(batch: _FrameBatch, lost: str | None = None, *, scorers: Sequence[Scorer]) -> list[Scorer]:
-    """Read frames and score them, in a worker: return what there is to add to each scorer.
+    """Read and score frames in a worker, and return one new scorer for each of `scorers`.
 
-    `lost` is the message if no worker could score them: they are not read then.
+    With the message `lost`, every worker died with these frames: they are not read, and the message is recorded as failure.
     """
     parts = [scorer.empty() for scorer in scorers]
     pair, frames = batch
@@ -379,7 +379,7 @@ def _score_batch(batch: _FrameBatch, lost: str | None = None, *, scorers: Sequen
 
 
 def _read(pair: Pair, frame: int, predicted: set[int]) -> LabelPair:
-    """Return a frame's predicted and true labels, of one shape, and what is known."""
+    """Return predicted and true labels of a frame, of equal shape, and the known voxels."""
     if frame not in predicted:
         raise MissingDataError(
             pair.prediction.location, expected=f"a prediction for frame {pair.truth.name_of(frame)}", found="none"
@@ -387,5 +387,5 @@ def _read(pair: Pair, frame: int, predicted: set[int]) -> LabelPair:
     prediction, truth = pair.prediction.labels(frame), pair.truth.labels(frame)
     if prediction.size != truth.size:
         where = f"{pair.prediction.location}: frame {pair.truth.name_of(frame)}"
-        raise FormatError(where, expected=f"the truth's shape {truth.shape}", found=str(prediction.shape))
+        raise FormatError(where, expected=f"the shape of the ground truth {truth.shape}", found=str(prediction.shape))
     return prediction.reshape(truth.shape), truth, cache(partial(pair.truth.known, frame))

@@ -1,4 +1,4 @@
-"""Scoring forecasts: grids that predict what will be seen some time after the frame that they are made in."""
+"""Scoring forecasts: grids that predict a later frame."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from carlasc.metrics.temporal import moved_grid
 from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 
-_NAMED = re.compile(r"(.+)_(\d+(?:\.\d+)?)s")  # a grid of forecasts: a name, and how far ahead they are
-_TOLERANCE_S = 0.05  # of the time of a later frame: half the period of most LiDARs
+_NAMED = re.compile(r"(.+)_(\d+(?:\.\d+)?)s")  # name of a forecast grid: a name and a time horizon
+_TOLERANCE_S = 0.05  # for the time of the later frame: half the period of most LiDARs
 
 
 class FutureGrid(GridFrames):
-    """The grids of a sequence as they are some time later, by the frames in which they are to be predicted."""
+    """The grids of later frames of a sequence, by the number of the present frame, in which the forecast is made."""
 
     def __init__(self, grid: SequenceGrid, horizon_s: float, around: Around) -> None:
         """Find the later frame of each frame.
 
         Args:
             grid: the grids of the sequence.
-            horizon_s: how much later, seconds.
-            around: whose sensor the result is around: that of the frame ("present"), or that of the later frame ("future").
+            horizon_s: time between the present and the later frame, seconds.
+            around: sensor pose at the centre of the result: of the present frame ("present") or of the later frame ("future").
 
         Raises:
-            MissingDataError: no frame has a later one, or the poses are missing that move it to the present.
+            MissingDataError: no frame has a later frame, or poses to move it to the present are missing.
         """
         self.grid, self.around = grid, around
         self.path, self.location, self.spec, self.classes = grid.path, grid.location, grid.spec, grid.classes
@@ -59,11 +59,11 @@ class FutureGrid(GridFrames):
         if around == "present" and layout.POSES not in sequence.documents():
             raise MissingDataError(
                 sequence.location, expected=f"{layout.POSES}, which moves later frames to the present", found="none",
-                advice="score grids around the later frame's sensor with `around=future`",
+                advice="for grids around the sensor pose of the later frame, use `around=future`",
             )  # fmt: skip
 
     def frames(self) -> NDArray[np.int64]:
-        """Return the sorted frames that have a later one."""
+        """Return the sorted frames that have a later frame."""
         return np.array(sorted(self.later), np.int64)
 
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
@@ -71,7 +71,7 @@ class FutureGrid(GridFrames):
         return self._later(frame).labels
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (X, Y, Z) which voxels the later frame knows; None for a camera, whose view does not move with the grid."""
+        """Return (X, Y, Z) bool, the known voxels of the later frame; None for cameras, because their mask cannot be moved."""
         if seen_by == "camera" or f"{self.grid.grid}/counts" not in self.grid.sequence.fields():
             return None
         return self._later(frame).known
@@ -97,32 +97,32 @@ def evaluate_forecasts(
     frames: Frames = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> Mapping[float, Evaluation]:
-    """Score forecasts against what came, apart for each time ahead.
+    """Score forecasts against the ground truth of later frames, separately for each time horizon.
 
-    The forecasts are grids of `source` whose names end with how far ahead they are: frame 10 of `forecast_1.5s` is what was predicted in
-    frame 10 for the instant 1.5 s later. The frame that is 1.5 s later, within 0.05 s, is found by times.txt (ten frames a second without
-    it). Frames without a later one are left out.
+    The forecasts are grids of `source` whose names end with the horizon: frame 10 of `forecast_1.5s` is the forecast that was made in frame
+    10 for the time 1.5 s later. The later frame is found by times.txt, with a tolerance of 0.05 s (without times.txt: ten frames per
+    second). Frames without a later frame are left out.
 
     Args:
         source: the forecasts: a data set in the layout, in any store.
-        truth: the ground truth, likewise, with poses.txt.
-        around: whose sensor the grids are around: that of the frame that they are made in ("present"), to which the later grid is moved
-            by the poses, or that of the later frame ("future"). Voxels that the moved grid does not cover are unknown.
+        truth: the ground truth, in the same forms, with poses.txt.
+        around: sensor pose at the centre of the forecast grids: of the frame in which they are made ("present"; the later grid is moved
+            to it by the poses), or of the later frame ("future"). Voxels outside the moved grid are unknown.
         convention: as in `evaluate`.
-        grid: name of the forecasts without the time: `forecast`; None takes the only one.
-        truth_grid: the grid that holds the ground truth; None takes `evaluation`, or the only grid of a sequence.
+        grid: name of the forecast grids without the horizon, such as `forecast`; None takes the only name.
+        truth_grid: name of the true grid; None takes `evaluation`, or the only grid of a sequence.
         source_classes: as in `evaluate`.
-        scoring: which voxels count. Rays, actors and motion are not scored.
-        frames: the frames whose forecasts are scored.
-        run: how the work is spread, and who is told of its progress.
+        scoring: voxels to score. Rays, actors and motion are not supported.
+        frames: frames in which the scored forecasts are made; None for all.
+        run: how the work is distributed, and the progress callback.
 
     Returns:
-        The scores by time ahead, seconds, the smallest first.
+        The scores by horizon, seconds, in ascending order.
 
     Raises:
-        ArgumentError: an argument has an unknown value, or asks for rays, actors or motion.
-        MissingDataError: no grid of forecasts exists, or no later frame.
-        FormatError: the grids or the classes of the two sides cannot be compared.
+        ArgumentError: an argument has an unknown value, or `scoring` requests rays, actors or motion.
+        MissingDataError: no forecast grid or no later frame exists.
+        FormatError: the grids or classes of prediction and ground truth cannot be compared.
     """
     if scoring.rays or scoring.actors or "motion" in scoring.by:
         asked = "rays" if scoring.rays else "actors" if scoring.actors else "by motion"
@@ -138,17 +138,20 @@ def evaluate_forecasts(
 
 
 def _horizons(source: Place, grid: str | None) -> dict[float, str]:
-    """Return the grids of forecasts by their times ahead, sorted.
+    """Return the names of forecast grids by horizon, sorted.
 
     Raises:
-        MissingDataError: there are none.
-        ArgumentError: there are several forecasts for one time.
+        MissingDataError: no forecast grid exists.
+        ArgumentError: several forecast grids have the same horizon.
     """
     opened, found = as_source(source), dict[float, str]()
     names = sorted({name for sequence in opened.sequences().values() for name in sequence.grids})
     for match in filter(None, map(_NAMED.fullmatch, names)):
         if match[1] == (grid or match[1]) and (other := found.setdefault(float(match[2]), match[0])) != match[0]:
-            raise ArgumentError("grid", expected="the name of one of the forecasts", found=f"{other} and {match[0]}")
+            both = f"{other} and {match[0]}"
+            raise ArgumentError(
+                "grid", expected="one forecast grid per horizon", found=both, advice="choose a name with `grid`"
+            )
     if not found:
         expected = f"grids of forecasts such as {grid or 'forecast'}_1s"
         raise MissingDataError(opened.location, expected=expected, found=", ".join(names) or "no grid")

@@ -1,6 +1,6 @@
-"""The frames of a grid that can be scored, of a sequence, a plain folder of `.label` files or CarlaOcc; and two grids compared voxel by voxel.
+"""The frames of a grid to score, from a sequence, a plain folder of `.label` files or CarlaOcc; and voxel-by-voxel comparison of grids.
 
-CarlaOcc has files `{sequence}/occupancy/{grid}/0000.npz`: rows x, y, z and label of the voxels that meshes fill.
+CarlaOcc has files `{sequence}/occupancy/{grid}/0000.npz` with rows x, y, z and label of the voxels inside meshes.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class GridFrames(ABC):
     """The frames of one grid.
 
     Attributes:
-        path: of the sequence; "" for a plain folder.
+        path: path of the sequence; "" for a plain folder.
         location: name of the grid in errors.
-        spec: its geometry; None if it is not known.
-        classes: the class table of its ids; None if it is not known.
-        benchmark: the convention of the benchmark whose files these are; None for others.
+        spec: geometry; None if it is not known.
+        classes: class table of the ids; None if it is not known.
+        benchmark: name of the convention of the benchmark with this file format; None for other data.
     """
 
     path: str
@@ -52,9 +52,9 @@ class GridFrames(ABC):
 
     @abstractmethod
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return which voxels of a frame are known (counts > 0, or not invalid); None if the data do not say.
+        """Return the known voxels of a frame (counts > 0, or not invalid), bool; None if the data do not have this information.
 
-        `seen_by` chooses between what the LiDAR and what a camera observed, where data have a mask for each.
+        `seen_by` selects the mask of the LiDAR or of cameras, for data that have both.
         """
 
     def name_of(self, frame: int) -> str:
@@ -62,7 +62,7 @@ class GridFrames(ABC):
         return str(frame)
 
     def follow(self, truth: GridFrames) -> None:  # noqa: B027 (only some data need it)
-        """Take from the ground truth what files of predictions do not contain: the number of voxels and the numbers of the frames."""
+        """Take the number of voxels and the frame numbers from the ground truth, if the files of predictions lack them."""
 
 
 class SequenceGrid(GridFrames):
@@ -82,7 +82,7 @@ class SequenceGrid(GridFrames):
         return self.sequence.read(f"{self.grid}/labels", frame)
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (X, Y, Z) which voxels have votes, and with cameras which of them any camera sees; None for a grid that does not say it."""
+        """Return (X, Y, Z) bool, the voxels with votes, or those that a camera also sees; None if the grid has no such fields."""
         fields = [f"{self.grid}/counts"] + ([f"{self.grid}/seen"] if seen_by == "camera" else [])
         if not set(fields) <= self.sequence.fields():
             return None
@@ -92,9 +92,9 @@ class SequenceGrid(GridFrames):
 class LabelFolder(GridFrames):
     """A folder of `000000.label` files without params.json, as other tools write it.
 
-    The same folder may hold counts (`000000.bin`, float32), or SemanticKITTI's or SSCBench's masks (`000000.invalid`, one bit or one byte per
-    voxel). Labels are uint32, as in the layout, or uint16, as in these benchmarks: the number of voxels tells. The `000000.bin` of these
-    benchmarks holds the occupancy of a scan, in bits: its size tells that it is no file of counts.
+    The folder may also have counts (`000000.bin`, float32), or masks of SemanticKITTI or SSCBench (`000000.invalid`, one bit or one byte per
+    voxel). Labels are uint32, as in the layout, or uint16, as in these benchmarks; the type follows from the file size and the number of
+    voxels. In these benchmarks, `000000.bin` is the occupancy of a scan as bits; it is distinguished from counts by its size.
 
     Attributes:
         voxels: number of voxels per frame; None if it is not known.
@@ -102,24 +102,26 @@ class LabelFolder(GridFrames):
 
     spec: GridSpec | None = None
     classes: ClassTable | None = None
-    _width = 4  # bytes of a label where the number of voxels is not known
+    _width = 4  # bytes per label if the number of voxels is not known
 
     def __init__(self, folder: Path, path: str = "") -> None:
         self.folder, self.path, self.location = folder, path, str(folder)
         self.voxels = self._count_voxels(int(self.frames()[0])) if len(self.frames()) else None
 
     def _count_voxels(self, frame: int) -> int | None:
-        """Return the number of voxels by the sizes of a frame's files; None if only labels exist."""
+        """Return the number of voxels from the sizes of the files of a frame; None if only labels exist."""
         if (counts := self._counts(frame)) is not None:
             return counts.stat().st_size // 4
         if (invalid := self._file(frame, ".invalid")).is_file():
             size = invalid.stat().st_size
-            packed = self._file(frame, ".label").stat().st_size >= size * _BITS  # labels of two or four bytes per voxel
+            packed = (
+                self._file(frame, ".label").stat().st_size >= size * _BITS
+            )  # because labels have two or four bytes per voxel
             return size * _BITS if packed else size
         return None
 
     def _counts(self, frame: int) -> Path | None:
-        """Return the file of a frame's counts, which have four bytes per voxel; None if there is none."""
+        """Return the file of counts of a frame, with four bytes per voxel; None if it does not exist."""
         counts, labels = self._file(frame, ".bin"), self._file(frame, ".label")
         if not counts.is_file() or self._file(frame, ".invalid").is_file():
             return None
@@ -145,7 +147,7 @@ class LabelFolder(GridFrames):
         """Return (X * Y * Z,) labels.
 
         Raises:
-            FormatError: the file does not have the size of a grid.
+            FormatError: the file size does not fit a grid.
         """
         path = self._file(frame, ".label")
         size = path.stat().st_size
@@ -159,12 +161,14 @@ class LabelFolder(GridFrames):
                 path,
                 expected=expected,
                 found=f"{size} bytes",
-                advice="the file is truncated, of another grid, or of another type",
+                advice="the file may be truncated, of another grid, or of another type",
             )
-        return np.fromfile(path, types[width], int(size // width))  # the size is that of a file: a device has none
+        return np.fromfile(
+            path, types[width], int(size // width)
+        )  # with the size of the file, because devices have no size
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (X * Y * Z,) which voxels have votes, or are not invalid; None if there is no such file.
+        """Return (X * Y * Z,) bool, the voxels that have votes or are not invalid; None if no such file exists.
 
         Raises:
             FormatError: the file does not have the size of a grid.
@@ -180,7 +184,7 @@ class LabelFolder(GridFrames):
                     invalid,
                     expected=f"{self.voxels} bytes, or {-(-self.voxels // _BITS)} of packed bits",
                     found=str(found.size),
-                    advice="the file is truncated, or of another grid",
+                    advice="the file may be truncated, or of another grid",
                 )
             return (found if found.size == self.voxels else np.unpackbits(found, count=self.voxels)) == 0
         return None
@@ -190,29 +194,29 @@ class LabelFolder(GridFrames):
 
 
 class VoxelOutcome(IntEnum):
-    """How one voxel of a prediction compares with the ground truth."""
+    """Result of the comparison of one voxel of a prediction with the ground truth."""
 
     NOT_COMPARED = 0
-    """The truth is unknown, or both are free."""
+    """The ground truth is unknown, or both are free."""
     RIGHT = 1
     """Occupied in both, with the same class."""
     WRONG = 2
     """Occupied in both, with different classes."""
     MISSED = 3
-    """Occupied in the truth, predicted free."""
+    """Occupied in the ground truth, predicted free."""
     INVENTED = 4
-    """Free in the truth, predicted occupied."""
+    """Free in the ground truth, predicted occupied."""
 
 
 def compare_grids(prediction: Grid, truth: Grid) -> NDArray[np.uint8]:
     """Compare a prediction with the ground truth, voxel by voxel.
 
     Args:
-        prediction: its class ids must be of the same class table as the truth's.
-        truth: voxels with count 0 are unknown and are not compared; without counts, every voxel is known.
+        prediction: predicted grid, with the same class table as the ground truth.
+        truth: true grid. Voxels with count 0 are unknown and are not compared; without counts, all voxels are known.
 
     Returns:
-        (X, Y, Z) uint8, an `VoxelOutcome` for each voxel.
+        (X, Y, Z) uint8, a `VoxelOutcome` per voxel.
 
     Raises:
         ArgumentError: the grids differ in their geometry.
@@ -228,22 +232,22 @@ def compare_grids(prediction: Grid, truth: Grid) -> NDArray[np.uint8]:
 
 
 def check_same_geometry(prediction: GridSpec, truth: GridSpec) -> None:
-    """Raise ArgumentError if a prediction's grid and the truth's have different sizes, bounds or coordinates."""
+    """Raise ArgumentError if the grids of prediction and ground truth have different sizes, bounds or coordinates."""
     if prediction != truth:
         raise ArgumentError(
             "truth",
-            expected=f"the geometry of the prediction's grid ({prediction}, {prediction.lower} to {prediction.upper})",
+            expected=f"the geometry of the predicted grid ({prediction}, {prediction.lower} to {prediction.upper})",
             found=f"{truth}, {truth.lower} to {truth.upper}",
             advice="choose another grid with `grid` or `truth_grid`",
         )
 
 
 CARLAOCC_GRIDS = ("vs_0_4_surround_view", "vs_0_2_forward_view", "vs_0_1")
-"""Names of grids; the first that exists is the default."""
+"""Names of grids. The first existing one is the default."""
 
 
 class CarlaOccGrids(GridFrames):
-    """The grids of one name of a sequence of CarlaOcc.
+    """The grids of a sequence of CarlaOcc with one name.
 
     Args:
         folder: the folder of the sequence.
@@ -266,7 +270,7 @@ class CarlaOccGrids(GridFrames):
         return self._read(frame)[0]
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_]:
-        """Return (X, Y, Z) which voxels have a class or are free: all but those that something without a class fills."""
+        """Return (X, Y, Z) bool, the voxels that have a class or are free. Occupied voxels without a class are unknown."""
         return self._read(frame)[1]
 
     def _read(self, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -277,7 +281,7 @@ class CarlaOccGrids(GridFrames):
 
 
 def find_carlaocc(folder: Path, grid: str | None) -> list[CarlaOccGrids]:
-    """Return the grids of the sequences in a folder, or of the sequence that it is; None takes the first name of `CARLAOCC_GRIDS` that exists."""
+    """Return the grids of a sequence folder, or of all sequences in a folder. With None, the first existing name of `CARLAOCC_GRIDS` is used."""
     found = []
     for sequence in (folder, *sorted(path for path in folder.glob("*") if path.is_dir())):
         existing = sorted(path.name for path in (sequence / "occupancy").glob("*") if any(path.glob("[0-9]*.npz")))
@@ -287,15 +291,15 @@ def find_carlaocc(folder: Path, grid: str | None) -> list[CarlaOccGrids]:
 
 
 def sequence_name(folder: Path) -> str:
-    """Return the name that a sequence has in the layout: what follows the last "_" selects it."""
+    """Return the name of a sequence in the layout: the part after the last "_" of the folder."""
     return f"CARLAOCC_{folder.resolve().name.replace('_', '-')}"
 
 
 def read_voxels(path: str | Path, spec: GridSpec) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return (X, Y, Z) tags of a grid and which voxels are known: all but those that something without a class fills.
+    """Return (X, Y, Z) tags of a grid, and (X, Y, Z) bool, the known voxels. Occupied voxels without a class are unknown.
 
     Raises:
-        FormatError: the file is no grid of this geometry.
+        FormatError: the file is not a grid of this geometry.
     """
     rows = _read_arrays(path, {"occupancy": ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)})[0]
     cells = rows[:, :3].astype(np.int64)
@@ -309,10 +313,10 @@ def read_voxels(path: str | Path, spec: GridSpec) -> tuple[NDArray[np.uint8], ND
 
 
 def semantic_ids(codes: NDArray[np.unsignedinteger]) -> NDArray[np.uint8]:
-    """Return the classes of voxel labels, which also hold an instance.
+    """Return the classes of voxel labels, which combine class and instance.
 
-    The documentation says `1000 * class + instance`, the code that made the files `2048 * class + instance`. Most voxels belong to
-    classes whose instance is always 0, and no label above 0 is a multiple of both, so the labels tell which of the two they follow.
+    The documentation has `1000 * class + instance`, the code that made the files `2048 * class + instance`. Most voxels belong to classes
+    whose instance is always 0, and no label above 0 is a multiple of both numbers, so the formula can be determined from the labels.
     """
     decimal, binary = int(np.count_nonzero(codes % 1000 == 0)), int(np.count_nonzero(codes % 2048 == 0))
     return (codes // (1000 if decimal > binary else 2048)).astype(np.uint8)
@@ -331,8 +335,8 @@ def read_geometry(path: str | Path) -> GridSpec:
         cells = np.asarray(size, np.int64).reshape(3)
         x, y, z = cells.tolist()
         check_size((x, y, z), np.dtype(np.uint8), str(path))
-        # Decimals first, because the origin is float32 and the size of a voxel is not: the bounds are then those of the documentation,
-        # in float32, as `--bounds` gives them.
+        # Rounded to decimals first, because the origin is float32 and the voxel size is not: the bounds are then those of the
+        # documentation in float32, as with `--bounds`.
         low, up = np.round(lower, 4).tolist(), np.round(lower + cells * float(step), 4).tolist()
         return GridSpec("cartesian", (x, y, z), (low[0], low[1], low[2]), (up[0], up[1], up[2])).with_bounds(low, up)
     except (TypeError, ValueError, OverflowError) as error:

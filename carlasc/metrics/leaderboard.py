@@ -1,4 +1,4 @@
-"""Several results in one table: Markdown, LaTeX, or HTML with a small chart of the IoU of each class."""
+"""A table of several results, as Markdown, LaTeX, or HTML with a small chart of the IoU of each class."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 _FIGURES = {"miou": "mIoU", "iou": "IoU", "precision": "Precision", "recall": "Recall", "false_free": "False free"}
 _REQUIRED = ("name", "convention", "frames", "class_iou", *_FIGURES)
-_BAR, _HEIGHT = 7, 24  # pixels of a class's bar in the chart
+_BAR, _HEIGHT = 7, 24  # pixels: width of a bar, and height of the chart
 
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """Results by one convention, side by side.
+    """Results of several predictions in one table.
 
     Attributes:
-        convention: its name; several, joined by commas, where mixing was allowed.
-        results: what `Evaluation.to_dict` gave, one per set of predictions.
+        convention: name of the convention; several names, joined by commas, if mixing was allowed.
+        results: result of `Evaluation.to_dict` for each prediction.
     """
 
     convention: str
@@ -37,11 +37,11 @@ class ScoreTable:
 
     @property
     def class_names(self) -> list[str]:
-        """The classes of all results, in the order of the first one."""
+        """The classes of all results, in the order of the first result."""
         return list(dict.fromkeys(name for result in self.results for name in result["class_iou"]))
 
     def table(self, *, classes: bool = True) -> FigureTable:
-        """Return the figures in percent, one row per result; `classes` adds a column per class."""
+        """Return the scores in percent, one row per result. `classes` adds a column per class."""
         rayed = any(result.get("rayiou") is not None for result in self.results)
         mixed = len({result["convention"] for result in self.results}) > 1
         names = self.class_names if classes else []
@@ -68,7 +68,7 @@ class ScoreTable:
         return f"{table.title}\n\n" + "\n".join(rows) + "\n"
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return a row per result, with the columns of `table`; figures as fractions, NaN where one is not defined.
+        """Return one row per result, with the columns of `table`. Scores are fractions, NaN if undefined.
 
         Raises:
             DependencyError: pandas is not installed.
@@ -85,7 +85,7 @@ class ScoreTable:
         return self.table().to_latex()
 
     def to_html(self) -> str:
-        """Return a self-contained HTML page: the figures, and for each result a bar per class."""
+        """Return a self-contained HTML page: the scores, and a bar chart of classes for each result."""
         table = self.table(classes=False)
         header = "".join(f"<th>{html.escape(name)}</th>" for name in (*table.header, "IoU of each class"))
         rows = ""
@@ -113,11 +113,11 @@ def scores(files: Iterable[str | os.PathLike[str]], *, mixed: bool = False) -> S
 
     Args:
         files: JSON files.
-        mixed: allow results by different conventions, and name each one's.
+        mixed: allow different conventions, and show the convention of each result.
 
     Raises:
-        ArgumentError: results by different conventions, which cannot be compared, without `mixed`.
-        FormatError: a file does not hold a result.
+        ArgumentError: the conventions differ, so the results cannot be compared, and `mixed` is not given.
+        FormatError: a file is not a result of an evaluation.
         MissingDataError: a file does not exist, or none was given.
     """
     results = tuple(_read(Path(file)) for file in files)
@@ -129,7 +129,7 @@ def scores(files: Iterable[str | os.PathLike[str]], *, mixed: bool = False) -> S
             "files",
             expected="results by one convention",
             found=", ".join(conventions),
-            advice="score them by the same one, or give `mixed=True` to print them side by side",
+            advice="score them by the same convention, or give `mixed=True` to print them side by side",
         )
     return ScoreTable(", ".join(conventions), results)
 

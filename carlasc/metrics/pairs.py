@@ -1,6 +1,6 @@
-"""Opening the grids that are scored, also in the files of other benchmarks, and matching the predicted ones with the true ones.
+"""Opening grids to score, also in file formats of other benchmarks, and matching predicted with true grids.
 
-The other files are Occ3D's and CarlaOcc's `.npz`, OpenOccupancy's `.npy`, and the folders of SemanticKITTI and SSCBench.
+The other formats are `.npz` of Occ3D and CarlaOcc, `.npy` of OpenOccupancy, and the folders of SemanticKITTI and SSCBench.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _LABELS = (
     "semantics",
     "pred",
     "occ_pred",
-)  # names of the array of classes in an .npz: the benchmark's own, and other common ones
+)  # possible names of the array of classes in an .npz: the name of the benchmark, and other common names
 _NOISE = 255
 
 
 class TokenFrames(GridFrames):
-    """A scene whose frames are named by tokens. Frames are numbered in the order of the tokens of the ground truth.
+    """A scene with tokens as names of frames. Frames are numbered in the order of the tokens of the ground truth.
 
     Attributes:
         files: file of each frame, by token.
@@ -51,7 +51,7 @@ class TokenFrames(GridFrames):
         self.tokens = sorted(files)
 
     def follow(self, truth: GridFrames) -> None:
-        """Number the frames as the ground truth does."""
+        """Take the numbering of frames from the ground truth."""
         if isinstance(truth, TokenFrames):
             self.tokens = truth.tokens
 
@@ -85,7 +85,7 @@ class Occ3dScene(TokenFrames):
         return labels.astype(np.uint8, copy=False)
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return the (200, 200, 16) mask of the voxels that the LiDAR or a camera observed; None if the file does not contain it."""
+        """Return (200, 200, 16) bool, the voxels that the LiDAR or a camera observed; None if the file does not contain the mask."""
         name = f"mask_{seen_by}"
         with open_npz(self._file(frame)) as arrays:
             if name not in arrays.names:
@@ -94,18 +94,18 @@ class Occ3dScene(TokenFrames):
 
 
 class OpenOccupancyScene(TokenFrames):
-    """A scene of OpenOccupancy-nuScenes: `scene_{token}/occupancy/{lidar_token}.npy`, rows z, y, x, ..., class of occupied voxels."""
+    """A scene of OpenOccupancy-nuScenes: `scene_{token}/occupancy/{lidar_token}.npy` with rows z, y, x, ..., class of occupied voxels."""
 
     spec, classes, benchmark = OPENOCCUPANCY_SPEC, OPENOCCUPANCY, "openoccupancy"
 
     def labels(self, frame: int) -> NDArray[np.unsignedinteger]:
-        """Return (512, 512, 40) labels; a stored 0 is noise, 255 here."""
+        """Return (512, 512, 40) labels. The stored id 0, noise, becomes 255."""
         file = self._file(frame)
         rows = read_npy(file, ArrayFormat(NUMBERS, (None, None)))
         if rows.shape[1] not in (4, 7):
             raise FormatError(file, expected="rows of 4 or 7 columns (z, y, x, ..., class)", found=str(rows.shape))
         if not np.isfinite(rows).all():
-            raise FormatError(file, expected="finite numbers", found="others")
+            raise FormatError(file, expected="finite numbers", found="NaN or infinity")
         z, y, x = rows[:, :3].astype(np.int64).T
         classes = rows[:, -1].astype(np.int64)
         size = np.array(self.spec.size)[:, None]
@@ -118,14 +118,14 @@ class OpenOccupancyScene(TokenFrames):
         return labels
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> None:
-        """Return None, because the benchmark does not say which voxels were observed."""
+        """Return None, because the benchmark has no masks of observed voxels."""
         return None
 
 
 class KittiFolder(LabelFolder):
     """A folder of SemanticKITTI or SSCBench: `.label` files of raw ids, uint16, and masks.
 
-    The geometry is known if the files have the size of the benchmarks' grid.
+    The geometry is known if the files have the size of the grid of the benchmarks.
     """
 
     classes: ClassTable | None = SEMANTICKITTI
@@ -141,7 +141,7 @@ class KittiFolder(LabelFolder):
 
 
 def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
-    """Yield the grids of a folder in the layout of another benchmark; nothing if it has none of these layouts."""
+    """Yield the grids of a folder in the layout of another benchmark; nothing if the folder has another layout."""
     for scene in sorted(path for path in folder.glob("*") if path.is_dir()):
         if files := {file.parent.name: file for file in scene.glob("*/labels.npz")}:
             yield Occ3dScene(scene, scene.name, files)
@@ -150,7 +150,7 @@ def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "t
     if (folder / "gts").is_dir():
         yield from foreign_grids(folder / "gts", grid, role)
     yield from find_carlaocc(folder, grid)
-    # a folder without predictions is scored as it is: an export, or another ground truth
+    # without a folder of predictions, the folder itself is scored, such as an export or another ground truth
     names = (grid,) if grid else {"prediction": ("predictions", "voxels"), "truth": ("voxels",)}[role]
     for pattern, benchmark in (("sequences/*", "semantickitti"), ("data_2d_raw/*", "sscbench")):
         for sequence in sorted(folder.glob(pattern)):
@@ -162,21 +162,21 @@ def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "t
 
 @dataclass(frozen=True)
 class Pair:
-    """A predicted grid and the true one."""
+    """A predicted grid and its true grid."""
 
     prediction: GridFrames
     truth: GridFrames
 
     @property
     def spec(self) -> GridSpec | None:
-        """The geometry of both; None if it is not known."""
+        """Geometry of both grids; None if it is not known."""
         return self.truth.spec or self.prediction.spec
 
 
 def pair_grids(
     source: Place, truth: Place, grid: str | None, truth_grid: str | None
 ) -> tuple[list[Pair], tuple[str, ...]]:
-    """Match predictions with the ground truth: by the paths of their sequences, or, if each side has one sequence, that one.
+    """Match predictions with ground truth by the paths of sequences. If each side has only one sequence, they match.
 
     Args:
         source: the predictions, as for `evaluate`.
@@ -185,10 +185,10 @@ def pair_grids(
         truth_grid: name of the true grid; None takes `evaluation`, or the only grid of a sequence.
 
     Returns:
-        The pairs, and notes: which sequences of the truth have no prediction.
+        The pairs, and notes about true sequences without a prediction.
 
     Raises:
-        MissingDataError: a side has no grid, or a predicted sequence has no ground truth.
+        MissingDataError: prediction or ground truth has no grid, or a predicted sequence has no ground truth.
     """
     truths = {grids.path: grids for grids in open_grids(truth, truth_grid, "truth")}
     predictions = list(open_grids(source, grid or truth_grid, "prediction"))
@@ -204,12 +204,12 @@ def pair_grids(
             raise MissingDataError(pair.truth.location, expected=expected, found=found)
         pair.prediction.follow(pair.truth)
     left = sorted(set(truths) - {pair.truth.path for pair in pairs})
-    note = f"{len(left)} of {len(truths)} sequences of the truth have no prediction and were not scored: {', '.join(left[:3])}"
+    note = f"{len(left)} of {len(truths)} sequences of the ground truth have no prediction and were not scored: {', '.join(left[:3])}"
     return pairs, (note + (", ..." if len(left) > 3 else ""),) if left else ()
 
 
 def _truth_of(prediction: GridFrames, truths: Mapping[str, GridFrames]) -> GridFrames:
-    """Return the true grid of the path, or the only one of the name: other benchmarks' folders name sequences without their splits."""
+    """Return the true grid with the same path, otherwise the only one with the same name, because other benchmarks have no split in the path."""
     if prediction.path in truths:
         return truths[prediction.path]
     name = identity_of(prediction.path)[1:]
@@ -219,25 +219,25 @@ def _truth_of(prediction: GridFrames, truths: Mapping[str, GridFrames]) -> GridF
             prediction.location,
             expected=f"ground truth for the sequence {prediction.path!r}",
             found=first_names(truths, 3),
-            advice="sequences are matched by path or by name; give one sequence of each side if they have other names",
+            advice="sequences are matched by path or by name; if names differ, give single sequences",
         )
     return same_name[0]
 
 
 def open_grids(place: Place, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
-    """Yield the grids of a place that `evaluate` reads: a data set, the folder of a grid, or files of another benchmark.
+    """Yield the grids at a place: a data set, the folder of a grid, or files of another benchmark.
 
     Args:
-        place: where they are.
+        place: path, URL or source of the grids.
         grid: name of the grid; None takes `evaluation`, or the only grid of a sequence.
-        role: whether they are predictions, which may be in other folders of a benchmark.
+        role: whether to look for predictions or ground truth, which are in different folders of some benchmarks.
 
     Raises:
-        MissingDataError: there is none.
+        MissingDataError: no grid exists.
     """
     if not isinstance(place, Source):
         folder = Path(place)
-        if (folder / layout.PARAMS).is_file():  # the folder of one grid: its sequence is the folder above
+        if (folder / layout.PARAMS).is_file():  # folder of one grid; the folder above is the sequence
             place, grid = folder.absolute().parent, folder.absolute().name
         elif folder.is_dir() and len((plain := LabelFolder(folder)).frames()):
             yield plain
@@ -258,7 +258,7 @@ def open_grids(place: Place, grid: str | None, role: Literal["prediction", "trut
 
 
 def _choose_grid(sequence: Sequence, grid: str | None) -> str | None:
-    """Return the grid of that name; without a name `evaluation`, or the only grid; None if the sequence has no such grid."""
+    """Return `grid`, or by default `evaluation` or the only grid; None if the sequence has no such grid."""
     names = [name for name in sequence.grids if f"{name}/labels" in sequence.fields()]
     if grid is not None:
         return grid if grid in names else None
@@ -269,6 +269,6 @@ def _choose_grid(sequence: Sequence, grid: str | None) -> str | None:
             sequence.location,
             expected=f"the grid {layout.EVALUATION}",
             found=", ".join(names),
-            advice="choose one with `grid` or `truth_grid`",
+            advice="choose a grid with `grid` or `truth_grid`",
         )
     return names[0] if names else None

@@ -1,4 +1,4 @@
-"""Panoptic quality: recognition and segmentation of single objects and of stuff classes (Kirillov et al., CVPR 2019)."""
+"""Panoptic quality: recognition and segmentation of objects and of stuff classes (Kirillov et al., CVPR 2019)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from carlasc.metrics.confusion import check_ids, ratio, to_numpy
 from carlasc.metrics.scoring import Summed
 
 Variant = Literal["standard", "pasco"]
-_SLOTS = 256  # of the tables of latest segments and pairs; a power of two
-_MATCH = 0.5  # above it, a segment has at most one match, so that no search is needed
+_SLOTS = 256  # size of the tables of recent segments and pairs; a power of two
+_MATCH = 0.5  # above this IoU, a segment has at most one match, so no search is needed
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class PanopticScore:
         sq: (K,) segmentation quality: mean IoU of the matched segments.
         rq: (K,) recognition quality: F1 score of finding segments.
         iou: (K,) IoU of each class over elements, for PQ-dagger.
-        things: ids of the classes whose instances count one by one; the others are stuff.
+        things: ids of classes with separate instances; the other classes are stuff.
     """
 
     pq: NDArray[np.float64]
@@ -38,7 +38,7 @@ class PanopticScore:
     things: frozenset[int]
 
     def mean(self, what: Literal["pq", "sq", "rq"] = "pq", which: Literal["all", "things", "stuff"] = "all") -> float:
-        """Return the mean over the classes that occur: all of them, only things, or only stuff; NaN if none occurs."""
+        """Return the mean over the occurring classes: all, only things, or only stuff; NaN if none occurs."""
         values = getattr(self, what)
         is_thing = np.isin(np.arange(len(values)), sorted(self.things))
         keep = {"all": np.ones_like(is_thing), "things": is_thing, "stuff": ~is_thing}[which] & ~np.isnan(self.pq)
@@ -46,7 +46,7 @@ class PanopticScore:
 
     @property
     def pq_dagger(self) -> float:
-        """PQ-dagger: the mean over classes of PQ for things and of the class's IoU for stuff (Porzi et al., CVPR 2019)."""
+        """PQ-dagger: the mean over classes of PQ for things and of IoU for stuff (Porzi et al., CVPR 2019)."""
         is_thing = np.isin(np.arange(len(self.pq)), sorted(self.things))
         values = np.where(is_thing, self.pq, self.iou)[~np.isnan(self.pq)]
         return float(values.mean()) if len(values) else float("nan")
@@ -54,14 +54,14 @@ class PanopticScore:
 
 @dataclass(frozen=True)
 class Segments:
-    """The segments of a prediction and of the truth, and how they overlap.
+    """The segments of prediction and ground truth, and their overlaps.
 
     Attributes:
         pred_class: (P,) class of each predicted segment.
-        pred_size: (P,) its elements.
+        pred_size: (P,) number of elements of each predicted segment.
         true_class: (T,) class of each true segment.
-        true_size: (T,) its elements.
-        overlaps: (M, 3) predicted segment, true segment, elements in common; of equal classes.
+        true_size: (T,) number of elements of each true segment.
+        overlaps: (M, 3) predicted segment, true segment, and number of common elements; only pairs with equal classes.
     """
 
     pred_class: NDArray[np.int64]
@@ -72,16 +72,16 @@ class Segments:
 
 
 class PanopticQuality(Summed):
-    """Adds up matched segments of predictions and truths.
+    """Accumulates matched segments of predictions and ground truth.
 
-    A predicted and a true segment match where they have the same class and an IoU over 0.5. Free elements belong to no segment.
+    A predicted and a true segment match if they have the same class and an IoU above 0.5. Free elements belong to no segment.
 
     Attributes:
         num_classes: K; ids are 0..K-1.
-        things: ids of the classes whose instances count one by one; all elements of another class are one segment per frame.
+        things: ids of classes with separate instances; for other classes, all elements of a frame are one segment.
         free: id of free space.
-        variant: "standard", or "pasco": a stuff segment matches the true segment of its class if they overlap at all, as in PaSCo's
-            evaluation script. Stuff is then never a false positive if its class occurs in the truth.
+        variant: "standard", or "pasco": as in the evaluation script of PaSCo, a stuff segment matches the true segment of its class at any
+            overlap. Stuff is then never a false positive if its class occurs in the ground truth.
     """
 
     _SETTINGS, _SUMS = ("num_classes", "things", "free", "variant"), ("counts", "iou_sum", "elements")
@@ -99,10 +99,10 @@ class PanopticQuality(Summed):
         self.reset()
 
     def reset(self) -> None:
-        """Remove everything that was added."""
+        """Set all sums to zero."""
         self.counts = np.zeros((3, self.num_classes), np.int64)  # true positives, false positives, false negatives
         self.iou_sum = np.zeros(self.num_classes)
-        self.elements = np.zeros((3, self.num_classes), np.int64)  # in common, predicted, true
+        self.elements = np.zeros((3, self.num_classes), np.int64)  # common, predicted, true
 
     def update(
         self,
@@ -113,9 +113,9 @@ class PanopticQuality(Summed):
         """Add a frame.
 
         Args:
-            prediction: class ids and instance ids, of equal shape; instance ids of stuff do not matter.
-            truth: likewise.
-            mask: the same shape, bool: only these elements count.
+            prediction: class ids and instance ids, of equal shape. Instance ids of stuff are ignored.
+            truth: true class ids and instance ids, of the same shape.
+            mask: the same shape, bool: only these elements are scored; None scores all.
 
         Raises:
             FormatError: shapes differ, or an id is not below `num_classes`.
@@ -126,7 +126,7 @@ class PanopticQuality(Summed):
             if classes.shape != ids.shape or classes.shape != to_numpy(truth[0]).reshape(-1).shape:
                 raise FormatError(
                     name,
-                    expected="classes and instances of the truth's shape",
+                    expected="classes and instances with the shape of the ground truth",
                     found=f"{classes.shape} and {ids.shape}",
                 )
             sides.append((classes, ids))
@@ -139,7 +139,7 @@ class PanopticQuality(Summed):
         return self
 
     def add(self, segments: Segments, *, fewest: int = 0) -> None:
-        """Add the segments of a frame; unmatched ones of fewer than `fewest` elements are left out."""
+        """Add the segments of a frame. Unmatched segments with fewer than `fewest` elements are ignored."""
         pred, true, common = segments.overlaps.T
         iou = common / (segments.pred_size[pred] + segments.true_size[true] - common)
         is_stuff = ~np.isin(segments.true_class[true], sorted(self.things))
@@ -162,7 +162,7 @@ class PanopticQuality(Summed):
         self.elements[2] += np.bincount(segments.true_class, segments.true_size, minlength=k).astype(np.int64)
 
     def compute(self) -> PanopticScore:
-        """Return the score of everything that was added."""
+        """Return the score of all added frames."""
         tp, fp, fn = self.counts
         sq = ratio(self.iou_sum, tp)
         rq = ratio(tp, tp + (fp + fn) / 2)
@@ -182,17 +182,17 @@ def match_segments(
     overlap: NDArray[np.bool_] | None = None,
     free: int = 0,
 ) -> Segments:
-    """Find the segments of a prediction and of the truth, and the elements that they have in common.
+    """Find the segments of prediction and ground truth, and the number of their common elements.
 
     Args:
         prediction: (N,) class ids and (N,) instance ids; equal pairs are one segment.
-        truth: likewise.
-        things: classes whose instances are apart; all elements of another class are one segment. None: all classes are things.
-        overlap: (N,) bool: elements that may be in common; all of them if None.
-        free: class of elements without a segment.
+        truth: (N,) true class ids and (N,) true instance ids.
+        things: ids of classes with separate instances; for other classes, all elements are one segment. None: all classes are things.
+        overlap: (N,) bool: elements that can be common elements; None for all.
+        free: class id of elements without a segment.
 
     Returns:
-        The segments; those of the free class are left out.
+        The segments, without the free class.
     """
     sides = [np.ascontiguousarray(array).reshape(-1) for side in (prediction, truth) for array in side]
     may_overlap = np.ones(1, np.bool_) if overlap is None else overlap
@@ -209,11 +209,11 @@ def match_segments(
 
 @cached(error_model="python")
 def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, free):  # type: ignore[no-untyped-def]
-    """Number the segments of both sides in the order in which they occur, and count elements and overlaps, in one pass.
+    """Number the segments of both sides in order of occurrence, and count elements and overlaps, in one pass.
 
-    Neighbouring elements mostly belong to few segments. Small tables of the latest segments, indexed by the key, avoid most look-ups.
+    Neighbouring elements mostly belong to few segments. Small tables of recent segments, indexed by the key, avoid most look-ups.
     """
-    numbers = {np.int64(-1): np.int64(-1)}  # side and key -> number
+    numbers = {np.int64(-1): np.int64(-1)}  # number of a segment by side and key
     keys = [[np.int64(0) for _ in range(0)] for _ in range(2)]
     sizes = [[np.int64(0) for _ in range(0)] for _ in range(2)]
     latest, latest_number = np.full((2, _SLOTS), -1, np.int64), np.zeros((2, _SLOTS), np.int64)
@@ -224,14 +224,14 @@ def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, fr
     for n in range(len(pred_class)):
         has_pred, has_true = pred_class[n] != free, true_class[n] != free
         if not has_pred and not has_true:
-            continue  # most elements are free on both sides
+            continue  # most elements are free in both
         for side in range(2):
             if not (has_pred if side == 0 else has_true):
                 continue
-            one, other = (pred_class[n], pred_ids[n]) if side == 0 else (true_class[n], true_ids[n])
-            key = np.int64(one) << 32
-            if all_things or is_thing[one]:
-                key |= np.int64(other)
+            label, instance = (pred_class[n], pred_ids[n]) if side == 0 else (true_class[n], true_ids[n])
+            key = np.int64(label) << 32
+            if all_things or is_thing[label]:
+                key |= np.int64(instance)
             slot = (key ^ key >> 32) & (_SLOTS - 1)
             if latest[side, slot] != key:
                 place = key << 1 | side

@@ -1,7 +1,7 @@
-"""RayIoU and RayPQ: grids compared by the first surface on each ray, not voxel by voxel (SparseOcc).
+"""RayIoU and RayPQ (SparseOcc): comparison of grids by the first surface on each ray instead of voxel by voxel.
 
-A wall that is predicted too thick reduces the IoU of voxels, although its visible surface is correct. Rays from the positions of the
-sensor along the sequence compare only the first surface.
+A wall that is predicted too thick reduces the IoU of voxels, although its visible surface is correct. Rays from sensor positions along the
+trajectory compare only the first surface.
 """
 
 from __future__ import annotations
@@ -23,20 +23,22 @@ from carlasc.metrics.scoring import Summed
 
 THRESHOLDS_M = (1.0, 2.0, 4.0)
 _MOST_ORIGINS = 8
-_MARGIN_M = 1.0  # distance of origins from the sides of the grid: 39 m for Occ3D's grid of 40 m
-_FEWEST_RAYS = 10  # a segment of fewer rays is neither a false negative nor a false positive
+_MARGIN_M = (
+    1.0  # minimum distance of origins from the sides of the grid: up to 39 m in the grid of Occ3D, which ends at 40 m
+)
+_FEWEST_RAYS = 10  # segments with fewer rays are not counted as false negatives or false positives
 
 
 def ray_origins(world_T_sensors: NDArray[np.float64], frame: int, spec: GridSpec) -> NDArray[np.float64]:
-    """Return the origins of the rays of a frame: positions of the sensor along the sequence that are inside the grid of the frame.
+    """Return the ray origins of a frame: sensor positions along the trajectory that are inside the grid of the frame.
 
     Args:
-        world_T_sensors: (F, 4, 4) poses of the sequence's (key) frames.
-        frame: row of the frame that is scored.
+        world_T_sensors: (F, 4, 4) poses of the (key) frames of the sequence.
+        frame: row of the scored frame in `world_T_sensors`.
         spec: the grid of the frame.
 
     Returns:
-        (O, 3) metres, in the sensor frame of the scored frame. At most 8 positions, evenly chosen from those that are at least 1 m inside
+        (O, 3) metres, in the sensor frame of the scored frame. At most 8 positions, evenly selected from those that are at least 1 m from
         the sides of the grid in x and y.
     """
     here: Transform = invert(world_T_sensors[frame])
@@ -54,9 +56,9 @@ class RayScore:
     """RayIoU of all rays.
 
     Attributes:
-        class_iou: (T, K) IoU of each class at each depth threshold; NaN for a class in neither prediction nor truth.
+        class_iou: (T, K) IoU of each class at each depth threshold; NaN for classes that do not occur in prediction or ground truth.
         thresholds_m: (T,) metres.
-        free: id of free space, which has no IoU.
+        free: id of free space, which is not scored.
     """
 
     class_iou: NDArray[np.float64]
@@ -65,27 +67,28 @@ class RayScore:
 
     @property
     def by_threshold(self) -> dict[float, float]:
-        """RayIoU at each threshold: the mean over the classes that occur, free left out."""
+        """RayIoU by threshold, metres: the mean over the occurring classes except free."""
         things = np.delete(self.class_iou, self.free, axis=1)
         return {t: _mean(row) for t, row in zip(self.thresholds_m, things, strict=True)}
 
     @property
     def rayiou(self) -> float:
-        """The mean of the thresholds' RayIoU."""
+        """Mean RayIoU over the thresholds."""
         return _mean(np.delete(self.class_iou, self.free, axis=1))
 
 
 class RayIoU(Summed):
-    """Adds up the first surfaces on rays through predicted and true grids.
+    """Accumulates the first surfaces on rays through predicted and true grids.
 
-    A ray is correct if the first voxels of the prediction and of the truth have the same class and their distances differ by less than a
-    threshold. Rays without a surface in the truth are left out. Counts are summed over all frames before they are divided.
+    A ray is correct if the first voxels of prediction and ground truth have the same class, and their distances differ by less than a
+    threshold. Rays without a surface in the ground truth are left out. IoU is computed from counts summed over all frames.
 
     Attributes:
         num_classes: K; ids are 0..K-1.
         free: id of free space.
-        skip_unknown: drop the rays that cross an unknown voxel before they meet something in the truth. The original has no unknown
-            voxels: there they count as free.
+        thresholds_m: maximum differences of distances, metres.
+        skip_unknown: leave out rays that cross an unknown voxel before the first surface of the ground truth. In the original metric, unknown
+            voxels count as free.
     """
 
     _SETTINGS, _SUMS = ("num_classes", "free", "thresholds_m", "skip_unknown"), ("true", "predicted", "hits")
@@ -99,7 +102,7 @@ class RayIoU(Summed):
         skip_unknown: bool = False,
         directions: ArrayLike | None = None,
     ) -> None:
-        """Start empty; `directions` are (R, 3) unit vectors of the rays, those of `rayiou_directions` if None."""
+        """Create an empty metric. `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`."""
         if not 0 <= free < num_classes:
             raise ArgumentError("free", expected=f"a class id below {num_classes}", found=str(free))
         self.num_classes, self.free, self.thresholds_m = num_classes, free, tuple(thresholds_m)
@@ -108,7 +111,7 @@ class RayIoU(Summed):
         self.reset()
 
     def reset(self) -> None:
-        """Remove everything that was added."""
+        """Set all sums to zero."""
         self.true = np.zeros(self.num_classes, np.int64)
         self.predicted = np.zeros(self.num_classes, np.int64)
         self.hits = np.zeros((len(self.thresholds_m), self.num_classes), np.int64)
@@ -125,24 +128,24 @@ class RayIoU(Summed):
 
         Args:
             prediction: (X, Y, Z) class ids, NumPy or a torch tensor; rays are cast on the device of a tensor.
-            truth: (X, Y, Z) class ids, likewise.
+            truth: (X, Y, Z) class ids, NumPy or a torch tensor.
             spec: geometry of both, Cartesian.
-            origins: (O, 3) metres, where rays start (see `ray_origins`).
-            known: (X, Y, Z) bool, voxels of the truth that were evaluated; only used with `skip_unknown`.
+            origins: (O, 3) ray origins, metres, in the frame of the grid (see `ray_origins`).
+            known: (X, Y, Z) bool, known voxels of the ground truth; only used with `skip_unknown`.
 
         Returns:
             The metric itself.
 
         Raises:
             FormatError: shapes differ, or an id is not below `num_classes`.
-            ArgumentError: the grid is cylindrical, or `skip_unknown` was asked for and `known` is missing.
+            ArgumentError: the grid is cylindrical, or `skip_unknown` is set and `known` is missing.
         """
         pred, true = self._check(prediction, "prediction", spec), self._check(truth, "truth", spec)
         device = device_of(prediction, truth)
         grids = [pred, true]
         if self.skip_unknown:
             if known is None:
-                raise ArgumentError("known", expected="the truth's known voxels", found="None")
+                raise ArgumentError("known", expected="the known voxels of the ground truth", found="None")
             seen = np.asarray(known, np.bool_)
             grids.append(np.where(seen, true, self.num_classes).astype(np.uint16))  # unknown voxels stop a ray here
         voxels, depths = self._cast(np.stack(grids), spec, np.asarray(origins), device)
@@ -163,7 +166,7 @@ class RayIoU(Summed):
     def _cast(
         self, grids: NDArray[Any], spec: GridSpec, origins: NDArray[np.floating], device: Any
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Cast the rays on the device of the tensors that were given; on the CPU in compiled code."""
+        """Cast the rays on the device of the given tensors, or on the CPU in compiled code."""
         if device is None:
             return cast_rays(grids, spec, origins, self.directions, free=self.free)
         import torch
@@ -173,7 +176,7 @@ class RayIoU(Summed):
         return voxels.cpu().numpy(), depths.cpu().numpy()
 
     def compute(self) -> RayScore:
-        """Return the score of everything that was added."""
+        """Return the score of all added frames."""
         iou = ratio(self.hits, self.true + self.predicted - self.hits)
         return RayScore(iou, self.thresholds_m, self.free)
 
@@ -188,10 +191,10 @@ class RayIoU(Summed):
 
 
 class RayPQ:
-    """Panoptic quality of rays: segments are sets of rays, which overlap only where the depths agree (SparseOcc).
+    """Panoptic quality of rays (SparseOcc): segments are sets of rays, and rays are common only if their depths agree within a threshold.
 
-    Segments match at an IoU over 0.5. A stuff class of the truth is one segment. A segment of fewer than 10 rays is neither a false
-    negative nor a false positive.
+    Segments match at an IoU above 0.5. Each stuff class of the ground truth is one segment. Segments with fewer than 10 rays are not counted as false
+    negatives or false positives. The arguments are those of `RayIoU`; `things` are the ids of classes with separate instances.
     """
 
     def __init__(
@@ -203,13 +206,13 @@ class RayPQ:
         thresholds_m: tuple[float, ...] = THRESHOLDS_M,
         directions: ArrayLike | None = None,
     ) -> None:
-        """Start empty; `directions` are (R, 3) unit vectors of the rays, those of `rayiou_directions` if None."""
+        """Create an empty metric. `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`."""
         self.num_classes, self.things, self.free, self.thresholds_m = num_classes, things, free, tuple(thresholds_m)
         self.directions = rayiou_directions() if directions is None else np.asarray(directions, np.float64)
         self.reset()
 
     def reset(self) -> None:
-        """Remove everything that was added."""
+        """Set all sums to zero."""
         self.qualities = [PanopticQuality(self.num_classes, self.things, free=self.free) for _ in self.thresholds_m]
 
     def update(
@@ -223,9 +226,9 @@ class RayPQ:
 
         Args:
             prediction: (X, Y, Z) class ids, and (X, Y, Z) instance ids.
-            truth: likewise.
+            truth: (X, Y, Z) true class ids, and (X, Y, Z) true instance ids.
             spec: geometry of both, Cartesian.
-            origins: (O, 3) metres, where rays start (see `ray_origins`).
+            origins: (O, 3) ray origins, metres, in the frame of the grid (see `ray_origins`).
         """
         (pred, pred_ids), (true, true_ids) = ([to_numpy(a) for a in side] for side in (prediction, truth))
         voxels, depths = cast_rays(np.stack([pred, true]), spec, np.asarray(origins), self.directions, free=self.free)
@@ -247,7 +250,7 @@ class RayPQ:
         return {t: quality.compute() for t, quality in zip(self.thresholds_m, self.qualities, strict=True)}
 
     def merge(self, other: RayPQ) -> Self:
-        """Add what another metric of the same settings has added up, in any order.
+        """Add the sums of another metric with the same settings.
 
         Raises:
             ArgumentError: its settings differ.

@@ -1,4 +1,4 @@
-"""Which voxels count: masks, (X, Y, Z) bool, combined with `&`; and separate scores by distance, height, visibility, motion, and what cameras see."""
+"""Masks of voxels to score, (X, Y, Z) bool, which can be combined with `&`; and separate scores by distance, height, visibility and motion."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Masks = Mapping[str, NDArray[np.bool_]]
 
 
 def known(counts: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return the voxels that have votes (count > 0), same shape as `counts`: the data set's own rule."""
+    """Return the voxels with votes (count > 0), bool with the shape of `counts`: the rule of the data set."""
     return counts > 0
 
 
@@ -29,8 +29,8 @@ def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) 
 
     Args:
         spec: geometry of the grid.
-        near_m: where the band begins, metres.
-        far_m: where it ends, metres.
+        near_m: inner radius of the band, metres.
+        far_m: outer radius of the band, metres.
 
     Returns:
         A mask of shape (X, Y, Z).
@@ -41,7 +41,7 @@ def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) 
     if not near_m >= 0:
         raise ArgumentError("near_m", expected="0 or more", found=f"{near_m:g}")
     if not far_m > near_m:
-        raise ArgumentError("far_m", expected=f"more than {near_m:g}, where the band starts", found=f"{far_m:g}")
+        raise ArgumentError("far_m", expected=f"more than {near_m:g}, the value of `near_m`", found=f"{far_m:g}")
     centers = spec.from_axes(spec.centers())
     distance = np.hypot(centers[..., 0], centers[..., 1])
     return np.asarray((distance >= near_m) & (distance < far_m))
@@ -55,9 +55,9 @@ def field_of_view(
     """Return the voxels whose centre is in the field of view of a sensor at the origin.
 
     Args:
-        spec: the grid, in the sensor's frame.
-        horizontal_rad: opening angle about the x axis (forward): a camera of 90 degrees is pi / 2.
-        vertical_rad: lowest and highest elevation; the data set's LiDAR: -25 to +2 degrees.
+        spec: geometry of the grid, in the sensor frame.
+        horizontal_rad: horizontal opening angle, centred on the x axis (forward), radians; pi / 2 for a camera of 90 degrees.
+        vertical_rad: lowest and highest elevation, radians. The LiDAR of the data set has -25 to +2 degrees.
 
     Raises:
         ArgumentError: `horizontal_rad` is not in (0, 2 pi], or the lowest elevation is not below the highest.
@@ -79,22 +79,22 @@ def distance_bands(spec: GridSpec, edges_m: Sequence[float] = (0, 10, 20, 30)) -
 
 
 def height_bands(spec: GridSpec, edges_m: Sequence[float]) -> Masks:
-    """Return a mask for each band of height of the voxels' centres, between consecutive edges, metres in the sensor's frame.
+    """Return a mask for each band of height of voxel centres, between consecutive edges, metres in the sensor frame.
 
     Raises:
-        ArgumentError: edges that do not rise.
+        ArgumentError: the edges are not increasing.
     """
     if len(edges_m) < 2 or any(low >= high for low, high in pairwise(edges_m)):
-        raise ArgumentError("edges_m", expected="two or more rising heights", found=str(list(edges_m)))
+        raise ArgumentError("edges_m", expected="two or more increasing heights", found=str(list(edges_m)))
     height = spec.centers()[..., 2]
     return {f"{low:g}-{high:g} m up": (height >= low) & (height < high) for low, high in pairwise(edges_m)}
 
 
 def visibility(truth: Grid, origin: ArrayLike = (0.0, 0.0, 0.0), *, free: int = 0) -> Masks:
-    """Return which voxels the sensor could see at this instant, and which it could not, according to the true grid.
+    """Return masks of the voxels that are visible and hidden from the sensor in this frame, according to the true grid.
 
-    A voxel is visible if no occupied voxel of the truth is between the sensor and the centre of the voxel. A network can only complete
-    the other voxels, because the scan of this instant does not observe them.
+    A voxel is visible if no occupied voxel of the ground truth is between the sensor and the centre of the voxel. Hidden voxels are not
+    observed by the scan of the frame, so a network has to complete them.
 
     Args:
         truth: the true grid, Cartesian.
@@ -115,16 +115,16 @@ def visibility(truth: Grid, origin: ArrayLike = (0.0, 0.0, 0.0), *, free: int = 
 
 
 def motion(truth: Grid, scan: Scan, movable: Sequence[int], *, min_speed_m_s: float = 0.3) -> Masks:
-    """Return the voxels of moving objects and those of movable objects at rest, from the flow of the frame's own scan.
+    """Return masks of the voxels of moving objects, and of movable objects at rest, from the flow of the scan of the frame.
 
     Args:
         truth: the true grid.
-        scan: the frame's points with flow, in the grid's frame.
-        movable: ids of the classes that may move.
-        min_speed_m_s: slower points are at rest.
+        scan: points of the frame with flow, in the frame of the grid.
+        movable: ids of the classes that can move.
+        min_speed_m_s: minimum speed of moving points, m/s.
 
     Returns:
-        Masks "moving" and "standing", (X, Y, Z) bool. Voxels of movable classes that hold no point are in neither.
+        Masks "moving" and "standing", (X, Y, Z) bool. Voxels of movable classes without a point are in neither.
 
     Raises:
         ArgumentError: the scan has no flow.
@@ -142,20 +142,20 @@ def motion(truth: Grid, scan: Scan, movable: Sequence[int], *, min_speed_m_s: fl
 
 
 class Breakdown:
-    """Adds up a confusion matrix for each of several regions."""
+    """Accumulates one confusion matrix per region."""
 
     def __init__(self, num_classes: int, *, free: int = 0) -> None:
         self.num_classes, self.free = num_classes, free
         self.matrices: dict[str, ConfusionMatrix] = {}
 
     def update(self, prediction: ArrayLike, truth: ArrayLike, masks: Masks, counted: ArrayLike | None = None) -> Self:
-        """Add a frame: to each region's matrix the voxels of its mask that count.
+        """Add a frame: for each region, the scored voxels of its mask.
 
         Args:
             prediction: predicted classes, shape (X, Y, Z).
             truth: true classes, same shape.
-            masks: the voxels of each region by its name, same shape.
-            counted: the voxels that count, same shape; None for all.
+            masks: mask of each region by name, bool, same shape.
+            counted: mask of scored voxels, bool, same shape; None for all.
         """
         for name, mask in masks.items():
             inside = mask if counted is None else mask & np.asarray(counted, np.bool_)
@@ -163,15 +163,15 @@ class Breakdown:
         return self
 
     def compute(self) -> Mapping[str, ConfusionMatrix]:
-        """Return the confusion of each region, by name."""
+        """Return the confusion matrix of each region by name."""
         return dict(self.matrices)
 
     def reset(self) -> None:
-        """Remove everything that was added."""
+        """Set all sums to zero."""
         self.matrices = {}
 
     def merge(self, other: Breakdown) -> Self:
-        """Add what another breakdown has added up; regions that only one of them has are kept."""
+        """Add the matrices of another breakdown. Regions of only one of them are kept."""
         for name, matrix in other.matrices.items():
             own = self._matrix(name)
             own += matrix

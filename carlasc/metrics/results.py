@@ -1,7 +1,7 @@
-"""The scores of predictions over a data set, how sure they are, and tables of them as text, LaTeX and CSV.
+"""The scores of predictions over a data set, confidence intervals, and tables as text, LaTeX and CSV.
 
-Confidence intervals come from a bootstrap over sequences, and a paired test compares two predictions. Sequences are drawn instead of frames,
-because the frames of one sequence show nearly the same scene.
+Confidence intervals are computed by bootstrap over sequences, and a paired test compares two predictions. Both resample sequences instead of
+frames, because the frames of one sequence show nearly the same scene.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _DRAWS, _SEED, _EXACT = 2000, 0, 12
 
 @dataclass(frozen=True)
 class FigureTable:
-    """Rows under a header. Numbers are percentages; NaN, a figure that is not defined, is written as a dash.
+    """A table with a header. Numbers are percentages; undefined scores, NaN, are written as a dash.
 
     Attributes:
-        title: what the table shows.
+        title: title of the table.
         header: names of the columns.
-        rows: one per set of predictions: its name, then numbers.
+        rows: one row per prediction: its name, then numbers.
     """
 
     title: str
@@ -78,9 +78,9 @@ class FrameScore:
     """The scores of one frame.
 
     Attributes:
-        sequence: path of its sequence.
-        frame: its number, or its token.
-        score: its figures.
+        sequence: path of the sequence.
+        frame: number or token of the frame.
+        score: scores of the frame.
     """
 
     sequence: str
@@ -90,21 +90,21 @@ class FrameScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The scores of predictions. All figures are computed from the sum of the confusion matrices of all frames.
+    """The scores of predictions. All scores are computed from the sum of the confusion matrices of all frames.
 
     Attributes:
-        name: name of the predictions: that of a network, or where they are stored.
-        convention: the rules by which they were scored.
-        matrix: the confusion matrix over all frames, in the convention's classes.
+        name: name of the predictions: of a network, or of the place where they are stored.
+        convention: the rules of scoring.
+        matrix: the confusion matrix over all frames, in the classes of the convention.
         sequences: the confusion matrix of each sequence, by path.
         frames: number of frames scored.
-        voxels: "known" voxels of the truth were scored, or "all".
+        voxels: scored voxels: "known" voxels of the ground truth, or "all".
         failures: (frame, message) of the frames that could not be scored.
-        frame_scores: the scores of each frame alone, where they were kept.
-        notes: remarks for readers of the scores.
+        frame_scores: the scores of each frame.
+        notes: remarks about the scores.
         breakdown: the confusion matrix of each requested region, by name.
-        rays: RayIoU, if it was requested.
-        actors: who is in each voxel and how fast, if it was requested.
+        rays: RayIoU, if requested; otherwise None.
+        actors: scores of actors and velocities, if requested; otherwise None.
     """
 
     name: str
@@ -122,17 +122,17 @@ class Evaluation:
 
     @property
     def classes(self) -> ClassTable:
-        """The classes that are scored."""
+        """The scored classes."""
         return self.convention.classes
 
     @property
     def score(self) -> ConventionScore:
-        """The figures of the convention."""
+        """The scores of the convention."""
         return self.convention.score(self.matrix)
 
     @property
     def class_iou(self) -> dict[str, float]:
-        """IoU of each class of the mean by name; NaN for a class that is in neither the prediction nor the truth."""
+        """IoU by name of each class of the mean; NaN for classes that do not occur in the prediction or the ground truth."""
         return dict(self.score.class_iou)
 
     @property
@@ -142,13 +142,13 @@ class Evaluation:
 
     @property
     def miou_without_free(self) -> float:
-        """Mean IoU over the convention's classes except free; absent classes count as zero, as in the paper."""
+        """Mean IoU over the classes of the convention except free. Absent classes count as zero, as in the paper."""
         free = self.classes.names[self.convention.free]
         values = [0.0 if math.isnan(v) else v for name, v in self.class_iou.items() if name != free]
         return sum(values) / len(values) if values else math.nan
 
     def interval(self, level: float = 0.95) -> Interval | None:
-        """Return the confidence interval of `miou` by bootstrap over sequences; None with fewer than five of them."""
+        """Return the confidence interval of `miou` by bootstrap over sequences; None for fewer than five sequences."""
         if len(self.sequences) < _FEWEST_SEQUENCES:
             return None
         return bootstrap(list(self.sequences.values()), lambda m: self.convention.score(m).miou, level=level)
@@ -157,14 +157,14 @@ class Evaluation:
         """Compare with other predictions of the same sequences by a paired test.
 
         Raises:
-            ArgumentError: they were scored by another convention, or have fewer than five sequences in common.
+            ArgumentError: the conventions differ, or fewer than five sequences are common.
         """
         if other.convention.name != self.convention.name:
             raise ArgumentError("other", expected=f"scores by {self.convention.name}", found=other.convention.name)
         return compare(self.sequences, other.sequences, lambda m: self.convention.score(m).miou)
 
     def tables(self) -> tuple[FigureTable, ...]:
-        """Return the paper's two tables, IoU of each class and completeness, and one of the regions if there are any."""
+        """Return the two tables of the paper, IoU of each class and completeness, and a table of regions if requested."""
         tables = semantic_table([self]), geometric_table([self]), *self._actor_tables()
         if not self.breakdown:
             return tables
@@ -197,7 +197,7 @@ class Evaluation:
         return _csv(rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return every figure by name, as fractions, for JSON; None for a figure that is not defined."""
+        """Return all scores by name, as fractions, for JSON; None for undefined scores."""
         score, interval = self.score, self.interval()
         figures = {
             "miou": score.miou,
@@ -231,10 +231,10 @@ class Evaluation:
 
 
 def semantic_table(evaluations: Sequence[Evaluation]) -> FigureTable:
-    """Return the table of the IoU of each class, the mean of them, and accuracy; one row per evaluation.
+    """Return the table of IoU per class, mean IoU, and accuracy, with one row per evaluation.
 
     Raises:
-        ArgumentError: there is no evaluation, or they follow different conventions.
+        ArgumentError: `evaluations` is empty, or the conventions differ.
     """
     conventions = {evaluation.convention.name for evaluation in evaluations}
     if len(conventions) != 1:
@@ -256,7 +256,7 @@ def semantic_table(evaluations: Sequence[Evaluation]) -> FigureTable:
 
 
 def geometric_table(evaluations: Sequence[Evaluation]) -> FigureTable:
-    """Return the table of completeness: precision, recall and IoU of occupied against free space; one row per evaluation."""
+    """Return the table of completeness: precision, recall and IoU of occupied against free space, with one row per evaluation."""
     rows: list[tuple[Cell, ...]] = []
     for evaluation in evaluations:
         score = evaluation.score
@@ -278,10 +278,10 @@ class Interval:
     """A confidence interval.
 
     Attributes:
-        value: the score of all sequences together.
-        low: lower end.
-        high: upper end.
-        level: confidence level: share of such intervals that contain the true value.
+        value: the score over all sequences.
+        low: lower bound.
+        high: upper bound.
+        level: confidence level, such as 0.95.
     """
 
     value: float
@@ -292,12 +292,12 @@ class Interval:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two predictions of the same sequences.
+    """Comparison of two predictions of the same sequences.
 
     Attributes:
-        difference: score of the first minus that of the second, with its interval.
+        difference: score of the first minus score of the second, with its interval.
         p_value: probability of a difference at least as large if both are equally good.
-        sequences: the sequences that both predictions have.
+        sequences: the common sequences.
     """
 
     difference: Interval
@@ -305,7 +305,7 @@ class Comparison:
     sequences: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures by name, as fractions, for JSON."""
+        """Return the values by name, as fractions, for JSON."""
         return {
             "difference": self.difference.value,
             "interval": [self.difference.low, self.difference.high],
@@ -315,7 +315,7 @@ class Comparison:
 
 
 def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score, *, level: float = 0.95) -> Interval:
-    """Return a score with its confidence interval by bootstrap: sequences are drawn again with replacement.
+    """Return a score with its confidence interval by bootstrap: sequences are resampled with replacement.
 
     Args:
         matrices: confusion matrix of each sequence.
@@ -323,7 +323,7 @@ def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score, *, level: float
         level: confidence level of the interval.
 
     Raises:
-        ArgumentError: there are fewer than five sequences.
+        ArgumentError: fewer than five sequences are given.
     """
     _check_number(len(matrices))
     counts = np.stack([matrix.counts for matrix in matrices])
@@ -337,18 +337,18 @@ def compare(
 ) -> Comparison:
     """Compare two predictions, sequence by sequence.
 
-    For the interval, the same sequences are drawn again for both predictions. For the p-value, the two predictions are swapped in some of
-    the sequences: in all possible ways for up to twelve sequences, in 2,000 random ways for more.
+    For the interval, the same sequences are resampled for both predictions. For the p-value, the predictions are swapped in subsets of the
+    sequences: all subsets for up to twelve sequences, 2,000 random subsets for more.
 
     Args:
-        first: confusion matrix of each sequence, by path.
-        second: likewise; sequences that only one of them has are left out.
+        first: confusion matrix of each sequence of the first prediction, by path.
+        second: confusion matrix of each sequence of the second prediction, by path. Only common sequences are used.
         score: function that computes the score from a sum of matrices.
         level: confidence level of the interval.
 
     Raises:
-        MissingDataError: they have no sequence in common.
-        ArgumentError: they have fewer than five in common.
+        MissingDataError: no sequence is common.
+        ArgumentError: fewer than five sequences are common.
     """
     common = tuple(sorted(set(first) & set(second)))
     if not common:
@@ -368,7 +368,7 @@ def compare(
         swaps = (np.arange(2 ** len(common))[:, None] >> np.arange(len(common)) & 1).astype(bool)
     else:
         swaps = rng.random((_DRAWS, len(common))) < 0.5
-        swaps[0] = False  # the actual assignment is one of them
+        swaps[0] = False  # the first one is the actual assignment
     swapped = [
         difference(np.where(s[:, None, None], b, a).sum(axis=0), np.where(s[:, None, None], a, b).sum(axis=0))
         for s in swaps
@@ -379,7 +379,9 @@ def compare(
 
 def _check_number(sequences: int) -> None:
     if sequences < _FEWEST_SEQUENCES:
-        raise ArgumentError("sequences", expected=f"at least {_FEWEST_SEQUENCES} to draw from", found=str(sequences))
+        raise ArgumentError(
+            "sequences", expected=f"at least {_FEWEST_SEQUENCES} sequences to resample", found=str(sequences)
+        )
 
 
 def _matrix(counts: NDArray[np.int64], like: ConfusionMatrix) -> ConfusionMatrix:

@@ -1,4 +1,4 @@
-"""What is scored of each frame, beside the classes; and what metrics have in common that add up frames."""
+"""Options of scoring, and the base class of metrics that accumulate frames."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ BREAKDOWNS = ("distance", "height", "visibility", "motion", "seen")
 
 @dataclass(frozen=True)
 class Scoring:
-    """What is scored of each frame.
+    """Voxels to score, and additional scores.
 
     Attributes:
-        voxels: "known" scores the voxels that the convention scores; "all" also scores voxels that the truth never evaluated.
-        region: function from a GridSpec to a (X, Y, Z) bool mask, such as `lambda spec: distance_band(spec, 0, 10)`; only voxels in
-            the mask count. With several processes it must be a function that can be pickled.
-        by: also give scores by any of "distance", "height", "visibility" (from the sensor, at this instant), "motion" and "seen" (by any camera).
-        rays: also compute RayIoU; this needs poses and a Cartesian grid.
-        actors: also score who is in each voxel and how fast: both sides need the field `instance`, and for velocities `velocity`.
+        voxels: "known" scores the voxels of the convention; "all" also scores unknown voxels of the ground truth.
+        region: function that returns an (X, Y, Z) bool mask for a GridSpec, such as `lambda spec: distance_band(spec, 0, 10)`. Only voxels
+            in the mask are scored. With several processes, it must be picklable. None scores all voxels.
+        by: separate scores by any of "distance", "height", "visibility" (from the sensor in the frame), "motion" and "seen" (by any camera).
+        rays: also compute RayIoU, which needs poses and a Cartesian grid.
+        actors: also score actors and velocities. Prediction and ground truth need the field `instance`, for velocities also `velocity`.
 
     Raises:
-        ArgumentError: an unknown value.
+        ArgumentError: a value is not valid.
     """
 
     voxels: Voxels = "known"
@@ -47,15 +47,15 @@ class Scoring:
 
 
 class Summed:
-    """A metric that is made of sums."""
+    """A metric that is computed from sums over frames."""
 
     _SETTINGS: ClassVar[tuple[str, ...]]
-    """Names of the attributes in which metrics must be equal to be merged."""
+    """Names of the settings, which must be equal to merge metrics."""
     _SUMS: ClassVar[tuple[str, ...]]
-    """Names of the attributes that are added."""
+    """Names of the sums, which are added."""
 
     def merge(self, other: Self) -> Self:
-        """Add what another metric of the same settings has added up, in any order.
+        """Add the sums of another metric with the same settings.
 
         Raises:
             ArgumentError: its settings differ.

@@ -1,4 +1,4 @@
-"""Scores over time: the consistency of consecutive frames, and LSTQ (Aygün et al., CVPR 2021): one number for each actor, and its classes."""
+"""Scores over time: consistency of consecutive frames, and LSTQ for segmentation and tracking of actors (Aygün et al., CVPR 2021)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from carlasc.metrics.scoring import Summed
 
 
 def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
-    """Return a grid in another frame: each voxel takes the label of the source voxel that contains its centre.
+    """Transform a grid to another frame. Each voxel takes the label of the source voxel that contains its centre.
 
     Args:
         grid: labels and counts in the frame `src`.
@@ -39,19 +39,25 @@ def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
 
 
 class Consistency(Summed):
-    """Adds up the agreement of consecutive frames in the static parts of the scene.
+    """Accumulates the agreement of consecutive frames in the static parts of the scene.
 
-    Voxels of frame t with a static class or free space are moved to frame t + 1 and compared with the voxels of that frame, over the
-    voxels that are known in both.
+    Voxels of frame t with a static class or free space are moved to frame t + 1, and compared with the voxels of that frame that are also
+    known.
 
     Attributes:
-        matrix: confusion of the later frame (columns) against the earlier one (rows).
+        matrix: confusion matrix with the earlier frame in rows and the later frame in columns.
     """
 
     _SETTINGS, _SUMS = ("moving",), ("matrix",)
 
     def __init__(self, num_classes: int, moving: Iterable[int], *, free: int = 0) -> None:
-        """Start empty; `moving` are the ids of classes that may move and are left out."""
+        """Create an empty metric.
+
+        Args:
+            num_classes: K; ids are 0..K-1.
+            moving: ids of classes that can move, which are left out.
+            free: id of free space.
+        """
         self.moving = frozenset(moving)
         self.matrix = ConfusionMatrix(num_classes, free=free)
 
@@ -61,14 +67,16 @@ class Consistency(Summed):
         Args:
             earlier: grid of frame t.
             later: grid of frame t + 1, of the same geometry.
-            later_T_earlier: (4, 4) motion of the sensor.
-            ignored: (X, Y, Z) bool voxels of the later frame that are left out, such as moving objects of a static class.
+            later_T_earlier: (4, 4) transform from the earlier to the later sensor frame.
+            ignored: (X, Y, Z) bool, voxels of the later frame to leave out, such as moving objects of a static class; None for none.
 
         Raises:
             FormatError: the geometries differ.
         """
         if earlier.spec != later.spec:
-            raise FormatError("later", expected=f"the earlier frame's {earlier.spec}", found=str(later.spec))
+            raise FormatError(
+                "later", expected=f"the geometry of the earlier frame, {earlier.spec}", found=str(later.spec)
+            )
         before = moved_grid(earlier, later_T_earlier)
         movable = sorted(self.moving)
         counted = before.known & later.known & ~np.isin(before.labels, movable) & ~np.isin(later.labels, movable)
@@ -82,19 +90,19 @@ class Consistency(Summed):
         return self.matrix.completeness().iou
 
     def reset(self) -> None:
-        """Remove everything that was added."""
+        """Set all sums to zero."""
         self.matrix = ConfusionMatrix(self.matrix.num_classes, free=self.matrix.free)
 
 
 def shape_consistency(earlier: NDArray[np.bool_], later: NDArray[np.bool_]) -> float:
-    """Return the IoU of an actor's shape in two frames, both in the actor's own frame of reference.
+    """Return the IoU of the shapes of an actor in two frames, both in the reference frame of the actor.
 
     Args:
-        earlier: (X, Y, Z) bool voxels of the actor.
-        later: likewise, of the same geometry.
+        earlier: (X, Y, Z) bool, voxels of the actor in the earlier frame.
+        later: (X, Y, Z) bool, voxels of the actor in the later frame, with the same geometry.
 
     Returns:
-        IoU from 0 to 1; NaN where the actor has no voxel in either.
+        IoU from 0 to 1; NaN if the actor has no voxel in both.
 
     Raises:
         FormatError: shapes differ.
@@ -114,8 +122,8 @@ class TrackingScore:
 
     Attributes:
         lstq: square root of `association` times `classification`.
-        association: S_assoc, the mean over all true actors of how well predicted numbers hold them in all frames.
-        classification: S_cls, mean IoU of the classes that occur.
+        association: S_assoc, the mean over all true actors of the association with predicted numbers over all frames.
+        classification: S_cls, mean IoU of the occurring classes.
         actors: number of true actors.
     """
 
@@ -126,14 +134,14 @@ class TrackingScore:
 
 
 class TrackingQuality(Summed):
-    """Adds up the frames of sequences, as SemanticKITTI's evaluation of 4D panoptic segmentation does.
+    """Accumulates the frames of sequences, as in the evaluation of 4D panoptic segmentation of SemanticKITTI.
 
     Attributes:
         num_classes: K; ids are 0..K-1.
-        things: ids of the classes whose actors count.
-        ignored: classes of the truth whose elements are left out.
-        unaveraged: classes that are not in the mean IoU, such as free space.
-        fewest: a true actor counts in the frames in which it has more elements than this.
+        things: ids of classes with actors.
+        ignored: ids of true classes whose elements are left out.
+        unaveraged: ids of classes that are not in the mean IoU, such as free space.
+        fewest: a true actor is scored only in frames in which it has more elements than this.
     """
 
     _SETTINGS, _SUMS = (
@@ -155,11 +163,11 @@ class TrackingQuality(Summed):
         self.reset()
 
     def reset(self) -> None:
-        """Remove everything that was added."""
+        """Set all sums to zero."""
         self.confusion = np.zeros((self.num_classes, self.num_classes), np.int64)  # predicted, true
-        self.predicted: _Sizes = Counter()  # elements by sequence and number
-        self.true: _Sizes = Counter()  # by sequence, class and number
-        self.common: _Sizes = Counter()  # by sequence, class, true number and predicted number
+        self.predicted: _Sizes = Counter()  # number of elements by sequence and actor number
+        self.true: _Sizes = Counter()  # by sequence, class and actor number
+        self.common: _Sizes = Counter()  # by sequence, class, true and predicted actor number
 
     def update(
         self,
@@ -171,10 +179,10 @@ class TrackingQuality(Summed):
         """Add a frame.
 
         Args:
-            sequence: the sequence that it is of; numbers are those of the whole sequence.
-            prediction: class ids and numbers of actors, 0 for none, of equal shape.
-            truth: likewise.
-            mask: the same shape, bool: only these elements count.
+            sequence: path of the sequence. Actor numbers are constant over a sequence.
+            prediction: class ids and actor numbers, 0 for none, of equal shape.
+            truth: true class ids and actor numbers, of the same shape.
+            mask: the same shape, bool: only these elements are scored; None scores all.
 
         Raises:
             FormatError: shapes differ, or a class id is not below `num_classes`.
@@ -182,7 +190,9 @@ class TrackingQuality(Summed):
         arrays = [to_numpy(array).reshape(-1) for side in (prediction, truth) for array in side]
         if len({array.shape for array in arrays}) > 1:
             found = " and ".join(str(array.shape) for array in arrays)
-            raise FormatError("prediction", expected="classes and numbers of the truth's shape", found=found)
+            raise FormatError(
+                "prediction", expected="classes and numbers with the shape of the ground truth", found=found
+            )
         for name, classes in (("prediction", arrays[0]), ("truth", arrays[2])):
             check_ids(name, classes, self.num_classes)
         counted = np.ones(len(arrays[0]), np.bool_) if mask is None else to_numpy(mask).astype(np.bool_).reshape(-1)
@@ -193,16 +203,16 @@ class TrackingQuality(Summed):
         for number, size in _counts(pred[(pred > 0) & ~np.isin(pred_class, sorted(self.ignored))]):
             self.predicted[sequence, number] += size
         for label in self.things:
-            own = (true_class == label) & (true > 0)
-            for number, size in _counts(true[own]):
+            of_class = (true_class == label) & (true > 0)
+            for number, size in _counts(true[of_class]):
                 if size > self.fewest:
                     self.true[sequence, label, number] += size
-                    for other, common in _counts(pred[own & (true == number) & (pred > 0)]):
-                        self.common[sequence, label, number, other] += common
+                    for predicted_number, common in _counts(pred[of_class & (true == number) & (pred > 0)]):
+                        self.common[sequence, label, number, predicted_number] += common
         return self
 
     def compute(self) -> TrackingScore:
-        """Return the scores of everything that was added; NaN where nothing occurs."""
+        """Return the scores of all added frames; NaN if nothing occurs."""
         sums = dict.fromkeys(self.true, 0.0)
         for (sequence, label, number, other), common in self.common.items():
             predicted, true = self.predicted[sequence, other], self.true[sequence, label, number]

@@ -13,18 +13,18 @@ from carlasc.metrics.confusion import check_ids, to_numpy
 from carlasc.metrics.scoring import Summed
 
 _BINS = 15
-_TOLERANCE = 1e-3  # largest deviation of the sum of the probabilities of a voxel from one: half precision gives 5e-4
+_TOLERANCE = 1e-3  # maximum deviation of the sum of the probabilities of a voxel from 1; half precision has 5e-4
 _EPSILON = 1e-12  # added in the argument of the logarithm
 
 
 @dataclass(frozen=True)
 class Reliability:
-    """A reliability diagram over bins of equal width of the predicted class's probability.
+    """A reliability diagram with bins of equal width of the probability of the predicted class.
 
     Attributes:
-        count: (B,) voxels in each bin.
-        confidence: (B,) mean probability in each bin; NaN in an empty one.
-        accuracy: (B,) share of the voxels of each bin that were predicted correctly.
+        count: (B,) number of voxels per bin.
+        confidence: (B,) mean probability per bin; NaN for empty bins.
+        accuracy: (B,) share of correctly predicted voxels per bin.
     """
 
     count: NDArray[np.int64]
@@ -33,7 +33,7 @@ class Reliability:
 
     @property
     def ece(self) -> float:
-        """Expected calibration error: mean of |confidence - accuracy| over voxels; NaN without any voxel."""
+        """Expected calibration error: mean of |confidence - accuracy| over voxels; NaN without voxels."""
         if not self.count.sum():
             return float("nan")
         gap = np.nan_to_num(np.abs(self.confidence - self.accuracy))
@@ -42,15 +42,15 @@ class Reliability:
 
 @dataclass(frozen=True)
 class UncertaintyScore:
-    """Calibration of everything that was added.
+    """Calibration over all added frames.
 
     Attributes:
-        ece_empty: mean over frames of the calibration error of voxels that were predicted free.
-        ece_occupied: likewise of voxels that were predicted occupied.
-        nll_empty: negative log-likelihood of the true class, mean over all voxels that were predicted free.
-        nll_occupied: likewise of voxels that were predicted occupied.
-        empty: reliability of voxels that were predicted free, pooled over frames.
-        occupied: likewise of voxels that were predicted occupied.
+        ece_empty: calibration error of voxels that are predicted free, mean over frames.
+        ece_occupied: calibration error of voxels that are predicted occupied, mean over frames.
+        nll_empty: negative log-likelihood of the true class, mean over all voxels that are predicted free.
+        nll_occupied: negative log-likelihood of the true class, mean over all voxels that are predicted occupied.
+        empty: reliability of voxels that are predicted free, over all frames.
+        occupied: reliability of voxels that are predicted occupied, over all frames.
     """
 
     ece_empty: float
@@ -62,10 +62,10 @@ class UncertaintyScore:
 
 
 class Uncertainty(Summed):
-    """Adds up the confidence and the accuracy of predictions.
+    """Accumulates the confidence and the accuracy of predictions.
 
-    As in PaSCo, calibration errors are computed per frame and averaged, likelihoods are pooled over voxels, and both are computed
-    separately for voxels that are predicted free and occupied.
+    As in PaSCo, calibration errors are averaged over frames, likelihoods over voxels, and both are separate for voxels that are predicted
+    free and occupied.
 
     Attributes:
         num_classes: K.
@@ -84,18 +84,18 @@ class Uncertainty(Summed):
         self.reset()
 
     def reset(self) -> None:
-        """Remove everything that was added."""
-        self.sums = np.zeros((2, 3, self.bins))  # predicted free or occupied; count, confidence, right; by bin
-        self.nll = np.zeros((2, 2))  # predicted free or occupied; sum, count
-        self.ece = np.zeros((2, 2))  # predicted free or occupied; sum of frames, number of frames
+        """Set all sums to zero."""
+        self.sums = np.zeros((2, 3, self.bins))  # (free or occupied prediction; count, confidence, correct; bin)
+        self.nll = np.zeros((2, 2))  # (free or occupied prediction; sum, count)
+        self.ece = np.zeros((2, 2))  # (free or occupied prediction; sum over frames, number of frames)
 
     def update(self, probabilities: Any, truth: ArrayLike, mask: ArrayLike | None = None) -> Self:
         """Add a frame.
 
         Args:
-            probabilities: (..., K) float, summing to one per voxel; NumPy or a torch tensor.
+            probabilities: (..., K) float, with a sum of 1 per voxel; a NumPy array or torch tensor.
             truth: (...) class ids.
-            mask: (...) bool: only these voxels count.
+            mask: (...) bool: only these voxels are scored; None scores all.
 
         Returns:
             The metric itself.
@@ -126,7 +126,7 @@ class Uncertainty(Summed):
         loss = -np.log(prob[np.arange(len(target)), target] + _EPSILON)
         occupied = predicted != self.free
         for row, chosen in enumerate((~occupied, occupied)):
-            # Bins are (low, high]: a confidence of exactly 1 is in the last one.
+            # Bins are (low, high], so a confidence of exactly 1 is in the last bin.
             bins = np.clip(np.ceil(confidence[chosen] * self.bins).astype(int) - 1, 0, self.bins - 1)
             weights = None, confidence[chosen], right[chosen]
             sums: NDArray[np.float64] = np.stack([np.bincount(bins, weight, self.bins) for weight in weights])
@@ -137,7 +137,7 @@ class Uncertainty(Summed):
         return self
 
     def compute(self) -> UncertaintyScore:
-        """Return the score of everything that was added; NaN where nothing was."""
+        """Return the score of all added frames; NaN without voxels."""
         with np.errstate(invalid="ignore"):
             ece, nll = self.ece[:, 0] / self.ece[:, 1], self.nll[:, 0] / self.nll[:, 1]
         empty, occupied = map(_reliability, self.sums)

@@ -1,4 +1,4 @@
-"""Calling one function with many items in parallel: in processes of our own, in an executor of the caller, or on a cluster."""
+"""Calling one function with many items in parallel: in new processes, in an executor of the caller, or on a cluster."""
 
 import lazy_loader
 

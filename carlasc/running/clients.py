@@ -1,4 +1,4 @@
-"""Calling one function with many items on the workers of a Dask cluster, which first compare versions and limit threads."""
+"""Calling one function with many items on the workers of a Dask cluster. Workers first check versions and limit threads."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from carlasc.running.spreading import DaskClient, LazyClient
 
 @dataclass(frozen=True)
 class Versions:
-    """The versions on which results depend.
+    """The versions of software on which results depend.
 
     Attributes:
-        carlasc: version of the package, and a digest of its source: rules change between versions too.
-        python: version of Python, without its last part.
+        carlasc: version of the package, and a digest of its source, because rules can change between versions.
+        python: version of Python, without the patch number.
         numpy: version of NumPy.
         numba: version of Numba.
     """
@@ -52,7 +52,7 @@ class Versions:
         """Check that a worker has these versions.
 
         Raises:
-            CarlascError: it has others.
+            CarlascError: the worker has other versions.
         """
         names = [field.name for field in fields(self) if getattr(self, field.name) != getattr(other, field.name)]
         if names:
@@ -60,7 +60,7 @@ class Versions:
                 f"worker {worker}",
                 expected=" and ".join(f"{name} {getattr(self, name)}" for name in names),
                 found=" and ".join(f"{name} {getattr(other, name)}" for name in names),
-                advice="install the same versions on all workers, or results would depend on who made them",
+                advice="install the same versions on all workers, because results may depend on them",
             )
 
 
@@ -74,12 +74,12 @@ def _digest_of_source() -> str:
 
 @dataclass(frozen=True)
 class Session:
-    """What all tasks of a run have in common.
+    """Common data of all tasks of a run.
 
     Attributes:
         name: unique name of the run.
-        versions: those of the process that started it.
-        folder: its current folder, which relative paths start from.
+        versions: versions of the process that started the run.
+        folder: current folder of that process, for relative paths.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Session:
 
     @classmethod
     def of(cls, name: str) -> Self:
-        """Return the session of this process with a name."""
+        """Return a new session of this process."""
         return cls(name, Versions.here(), str(Path.cwd()))
 
 
@@ -108,7 +108,7 @@ def run_task(session: Session, call: bytes) -> Any:
     except (ImportError, AttributeError) as error:
         raise CarlascError(
             f"worker {_name()}",
-            problem=f"it cannot load the work: {error}",
+            problem=f"it cannot load the function or the item: {error}",
             advice="install the same packages on all workers",
         ) from error
     return function(item)
@@ -118,9 +118,9 @@ def run_task(session: Session, call: bytes) -> Any:
 def _prepare(session: Session) -> None:
     """Check the versions of this process, and set it up for a run."""
     session.versions.check(Versions.here(), _name())
-    for name in ONE_THREAD:  # a worker has one thread: libraries that were not loaded yet follow
+    for name in ONE_THREAD:  # libraries that are loaded later use one thread
         os.environ.setdefault(name, "1")
-    with suppress(OSError):  # a worker without this folder can still read absolute paths and URLs
+    with suppress(OSError):  # without this folder, a worker can still read absolute paths and URLs
         os.chdir(session.folder)
 
 
@@ -133,9 +133,9 @@ def _name() -> str:
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_AHEAD = 4  # tasks that the scheduler knows, per thread of the workers
-_LEAST = 32  # also with few threads, so that calls for several tasks at once are enough
-_TOGETHER = 16  # results that are fetched together, at most
+_AHEAD = 4  # submitted tasks per thread of the workers
+_LEAST = 32  # minimum number of submitted tasks, so that one call can submit several
+_TOGETHER = 16  # maximum number of results that are fetched together
 _COUNT_S = 1.0  # workers are counted again after this time
 
 
@@ -147,11 +147,11 @@ def run_on_cluster(
 ) -> Generator[Result, None, None]:
     """Yield `function(item)` for every item, in the order of the items; see `carlasc.running.run_all`.
 
-    The scheduler knows a few tasks per worker at a time, and gives those of a worker that died to others. A result stays on its worker
-    until it is asked for; then the scheduler forgets the task.
+    A few tasks per worker are submitted at a time. The scheduler moves the tasks of a worker that died to other workers. A result stays on
+    its worker until it is fetched; then the task is released.
 
     Raises:
-        CarlascError: the connection to the scheduler is lost, a worker has other versions, or an item is given up and there is no `lost`.
+        CarlascError: the connection to the scheduler is lost, a worker has other versions, or an item is given up and `lost` is None.
     """
     client = client.client if isinstance(client, LazyClient) else client
     distributed = import_extra("distributed", "cluster")
@@ -162,14 +162,14 @@ def run_on_cluster(
             tasks.submit(list(islice(waiting, tasks.window)))
             while tasks.pending:
                 yield from tasks.take(lost)
-                if len(tasks.pending) <= tasks.window // 2:  # several at once: a call costs as much as a task
+                if len(tasks.pending) <= tasks.window // 2:  # several at once, because a call costs as much as a task
                     tasks.submit(list(islice(waiting, tasks.window - len(tasks.pending))))
         finally:
             _release(tasks.pending)
 
 
 class _Tasks:
-    """The tasks of a run that the scheduler knows, in the order of the items."""
+    """The submitted tasks of a run, in the order of the items."""
 
     def __init__(self, client: DaskClient, function: Callable[[Any], Any], distributed: Any) -> None:
         import cloudpickle
@@ -182,13 +182,13 @@ class _Tasks:
 
     @property
     def window(self) -> int:
-        """Number of tasks that the scheduler should know. It grows when workers come."""
+        """Maximum number of submitted tasks. It grows when workers are added."""
         if time.monotonic() - self._counted > _COUNT_S:
             self._threads, self._counted = sum(self._client.nthreads().values()), time.monotonic()
         return max(_AHEAD * self._threads, _LEAST)
 
     def submit(self, items: list[Any]) -> None:
-        """Start the tasks of some items."""
+        """Submit tasks for some items."""
         if items:
             calls = [self._dumps((self._function, item)) for item in items]
             name = os.urandom(8).hex()
@@ -197,7 +197,7 @@ class _Tasks:
             self.pending.extend(zip(items, futures, strict=True))
 
     def take(self, lost: Callable[[Any, str], Any] | None) -> Iterator[Any]:
-        """Yield the result of the first task, and those of the tasks after it that are done too."""
+        """Yield the result of the first task, and of the following tasks that are also done."""
         self.pending[0][1].exception()  # waits for its end
         done = list(takewhile(lambda entry: entry[1].status == "finished", islice(self.pending, _TOGETHER)))
         batch = [self.pending.popleft() for _ in range(max(len(done), 1))]
@@ -210,7 +210,9 @@ class _Tasks:
         self, batch: list[tuple[Any, Any]], lost: Callable[[Any, str], Any] | None, *, together: bool
     ) -> Iterator[Any]:
         if together:
-            with suppress(self._killed):  # a result was lost with its worker, and so was the worker that made it again
+            with suppress(
+                self._killed
+            ):  # the worker with the result died, and so did the worker that repeated the task
                 yield from self._client.gather([future for _, future in batch])
                 return
         for item, future in batch:
@@ -224,14 +226,14 @@ class _Tasks:
 
 
 def _release(tasks: Iterable[tuple[Any, Any]]) -> None:
-    """Let the scheduler forget tasks: it cancels those that are not done."""
+    """Release tasks. The scheduler cancels tasks that are not done."""
     for _, future in tasks:
         future.release()
 
 
 @contextmanager
 def one_line_if_lost(client: DaskClient) -> Iterator[None]:
-    """Raise an error of one line if the connection to the scheduler is lost in the block."""
+    """Raise a one-line CarlascError if the connection to the scheduler is lost in the block."""
     from distributed.client import CancelledError
     from distributed.comm import CommClosedError
 
@@ -241,9 +243,9 @@ def one_line_if_lost(client: DaskClient) -> Iterator[None]:
         raise
     except Exception as error:
         if client.status == "running" and not isinstance(error, CancelledError | CommClosedError):
-            raise  # an error of the function; a connection may be closed before the client knows it
+            raise  # an error of the function, not of the connection
         raise CarlascError(
             f"the scheduler {getattr(getattr(client, 'scheduler', None), 'address', '')}".rstrip(),
             problem="the connection was lost",
-            advice="see whether it still runs, and run the same command again to continue",
+            advice="check that the scheduler is running, and run the same command again to continue",
         ) from error

@@ -1,4 +1,4 @@
-"""Opening a cluster: on this machine, at the address of a Dask scheduler, on Slurm, or of any class that follows Dask's protocol."""
+"""Opening a Dask cluster: on this machine, at the address of a scheduler, on Slurm, or of any cluster class of Dask."""
 
 from __future__ import annotations
 
@@ -17,38 +17,36 @@ from carlasc.running.clients import Versions, one_line_if_lost
 from carlasc.running.pools import DEATHS, ONE_THREAD, inherited_by_workers
 from carlasc.running.spreading import DaskClient, LazyClient, Run
 
-_CONNECT_S = "10s"  # Dask's setting carlasc.connect-timeout replaces it
-_WORKERS_S = "10m"  # the same of carlasc.workers-timeout
+_CONNECT_S = "10s"  # the Dask setting carlasc.connect-timeout replaces it
+_WORKERS_S = "10m"  # the Dask setting carlasc.workers-timeout replaces it
 _REFILL_S = 2.0
 _FORMS = "local, local:N, tcp://HOST:PORT, slurm, or the dotted path of a class"
 _SETTINGS = {
     "distributed.scheduler.allowed-failures": DEATHS - 1,
-    "distributed.scheduler.worker-saturation": 1.0,  # a worker holds the task that it works on: no other dies with it
+    "distributed.scheduler.worker-saturation": 1.0,  # a worker holds only its current task, so that no other task is lost if it dies
     **{f"distributed.nanny.pre-spawn-environ.{name}": "1" for name in ONE_THREAD},
-    "distributed.worker.profile.enabled": False,  # it samples stacks all the time
+    "distributed.worker.profile.enabled": False,  # the profiler samples stacks continuously
     "distributed.admin.large-graph-warning-threshold": "1GB",
 }
 
 
 @contextmanager
 def open_cluster(where: str, *, workers: int | None = None) -> Iterator[LazyClient]:
-    """Yield a Dask cluster that `run_all`, and all that take an `executor`, accept.
+    """Yield a Dask cluster for `run_all` and every argument `executor`.
 
-    It is started when it first has something to do, and what was started is stopped at the end, at once if the block fails.
-
-    All workers need the same version of carlasc, and read and write the same files under the same names: on a shared file system, or
-    in an object store.
+    The cluster starts with the first task, and is stopped at the end of the block, immediately if the block fails. All workers need the
+    same version of carlasc, and must read and write the same files under the same names: on a shared file system, or in an object store.
 
     Args:
-        where: "local": new processes on this machine; "local:N": N of them; "tcp://HOST:PORT" ("tls://", "ws://"): a scheduler that
-            runs already; "slurm": jobs of Slurm, as Dask's configuration file describes them (`jobqueue.slurm`);
-            "package.module.Class": a class that starts a cluster when it is called without arguments.
-        workers: number of processes of "local", all cores if None; number of jobs or workers that the others are asked for.
+        where: "local": new processes on this machine; "local:N": N processes; "tcp://HOST:PORT" ("tls://", "ws://"): a running scheduler;
+            "slurm": Slurm jobs, as in the configuration file of Dask (`jobqueue.slurm`); "package.module.Class": a class that starts a
+            cluster when it is called without arguments.
+        workers: number of processes of "local", None for one per core; number of jobs or workers of the other clusters that are started.
 
     Raises:
         ArgumentError: `where` has none of these forms, or the number of workers is missing.
         DependencyError: Dask is not installed.
-        CarlascError: the scheduler does not answer, no worker comes, or a worker has other versions.
+        CarlascError: the scheduler does not answer, no worker starts in time, or a worker has other versions.
     """
     distributed = import_extra("distributed", "cluster")
     start = _starter(where, workers)
@@ -67,16 +65,16 @@ def open_cluster(where: str, *, workers: int | None = None) -> Iterator[LazyClie
 
 
 def _starter(where: str, workers: int | None) -> Callable[[], Any] | None:
-    """Return what starts a cluster; None if it runs already.
+    """Return the function that starts a cluster; None for the address of a running one.
 
     Raises:
-        ArgumentError: `where` has no form that is known.
+        ArgumentError: `where` has none of the known forms.
     """
     if re.match(r"(tcp|tls|ws|wss|ucx)://", where):
         return None
     if match := re.fullmatch(r"local(?::([1-9][0-9]*))?", where):
         if match[1] and workers not in (None, int(match[1])):
-            raise ArgumentError("workers", expected=f"none beside {where}", found=str(workers))
+            raise ArgumentError("workers", expected=f"no number of workers with {where}", found=str(workers))
         return partial(_start_local, int(match[1]) if match[1] else Run(workers).processes)
     module, _, name = "dask_jobqueue.SLURMCluster".rpartition(".") if where == "slurm" else where.rpartition(".")
     if where == "slurm":
@@ -97,8 +95,8 @@ def _start_local(workers: int) -> Any:
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
-            memory_limit=None,  # as without a cluster: a limit would pause or kill workers that a machine has memory for
-            dashboard_address="127.0.0.1:0",  # a free port: the usual one may be taken
+            memory_limit=None,  # no limit, as without a cluster: Dask would pause or kill workers although memory is free
+            dashboard_address="127.0.0.1:0",  # a free port, because the default port may be in use
             silence_logs=logging.CRITICAL,
         )
     except (RuntimeError, OSError) as error:
@@ -122,14 +120,14 @@ def _start_class(kind: Callable[[], Any], where: str, workers: int | None) -> An
 
 
 def _keep(cluster: Any, workers: int) -> None:
-    """Ask a cluster for workers, and again and again for those that it lost for good."""
+    """Request workers from a cluster, and replace lost workers repeatedly."""
     from tornado.ioloop import PeriodicCallback
 
     number = {"jobs": workers} if hasattr(cluster, "job_script") else {"n": workers}
 
     def refill() -> None:
         for name, worker in list(cluster.workers.items()):
-            # one that died while it started: Dask does not try again
+            # Dask does not replace a worker that died while it started
             if hasattr(worker, "kill") and worker.status.name in ("closed", "failed"):
                 del cluster.workers[name]
         cluster.scale(**number)
@@ -142,10 +140,10 @@ def _keep(cluster: Any, workers: int) -> None:
 
 @contextmanager
 def _started(start: Callable[[], Any]) -> Iterator[Any]:
-    """Yield a cluster that is started, and stop it at the end."""
+    """Start a cluster, yield it, and stop it at the end."""
     from multiprocessing import resource_tracker
 
-    resource_tracker.ensure_running()  # when it is started with the first process, it lets Ctrl-C through
+    resource_tracker.ensure_running()  # here, because its start unblocks Ctrl-C
     with inherited_by_workers():
         cluster = start()
     try:
@@ -158,7 +156,7 @@ def _started(start: Callable[[], Any]) -> Iterator[Any]:
 
 
 def _kill_workers(cluster: Any) -> None:
-    """End the processes of a cluster on this machine in the middle of their tasks; jobs elsewhere end when the cluster is closed."""
+    """Kill the processes of a cluster on this machine during their tasks. Other jobs end when the cluster is closed."""
     import asyncio
 
     async def kill() -> None:
@@ -171,7 +169,7 @@ def _kill_workers(cluster: Any) -> None:
 
 @contextmanager
 def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
-    """Yield a client of a scheduler that has at least one worker, all of them with our versions."""
+    """Yield a client of a scheduler with at least one worker. All workers have the versions of this process."""
     import dask
     from dask.utils import parse_timedelta
 
@@ -182,11 +180,13 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
         client = distributed.Client(place, timeout=connect_s, set_as_default=False)
     except (OSError, ValueError, RuntimeError, TypeError) as error:
         failure = CarlascError(
-            f"cluster {where}", problem=f"no scheduler answers: {error}", advice="check the address, and that it runs"
+            f"cluster {where}",
+            problem=f"no scheduler answers: {error}",
+            advice="check the address, and that the scheduler is running",
         )
     if failure:
-        # Dask does not close a client that could not start: its finalizer does. If that ran while another client starts,
-        # each would wait for the other, so it runs now, and the cause, which holds the client, is not kept.
+        # Dask closes a client that could not start only in its finalizer. To avoid a deadlock with the start of another client,
+        # the finalizer must run now, so the cause, which refers to the client, is dropped.
         gc.collect()
         raise failure
     try:
@@ -196,23 +196,23 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
             except TimeoutError as error:
                 raise CarlascError(
                     f"cluster {where}",
-                    problem=f"no worker came within {workers_s:g} s",
-                    advice="look at its jobs or workers, or wait longer: DASK_CARLASC__WORKERS_TIMEOUT=1h",
+                    problem=f"no worker started within {workers_s:g} s",
+                    advice="check its jobs or workers, or wait longer: DASK_CARLASC__WORKERS_TIMEOUT=1h",
                 ) from error
-            ours = Versions.here()  # workers that come later are checked before their first task
+            ours = Versions.here()  # workers that start later are checked before their first task
             for worker, found in client.run(Versions.here, on_error="return").items():
                 if not isinstance(found, Versions):
                     raise CarlascError(f"worker {worker}", expected=f"carlasc {ours.carlasc}", found=f"none ({found})")
                 ours.check(found, worker)
         yield client
     finally:
-        with suppress(TimeoutError):  # a scheduler that is gone does not answer
+        with suppress(TimeoutError):  # the scheduler may have ended
             client.close(timeout=1)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Dask from logging and warning: what goes wrong is told in one line."""
+    """Suppress logs and warnings of Dask, because failures are reported in one line."""
     names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
     before = {name: logging.getLogger(name).level for name in names}
     try:

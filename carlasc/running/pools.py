@@ -1,4 +1,4 @@
-"""A pool of processes of our own, which stop at once when they are told to, and which are replaced when they die."""
+"""A pool of worker processes that can be stopped immediately, and that are replaced when they die."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from carlasc.core.first_use import note_in_workers, wishes
 from carlasc.errors import CarlascError
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Variables of the environment that set the number of threads of the libraries that compute."""
+"""Environment variables for the number of threads of numerical libraries."""
 
 DEATHS = 3
-"""A task whose worker process died so many times is not tried again."""
+"""Number of deaths of worker processes after which a task is not tried again."""
 
 _TERMINATED = 128 + signal.SIGTERM
-_GRACE_S = 3.0  # time given to a worker to remove the file that it was writing
+_GRACE_S = 3.0  # time for a worker to remove its unfinished file
 
 
 class LostTaskError(CarlascError):
-    """A task killed every worker process that tried it, or was there when they were killed."""
+    """A task is given up, because several worker processes died while running it."""
 
     def __init__(self, where: object = "a task") -> None:
         super().__init__(
             where,
-            problem=f"{DEATHS} worker processes died while they did it: they ran out of memory, crashed, or were killed",
+            problem=f"{DEATHS} worker processes died while running it: they ran out of memory, crashed, or were killed",
             advice="try fewer `workers` or a coarser grid",
         )
 
 
 class OwnProcesses(Executor):
-    """Processes that ignore Ctrl-C, use one thread each, and can be stopped in the middle of a task.
+    """An executor of processes that ignore Ctrl-C, use one thread each, and can be stopped during a task.
 
-    Ctrl-C reaches all processes of a terminal; only the main process handles it, and stops the others. When a process dies, all are
-    replaced, and the tasks that were lost run again, one at a time: so one that kills its process takes no other with it. A task that
-    is lost three times raises LostTaskError.
+    Ctrl-C reaches all processes of a terminal. Only the main process handles it, and stops the others. When a process dies, all are
+    replaced, and the lost tasks run again, one at a time, so that a task that kills its process affects no other task. A task that is lost
+    three times raises LostTaskError.
     """
 
     def __init__(self, workers: int) -> None:
@@ -52,28 +52,28 @@ class OwnProcesses(Executor):
         self._tasks: dict[int, _RetriedTask] = {}
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Start a task. Its result is asked for in the thread that submits."""
+        """Start a task. Its result must be requested in the same thread."""
         task = _RetriedTask(self, _Cleanly(fn), args, kwargs)
         if not task.start(self._pool):
             self.recover()
-            task.start(self._pool)  # where a process dies again, the task is lost, and its result starts it again
+            task.start(self._pool)  # if a process has died again, the task is lost, and `result` starts it again
         self._tasks[id(task)] = task
         return task
 
     def stop(self) -> None:
-        """End the processes now; each is given time to remove the file that it was writing."""
+        """Stop the processes now. Each has some time to remove its unfinished file."""
         self._tasks.clear()
         self._pool.stop()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes when they have done their tasks."""
+        """End the processes after their tasks."""
         self._pool.shutdown(wait, cancel_futures=cancel_futures)
 
     def recover(self) -> None:
-        """Do the tasks again that were lost when a process died, each alone in a process, and replace the processes.
+        """Replace the processes after one died, and run the lost tasks again, each alone in a process.
 
         Raises:
-            CarlascError: new processes die before they do anything.
+            CarlascError: new processes die before they run a task.
         """
         self._pool.end()
         self._pool = _ProcessGroup(1)
@@ -88,7 +88,7 @@ class OwnProcesses(Executor):
         self._renew(self._workers)
 
     def forget(self, task: _RetriedTask) -> None:
-        """Forget a task whose result was taken."""
+        """Discard a task whose result was returned."""
         self._tasks.pop(id(task), None)
 
     def _renew(self, workers: int) -> None:
@@ -99,11 +99,11 @@ class OwnProcesses(Executor):
             self._pool.end()
             self._pool = _ProcessGroup(workers)
         if not self._is_alive():
-            self._pool.end()  # what its processes say on stderr comes before the error, not after it
+            self._pool.end()  # so that messages of its processes on stderr come before the error
             raise CarlascError(
                 "worker processes die as soon as they start",
-                problem='there is no memory for them, or they are started by a script without `if __name__ == "__main__":`',
-                advice="try fewer `workers`",
+                problem='the memory is full, or the script that starts them has no `if __name__ == "__main__":`',
+                advice="try fewer `workers`, or add the guard to the script",
             )
 
     def _is_alive(self) -> bool:
@@ -123,7 +123,7 @@ class _RetriedTask(Future[Any]):
         self._owner, self._call, self._attempt = pool, (function, args, kwargs), Future[Any]()
 
     def start(self, pool: ProcessPoolExecutor) -> bool:
-        """Start the task; return whether the processes were alive. If not, the task is lost."""
+        """Start the task, and return whether the processes were alive. If not, the task is lost."""
         function, args, kwargs = self._call
         try:
             self._attempt = pool.submit(function, *args, **kwargs)
@@ -134,7 +134,7 @@ class _RetriedTask(Future[Any]):
         return True
 
     def was_lost(self) -> bool:
-        """Return whether the process died; waits for the end of the task."""
+        """Wait for the end of the task, and return whether its process died."""
         return isinstance(self._attempt.exception(), BrokenProcessPool)
 
     def result(self, timeout: float | None = None) -> Any:
@@ -155,7 +155,7 @@ class _RetriedTask(Future[Any]):
 
 
 class _NotingContext(SpawnContext):
-    """How a pool starts its processes; notes them, because a pool does not tell which they are before Python 3.14."""
+    """A context that records the processes that a pool starts, because pools do not list them before Python 3.14."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -168,7 +168,7 @@ class _NotingContext(SpawnContext):
 
 
 class _ProcessGroup(ProcessPoolExecutor):
-    """The processes of a moment: when one dies, the others end too."""
+    """One generation of processes. When one dies, the others end too."""
 
     def __init__(self, workers: int) -> None:
         self._context = _NotingContext()
@@ -181,16 +181,16 @@ class _ProcessGroup(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         try:
-            with inherited_by_workers():  # a pool starts its processes when tasks are submitted
+            with inherited_by_workers():  # pools start processes when tasks are submitted
                 return super().submit(fn, *args, **kwargs)
-        except OSError as error:  # a process died while another was started, and the pool has closed the queue for it
+        except OSError as error:  # a process died while another was starting, and the pool has closed its queue
             raise BrokenProcessPool(f"a process cannot be started: {error}") from error
 
     def end(self) -> None:
-        """End processes that have nothing to do, or of which one has died.
+        """End processes that are idle, or of which one has died.
 
-        A pool that breaks tells its processes to end and waits for them, but does not tell one that was started at that moment, which
-        waits for a task for ever: it is killed here.
+        A broken pool ends its processes and waits for them. It misses a process that was starting at that moment, which would then hang;
+        this method kills it.
         """
         self.shutdown(wait=False)
         for process in self._context.started:
@@ -213,7 +213,7 @@ class _ProcessGroup(ProcessPoolExecutor):
 
 @contextmanager
 def inherited_by_workers() -> Iterator[None]:
-    """Within the block, block Ctrl-C and limit libraries to one thread: processes that are started in it inherit both."""
+    """Block Ctrl-C and limit libraries to one thread within the block. Processes that are started in it inherit both."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
@@ -235,28 +235,28 @@ def _prepare_worker(first: Semaphore, wishes: tuple[tuple[Callable[[], None], fl
 
 
 def _end_with_parent() -> None:
-    """End this worker soon after the main process, which cannot tell its workers to stop when it is killed itself.
+    """End this worker soon after the main process has ended. A killed main process cannot stop its workers.
 
-    Without this they would wait for tasks for ever: each of them keeps the queue of tasks open.
+    Without this, workers would hang, because each of them keeps the queue of tasks open.
     """
     parent = parent_process()
     if parent is None:
         return
     parent.join()
-    os.kill(os.getpid(), signal.SIGTERM)  # the task removes the file that it is writing
+    os.kill(os.getpid(), signal.SIGTERM)  # the task removes its unfinished file
     time.sleep(_GRACE_S)
     os._exit(_TERMINATED)
 
 
 def _exit_worker(*_: object) -> None:
     if not _Cleanly.is_working:
-        # At once: an exception in the middle of reading a task would leave its rest to the next worker, who takes it for a task.
+        # Exit immediately: after an exception while reading a task, the next worker would read the rest of it as a task.
         os._exit(_TERMINATED)
     raise SystemExit(_TERMINATED)
 
 
 class _Cleanly:
-    """A function whose process ends on SIGTERM once the function has cleaned up, instead of taking the next task."""
+    """Wraps a function. On SIGTERM, the function cleans up and its process ends instead of taking the next task."""
 
     is_working = False
 

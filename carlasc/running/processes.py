@@ -1,4 +1,4 @@
-"""Calling one function with many items in parallel: in processes of our own, in an executor of the caller, or on a Dask cluster."""
+"""Calling one function with many items in parallel: in new processes, in an executor of the caller, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ def run_all(
 ) -> Generator[Result, None, None]:
     """Yield `function(item)` for every item, in the order of the items.
 
-    At most twice as many items as workers are in progress at a time (four times as many on a cluster), so that memory use does not grow
-    with the number of items.
-    Without an executor, the work is done in new processes with one thread each or, with one worker, in this process. When the
-    generator is closed or interrupted, these processes stop at once, and each removes the file that it was writing. They import the
-    caller's main module again: a script must guard its work with `if __name__ == "__main__":`.
+    At most two items per worker (four on a cluster) are in progress at a time, so memory use does not grow with the number of items.
 
-    If a worker process dies, the items that it worked on are worked on again by another, so a function may run more than once with an
-    item. An item that three worker processes died of is given up.
+    Without an executor, the function runs in new processes with one thread each, or in this process if `workers` is 1. When the generator
+    is closed or interrupted, these processes stop immediately, and each removes its unfinished file. They import the main module of the
+    caller again: a script must guard its work with `if __name__ == "__main__":`.
+
+    If a worker process dies, another one repeats its items, so the function may run more than once with an item. An item is given up after
+    three worker processes died while working on it.
 
     Args:
         function: a top-level function; it and the items are pickled.
-        items: the arguments of the calls. They are taken as work proceeds, and making one may call `run_all` with the same executor.
-        run: how many processes do the work, or which executor does.
-        lost: makes the result of an item that is given up, from the item and a message. Without it, such an item is an error.
+        items: the arguments of the calls, taken one by one. The iterable itself may call `run_all` with the same executor.
+        run: number of processes, or the executor.
+        lost: returns the result for an item that is given up, from the item and a message. With None, such an item is an error.
 
     Raises:
-        CarlascError: an item is given up and there is no `lost`, the worker processes of a caller's executor died, or the connection to
-            a cluster is lost.
+        CarlascError: an item is given up and `lost` is None, the worker processes of an executor of the caller died, or the connection
+            to a cluster is lost.
     """
     workers, executor, waiting = run.processes, run.executor, iter(items)
     first = list(islice(waiting, 2))
@@ -59,7 +59,7 @@ def run_all(
     elif isinstance(executor, Executor):
         yield from _submit_all(executor, function, items, 2 * workers, lost)
     else:
-        from carlasc.running.clients import run_on_cluster  # Dask and what a worker of it needs
+        from carlasc.running.clients import run_on_cluster  # imports Dask
 
         yield from run_on_cluster(executor, function, items, lost)
 
@@ -92,7 +92,7 @@ def _submit_all(
     except BrokenExecutor as error:
         raise CarlascError(
             "a worker process died",
-            problem='it ran out of memory, was killed, or was started by a script without `if __name__ == "__main__":`',
+            problem='it ran out of memory, was killed, or the script that started it has no `if __name__ == "__main__":`',
             advice="try fewer `workers` or a coarser grid",
         ) from error
     finally:
@@ -102,12 +102,12 @@ def _submit_all(
 
 @contextmanager
 def one_pool(run: Run) -> Iterator[Run]:
-    """Yield a run with an executor for several calls of `run_all`, so that its processes start only once.
+    """Yield a run with one executor for several calls of `run_all`, so that processes start only once.
 
-    A run with an executor of its own, or with one worker, whose work is done in this process, is yielded as it is.
+    A run that already has an executor, or has one worker, is yielded unchanged.
 
     Args:
-        run: how many processes do the work, or which executor does.
+        run: number of processes, or the executor.
     """
     if run.executor is not None or run.is_alone:
         yield run
@@ -118,7 +118,7 @@ def one_pool(run: Run) -> Iterator[Run]:
 
 @contextmanager
 def _own_processes(workers: int) -> Iterator[Executor]:
-    """Yield an executor whose processes end with the block, at once if the block fails or is interrupted."""
+    """Yield an executor whose processes end with the block, immediately if the block fails or is interrupted."""
     pool = OwnProcesses(workers)
     try:
         yield pool

@@ -1,6 +1,6 @@
-"""How the work of a run is spread: the options that all functions share which work in parallel, what does the work, and which part.
+"""How the work of a run is distributed: the options of all parallel functions, the executor, and the part of the work.
 
-Nothing of Dask is loaded here, which commands on one machine need not wait for.
+This module does not import Dask, so that commands on one machine start fast.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from carlasc.errors import ArgumentError
 
 
 class DaskClient(Protocol):
-    """What is used of a `distributed.Client`."""
+    """The methods of `distributed.Client` that carlasc uses."""
 
     id: str
     status: str
@@ -33,7 +33,7 @@ class DaskClient(Protocol):
 
 
 class LazyClient:
-    """A client that connects when it is first used: a cluster starts no jobs for a run that has nothing to do, or wrong arguments.
+    """A client that connects on first use, so that a cluster starts no jobs for a run without work or with wrong arguments.
 
     Args:
         connect: returns the client.
@@ -44,12 +44,12 @@ class LazyClient:
 
     @cached_property
     def client(self) -> DaskClient:
-        """The client of Dask."""
+        """The Dask client, connected on first access."""
         return self._connect()
 
 
 Engine = Executor | DaskClient | LazyClient
-"""What does work in parallel: any `concurrent.futures.Executor`, a `distributed.Client` of Dask, or what `open_cluster` yields."""
+"""An executor of parallel work: any `concurrent.futures.Executor`, a `distributed.Client` of Dask, or the result of `open_cluster`."""
 
 
 Item = TypeVar("Item")
@@ -57,14 +57,14 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Part:
-    """One of several parts of a run. Together, the parts do each item exactly once, whatever order they run in.
+    """One of several parts of a run. Together, the parts process each item exactly once, in any order.
 
     Attributes:
         number: number of this part, from 1.
         count: number of parts.
 
     Raises:
-        ArgumentError: the number is not between 1 and the count.
+        ArgumentError: the number is not from 1 to the count.
     """
 
     number: int = 1
@@ -87,22 +87,22 @@ class Part:
         return cls(int(match[1]), int(match[2]))
 
     def take(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Return the items of this part: a stretch of them, so that what neighbours share is read by few parts."""
+        """Return the items of this part. They are consecutive, because neighbouring items often read the same data."""
         begin, end = (len(items) * number // self.count for number in (self.number - 1, self.number))
         return items[begin:end]
 
     def refuse(self, overwrite: bool) -> None:
-        """Refuse to replace what exists, where other parts may have made it.
+        """Check that `overwrite` is not combined with several parts, because a part would remove the output of others.
 
         Raises:
-            ArgumentError: something is to be replaced, and there are several parts.
+            ArgumentError: `overwrite` is given, and the run has several parts.
         """
         if self.count > 1 and overwrite:
             raise ArgumentError(
                 "overwrite",
-                expected="nothing with `part`, because parts would remove what other parts make",
+                expected="False with `part`, because parts would remove the output of other parts",
                 found="True",
-                advice="remove what exists first",
+                advice="remove the existing output first",
             )
 
     def __str__(self) -> str:
@@ -111,12 +111,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Run:
-    """How the work of a run is spread, and who is told of its progress.
+    """How the work of a run is distributed, and its progress callback.
 
     Attributes:
         workers: number of processes; None for one per core. With an executor: the number of its workers.
-        executor: runs the work instead of processes of our own; it is not shut down.
-        part: does only this part of the work; other commands do the others, at the same time or not.
+        executor: executor of the work, instead of new processes; it is not shut down. None starts new processes.
+        part: the part of the work to do; other commands do the other parts, at the same time or later.
         progress: called with the number of finished steps and the number of all steps.
 
     Raises:
@@ -139,12 +139,12 @@ class Run:
 
     @property
     def is_alone(self) -> bool:
-        """Whether all work is done in this process."""
+        """Whether all work runs in this process."""
         return self.executor is None and self.processes == 1
 
 
 class StepCounter:
-    """Counts the steps of a run for its progress callback. A stage adds its steps when it knows their number."""
+    """Counts the steps of a run for its progress callback. A stage adds its steps as soon as their number is known."""
 
     def __init__(self, progress: Callable[[int, int], None] | None, total: int = 0, done: int = 0) -> None:
         self._progress, self._done, self._total = progress, done, total
@@ -154,13 +154,13 @@ class StepCounter:
         self._total += more
 
     def __call__(self, steps: int = 1) -> None:
-        """Count finished steps, and report them; none of them reports the total."""
+        """Count finished steps, and report progress. With `steps=0`, only report."""
         self._done += steps
         if self._progress is not None:
             self._progress(self._done, self._total)
 
     def stage(self, expected: int = 0) -> Callable[[int, int], None]:
-        """Return the progress callback of a stage that counts its own steps, of which some are in the total already."""
+        """Return the progress callback of a stage that counts its own steps. `expected` of them are already in the total."""
         before, total = self._done, self._total - expected
 
         def advance(done: int, of: int) -> None:
@@ -172,5 +172,5 @@ class StepCounter:
 
 def count_cores() -> int:
     """Return the number of cores that this process may use."""
-    cores_of = getattr(os, "sched_getaffinity", None)  # macOS does not say which cores a process may use
+    cores_of = getattr(os, "sched_getaffinity", None)  # macOS has no such function
     return len(cores_of(0)) if cores_of else os.cpu_count() or 1

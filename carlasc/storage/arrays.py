@@ -1,7 +1,7 @@
-"""Arrays in .npy and .npz files, which anybody may have made; and writing .npz files.
+"""Reading arrays from untrusted .npy and .npz files, and writing .npz files.
 
-Type, shape and size of an array are in its header. They are compared with what the file must hold before any value is read, and the header
-alone is unpacked for that: a small file that claims, or unpacks to, more than it may hold costs neither memory nor time. No pickle is read.
+The header of an array holds its type, shape and size. They are checked before any value is read, and only the header is unpacked for that.
+A small file that claims a huge array, or unpacks to one, therefore takes neither memory nor time. Pickles are never read.
 The format is that of `numpy.lib.format`; .npz files are zips of such files (PKWARE's APPNOTE).
 """
 
@@ -24,28 +24,28 @@ from carlasc.errors import FormatError, MissingDataError, reading
 
 _LONGEST_HEADER = 1 << 14  # bytes; NumPy refuses headers of more than 10,000
 _PIECE = 1 << 18  # bytes that are unpacked at a time
-_SMALL = 1 << 26  # bytes: an array of less is unpacked however well it is packed, such as one of zeros
-_MOST_RATIO = 100  # a larger one has at most so many times the bytes that it takes in the zip; Deflate reaches 1032
-_MOST_BYTES = 1 << 28  # of one frame of anything but a grid: 20 million points, more than any sensor's scan
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # those that NumPy writes
+_SMALL = 1 << 26  # bytes: smaller arrays are unpacked at any compression ratio: zeros compress very well
+_MOST_RATIO = 100  # largest compression ratio of larger arrays; Deflate reaches 1032
+_MOST_BYTES = 1 << 28  # largest frame of any field but a grid: 20 million points, more than any sensor records
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the methods that NumPy writes
 _ENCRYPTED = 1  # flag
 _READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 _ORDERS = ("<", ">")
 WHOLE_NUMBERS = ("?", "i1", "u1", *(f"{order}{kind}{size}" for order in _ORDERS for kind in "iu" for size in (2, 4, 8)))
-"""Types of whole numbers, for files of other programs, which choose the type themselves."""
+"""All integer types, for files of other programs, whose type is not fixed."""
 NUMBERS = (*WHOLE_NUMBERS, *(f"{order}f{size}" for order in _ORDERS for size in (2, 4, 8)))
-"""The same of all real numbers."""
+"""All integer and floating-point types, for files of other programs."""
 
 
 @dataclass(frozen=True)
 class ArrayFormat:
-    """What an array of a file must be.
+    """The type and shape that an array in a file must have.
 
     Attributes:
-        dtypes: NumPy's names of the types that it may have, with the byte order.
+        dtypes: NumPy names of the allowed types, with the byte order.
         shape: length of each axis; None allows any length. A shape of None allows every shape.
-        most: largest number of elements, where the format or another file says it.
+        most: largest number of elements; None if it is not limited.
         records: whether elements may also be records, whose fields have these types.
     """
 
@@ -62,7 +62,7 @@ class ArrayFormat:
 
 @dataclass(frozen=True)
 class _Header:
-    """The header of a .npy file, as it was checked."""
+    """The checked header of a .npy file."""
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
@@ -75,7 +75,7 @@ class _Header:
         return math.prod(self.shape) * self.dtype.itemsize
 
     def array(self, values: bytes | memoryview) -> NDArray[Any]:
-        """Return the array that has these bytes, in C order, without a copy where that is its order."""
+        """Return these bytes as an array in C order. Copies only if the file is in Fortran order."""
         flat = np.frombuffer(values, self.dtype, math.prod(self.shape))
         return np.asarray(flat.reshape(self.shape, order="F" if self.fortran_order else "C"), order="C")
 
@@ -127,30 +127,30 @@ def read_npy(path: str | Path, expected: ArrayFormat) -> NDArray[Any]:
 
 
 def check_ratio(size: int, packed: int, where: str) -> None:
-    """Refuse what would unpack to far more than it takes, where nothing else says how much it may be.
+    """Check the compression ratio of an array whose size is not known otherwise.
 
     Args:
-        size: bytes that it unpacks to.
-        packed: bytes that it takes.
+        size: bytes of the unpacked array.
+        packed: bytes of the packed array.
         where: the file, for errors.
 
     Raises:
-        FormatError: it is larger than any array that is packed so well.
+        FormatError: the array is large, and its ratio is higher than that of any real array.
     """
     if size > max(_SMALL, _MOST_RATIO * packed):
         raise FormatError(
             where,
-            expected=f"at most {_MOST_RATIO} times the {packed} bytes that it takes",
-            found=f"{size} bytes",
-            advice="it was made to fill the memory: do not use this file",
+            expected=f"at most {_MOST_RATIO} times the {packed} packed bytes",
+            found=f"{size} unpacked bytes",
+            advice="the file was made to fill the memory: do not use it",
         )
 
 
 def check_size(shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
-    """Check that an array whose size the format does not bound is not larger than any that it is made for.
+    """Check that an array is not larger than any real frame. For fields whose size the format does not limit.
 
     Raises:
-        FormatError: it is; names it `what`.
+        FormatError: the array is too large; the message begins with `what`.
     """
     if math.prod(shape) * dtype.itemsize > _MOST_BYTES:
         raise FormatError(
@@ -183,7 +183,7 @@ class NpzFile:
         """Return an array, in C order.
 
         Raises:
-            FormatError: it does not exist, has another type, shape or size, is packed in a way that NumPy does not use, or is damaged.
+            FormatError: the array does not exist, has another type, shape or size, has a compression that NumPy does not use, or is damaged.
         """
         member, where = self._members.get(name), f"{self._where}: {name}"
         if member is None:
@@ -224,10 +224,10 @@ class NpzFile:
 
 
 def npz_bytes(arrays: Mapping[str, tuple[NDArray[Any], int]]) -> bytes:
-    """Return a compressed .npz file, as `numpy.savez_compressed` writes it, but each array at a level of Deflate of its own.
+    """Return a compressed .npz file like that of `numpy.savez_compressed`, but with one Deflate level per array.
 
     Args:
-        arrays: name -> array, and level from 1 (fast) to 9 (small). NumPy's is 6.
+        arrays: array and Deflate level by name. Levels go from 1 (fast) to 9 (small); NumPy uses 6.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -240,15 +240,15 @@ def npz_bytes(arrays: Mapping[str, tuple[NDArray[Any], int]]) -> bytes:
 
 @contextmanager
 def open_npz(source: str | Path | bytes | memoryview, where: str = "") -> Iterator[NpzFile]:
-    """Open an .npz file: its path, or its bytes.
+    """Open an .npz file, given by its path or its bytes.
 
     Args:
         source: the path or the bytes.
-        where: the file, for errors; the path where that is given.
+        where: name of the file in errors, if `source` is bytes.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it is no zip, or damaged, or cannot be read.
+        FormatError: the file is not a zip, is damaged, or cannot be read.
     """
     if isinstance(source, bytes | memoryview):
         with _archive(io.BytesIO(source), where) as archive:
@@ -280,7 +280,7 @@ def _opened(path: str | Path) -> Iterator[IO[bytes]]:
 
 
 def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return the shape, whether the order is Fortran's, and the type that the header of a .npy file says."""
+    """Return shape, whether the order is Fortran, and type from the header of a .npy file."""
     version = np.lib.format.read_magic(stream)
     if version not in _READERS:
         raise ValueError(f"version {version} of the .npy format")
@@ -289,14 +289,14 @@ def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]
 
 
 def _read_header(stream: IO[bytes], expected: ArrayFormat, where: str) -> _Header:
-    """Read the header of a .npy file, and compare it with what the file must hold.
+    """Read the header of a .npy file, and check it against the expected format.
 
-    Only its text is interpreted, by NumPy, as a literal of Python of at most 10,000 characters: no code is run.
+    NumPy parses its text as a Python literal of at most 10,000 characters. No code is run.
     """
     with reading(where, "a .npy array"):
         shape, fortran_order, dtype = _npy_header(stream)
         start = stream.tell()
-    # An empty array of shape (0,) is taken for one of (0, K): the authors of CarlaSC write an empty list of actors so.
+    # An empty array of shape (0,) is accepted as (0, K): CarlaSC has such files for an empty list of actors.
     if len(shape) == 1 and shape[0] == 0 and expected.shape is not None and len(expected.shape) == 2:
         shape = (0, expected.shape[1] or 0)
     if not expected.holds(dtype):
@@ -310,7 +310,7 @@ def _read_header(stream: IO[bytes], expected: ArrayFormat, where: str) -> _Heade
     if not fits or min(shape, default=0) < 0:
         raise FormatError(where, expected=f"an array of {_text(expected.shape or ())} values", found=_text(shape))
     if math.prod(shape) * dtype.itemsize >= 2**63:
-        raise FormatError(where, expected="an array that a computer can hold", found=_text(shape))
+        raise FormatError(where, expected="an array that fits into memory", found=_text(shape))
     if expected.most is not None and math.prod(shape) > expected.most:
         raise FormatError(where, expected=f"at most {expected.most} values", found=_text(shape))
     return _Header(dtype, shape, fortran_order, start)

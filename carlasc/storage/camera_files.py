@@ -1,4 +1,4 @@
-"""The cameras of a sequence: cameras.json, their images, and where each camera was in a frame."""
+"""The cameras of a sequence: cameras.json, images, and the pose of each camera in a frame."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def cameras_to_json(cameras: Iterable[CameraModel]) -> bytes:
 
 
 def cameras_of(sequence: Sequence) -> dict[str, CameraModel]:
-    """Return the cameras of a sequence by name, in the order of cameras.json; none if the file does not exist.
+    """Return the cameras of a sequence by name, in the order of cameras.json; empty if the file does not exist.
 
     Raises:
-        FormatError: the file is damaged, two cameras have one name, or a camera's place does not fit the axes of the scans.
+        FormatError: the file is damaged, two cameras have the same name, or the pose of a camera does not fit the axes of the scans.
     """
     if layout.CAMERAS not in sequence.documents():
         return {}
@@ -48,7 +48,7 @@ def cameras_from_json(data: bytes, where: str, axes: Axes) -> dict[str, CameraMo
         axes: handedness of the scans.
 
     Raises:
-        FormatError: the file is damaged, two cameras have one name, or a camera's place does not fit the axes of the scans.
+        FormatError: the file is damaged, two cameras have the same name, or the pose of a camera does not fit the axes of the scans.
     """
     values = parse_json(data, where)
     check_format(values.get("format", 1), where)
@@ -59,10 +59,11 @@ def cameras_from_json(data: bytes, where: str, axes: Axes) -> dict[str, CameraMo
     for about in listed:
         camera = CameraModel.from_dict(about, where)
         if camera.name in cameras:
-            raise FormatError(where, expected="a name for each camera", found=f"two called {camera.name}")
+            raise FormatError(where, expected="a different name for each camera", found=f"two named {camera.name}")
         if (np.linalg.det(camera.sensor_T_camera[:3, :3]) > 0) != (axes == "right"):
-            expected = "a rotation" if axes == "right" else "a reflection, as the scans are left-handed"
-            raise FormatError(f"{where}: {camera.name}", expected=f"{expected} in sensor_T_camera", found="the other")
+            expected, found = ("a rotation", "a reflection") if axes == "right" else ("a reflection", "a rotation")
+            advice = f"convert sensor_T_camera to the {axes}-handed axes of the scans"
+            raise FormatError(f"{where}: {camera.name}: sensor_T_camera", expected=expected, found=found, advice=advice)
         cameras[camera.name] = camera
     return cameras
 
@@ -81,12 +82,17 @@ def camera_named(sequence: Sequence, name: str) -> CameraModel:
 
 
 def scan_T_camera(sequence: Sequence, camera: CameraModel, frame: int) -> Transform | None:
-    """Return (4, 4), from the camera's frame when it took the image of a frame to the frame of the scan; None if it took none.
+    """Return (4, 4) scan_T_camera, where camera is its pose at the time of the image of a frame; None if it took no image.
 
-    The motion of the vehicle between the two times is that of poses.txt.
+    The ego motion between the image and the scan is interpolated from poses.txt.
+
+    Args:
+        sequence: the sequence, with poses and times.
+        camera: one of its cameras.
+        frame: frame number.
 
     Raises:
-        FormatError: there is more than a frame between the two times.
+        FormatError: image and scan are more than one frame apart.
     """
     documents = sequence.documents()
     if camera.times is None or not {layout.TIMES, layout.POSES} <= set(documents):
@@ -95,7 +101,7 @@ def scan_T_camera(sequence: Sequence, camera: CameraModel, frame: int) -> Transf
     line = sequence.line_of(frame, len(times), layout.TIMES)
     where = f"{sequence.location}/{layout.CAMERAS}: {camera.name}, frame {frame}"
     if len(camera.times) != len(times):
-        raise FormatError(where, expected=f"{len(times)} times, as in times.txt", found=str(len(camera.times)))
+        raise FormatError(where, expected=f"{len(times)} times, as in times.txt", found=f"{len(camera.times)} times")
     seconds = float(camera.times[line])
     if np.isnan(seconds):
         return None
@@ -122,7 +128,7 @@ def image_fields(sequence: Sequence, folder: str = "images") -> dict[str, str]:
 
 
 def has_image(sequence: Sequence, camera: CameraModel, frame: int) -> bool:
-    """Whether there is an image of a frame, in the folder of images or where cameras.json says."""
+    """Whether an image of a frame exists, in the folder of images or where cameras.json refers to."""
     field = image_fields(sequence).get(camera.name)
     return bool(camera.images and _reference(sequence, camera, frame)) or (
         field is not None and frame in sequence.frames(field)
@@ -130,7 +136,7 @@ def has_image(sequence: Sequence, camera: CameraModel, frame: int) -> bool:
 
 
 def read_image(sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images") -> NDArray[Any]:
-    """Return the image of a frame: (H, W, 3) uint8 RGB, or (H, W) whole numbers of classes, instances or depths.
+    """Return the image of a frame: (H, W, 3) uint8 RGB, or (H, W) integers: classes, instances or depths.
 
     Args:
         sequence: the sequence.
@@ -139,7 +145,7 @@ def read_image(sequence: Sequence, camera: CameraModel, frame: int, folder: str 
         folder: one of `carlasc.storage.layout.IMAGE_FOLDERS`.
 
     Raises:
-        MissingDataError: there is no such image.
+        MissingDataError: the image does not exist.
         FormatError: the image is cut short or damaged, or has another size than the camera's calibration.
         DependencyError: Pillow is not installed.
     """
@@ -148,10 +154,10 @@ def read_image(sequence: Sequence, camera: CameraModel, frame: int, folder: str 
 
 
 def image_bytes(sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images") -> tuple[bytes, str]:
-    """Return the file of an image as its bytes, and its name for errors. The arguments are those of `read_image`.
+    """Return the bytes of an image file, and its name for errors. Takes the arguments of `read_image`.
 
     Raises:
-        MissingDataError: there is no such image.
+        MissingDataError: the image does not exist.
     """
     field = image_fields(sequence, folder).get(camera.name)
     if field is not None and frame in sequence.frames(field):
@@ -172,7 +178,7 @@ def image_bytes(sequence: Sequence, camera: CameraModel, frame: int, folder: str
 
 
 def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -> NDArray[Any]:
-    """Return the pixels of a JPEG or PNG of a camera, as `read_image` does.
+    """Return the pixels of a JPEG or PNG file of a camera, as `read_image` does. With `color`, they are (H, W, 3) RGB, otherwise (H, W).
 
     Raises:
         FormatError: the image is cut short or damaged, or has another size than the camera's calibration.
@@ -189,7 +195,7 @@ def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -
     except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
         raise FormatError(where, expected="a whole JPEG or PNG", found="something else", advice=str(error)) from error
     if not color and (pixels.ndim != 2 or pixels.dtype.kind not in "iu"):
-        raise FormatError(where, expected="a PNG with one whole number per pixel", found=f"shape {pixels.shape}")
+        raise FormatError(where, expected="a PNG with one integer per pixel", found=f"shape {pixels.shape}")
     return pixels
 
 

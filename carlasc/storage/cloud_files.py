@@ -1,8 +1,8 @@
-"""Files of maps for other programs: classified points, written in pieces (.ply, .pcd, .las and .npz), and OctoMap's binary trees (.bt).
+"""Map files for other programs: points with classes, written in pieces (.ply, .pcd, .las and .npz), and OctoMap binary trees (.bt).
 
 PLY: https://paulbourke.net/dataformats/ply/. PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html (version 0.7).
 
-A binary tree says which cells are occupied and which are free; all others are unknown. After a text header, each inner node is two bits for
+A binary tree stores which cells are occupied and which are free; all others are unknown. After a text header, each inner node has two bits for
 each of its eight children, 01 free, 10 occupied, 11 an inner node, 00 unknown, in the order x + 2 y + 4 z; the inner nodes follow each other
 in depth-first order. A tree has 16 levels, and its middle is at the origin. See A. Hornung et al., "OctoMap", Autonomous Robots 2013,
 section 5, and https://octomap.github.io.
@@ -29,7 +29,7 @@ from carlasc.storage.files import write_output
 POINT_DTYPE = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("label", "<u2"), ("seen", "<u4"), ("confidence", "<f4")]
 )
-"""A point: metres, class, number of scans that saw its cell, confidence in the class."""
+"""A point: position in metres, class, number of scans that saw its cell, confidence of the class."""
 
 _ROW_DTYPE = np.dtype([*POINT_DTYPE.descr[:3], ("rgb", "<u4"), *POINT_DTYPE.descr[3:]])  # 0xAARRGGBB: bytes b, g, r, a
 _PLY_NAMES = {"f4": "float", "u2": "ushort", "u4": "uint"}
@@ -39,13 +39,13 @@ _LAS_CLASSES = 256  # a classification has 8 bits; `label` holds every class
 
 @dataclass(frozen=True)
 class PointPieces:
-    """Points that need not fit into memory.
+    """Points with classes, in pieces, because all of them may not fit into memory.
 
     Attributes:
         count: number of points.
         pieces: yields arrays of `POINT_DTYPE`, `count` points in all; called once for each pass over them.
         classes: class table of the labels.
-        about: what the points are, a line.
+        about: one line about the points, for the headers of files.
     """
 
     count: int
@@ -65,11 +65,11 @@ class PointPieces:
 
 
 def write_points(path: str | os.PathLike[str], points: PointPieces) -> None:
-    """Write points; the ending of the file, one of `POINT_ENDINGS`, says its format.
+    """Write points. The file suffix, one of `POINT_ENDINGS`, determines the format.
 
     Raises:
         DependencyError: laspy is needed, and not installed.
-        StorageError: the file cannot be written; an earlier one stays.
+        StorageError: the file cannot be written. An existing file is unchanged.
     """
     write = _WRITERS[Path(path).suffix.lower()]
     write_output(Path(path), lambda file: write(file, points))
@@ -137,37 +137,37 @@ _WRITERS: dict[str, Callable[[BinaryIO, PointPieces], None]] = {
     ".npz": _write_npz,
 }
 POINT_ENDINGS = tuple(_WRITERS)
-"""The endings of the files that are written."""
+"""The suffixes of the files that `write_points` writes."""
 
 
 _LEVELS = 16
 _MIDDLE = 1 << (_LEVELS - 1)
 _FREE, _OCCUPIED, _INNER = 1, 2, 3
-_ALL_FREE, _ALL_OCCUPIED = 0x5555, 0xAAAA  # eight children alike, which are one leaf
+_ALL_FREE, _ALL_OCCUPIED = 0x5555, 0xAAAA  # eight equal children, which become one leaf
 
 
 def write_octomap(
     path: str | os.PathLike[str], cells: NDArray[np.integer], occupied: NDArray[np.bool_], cell_m: float
 ) -> None:
-    """Write cells as a binary tree.
+    """Write cells as an OctoMap binary tree.
 
     Args:
         path: the file.
-        cells: (N, 3) indices of cells, none twice: cell i begins at i times `cell_m`.
-        occupied: (N,) which are occupied; the others are free.
+        cells: (N, 3) unique indices of cells. Cell i begins at i times `cell_m`.
+        occupied: (N,) whether each cell is occupied; the others are free.
         cell_m: size of a cell, metres.
 
     Raises:
-        ArgumentError: a cell is farther from the origin than a tree reaches.
-        StorageError: the file cannot be written; an earlier one stays.
+        ArgumentError: a cell is outside the extent of the tree.
+        StorageError: the file cannot be written. An existing file is unchanged.
     """
     farthest = int(np.abs(cells).max(initial=0))
     if farthest >= _MIDDLE:
         raise ArgumentError(
             "cell_m",
-            expected=f"cells that reach at most {_MIDDLE * cell_m:g} m from the origin, as trees of OctoMap do",
+            expected=f"cells within {_MIDDLE * cell_m:g} m of the origin, the extent of an OctoMap tree",
             found=f"{farthest * cell_m:.0f} m",
-            advice="take larger cells, or fewer frames",
+            advice="use larger cells, or fewer frames",
         )
     nodes, tree = _encode(cells, occupied)
     text = f"# Octomap OcTree binary file\nid OcTree\nsize {nodes}\nres {float(cell_m)!r}\ndata\n"
@@ -175,7 +175,7 @@ def write_octomap(
 
 
 def _encode(cells: NDArray[np.integer], occupied: NDArray[np.bool_]) -> tuple[int, bytes]:
-    """Return the number of nodes of a tree, and its bytes."""
+    """Return the number of nodes of a tree, and its encoded bytes."""
     code = _interleave((cells + _MIDDLE).astype(np.uint64))
     order = np.argsort(code)
     code, state = code[order], np.where(occupied[order], _OCCUPIED, _FREE).astype(np.uint16)
@@ -197,7 +197,7 @@ def _encode(cells: NDArray[np.integer], occupied: NDArray[np.bool_]) -> tuple[in
 
 
 def _interleave(keys: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return the bits of (N, 3) keys as one number each, those of z first."""
+    """Return (N,) Morton codes of (N, 3) keys, with z in the most significant bits."""
     code = np.zeros(len(keys), np.uint64)
     for bit in range(_LEVELS):
         for axis in range(3):

@@ -1,6 +1,6 @@
-"""Copying frames from a source to a store, block by block, in any number of processes: what packing and unpacking share; and unpacking.
+"""`unpack`, and copying frames block by block in any number of processes, which packing uses too.
 
-Unpacking writes every sequence of a store as published files again.
+Unpacking writes every sequence of a store as published files.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from carlasc.storage.transport.targets import check_shared
 from carlasc.storage.transport.trees import is_url
 
 Progress = Callable[[int, int], None]
-_FEW = 4  # tasks for which it does not pay to start another process
-_SAMPLED = 5  # frames of which the largest says how large frames are
+_FEW = 4  # minimum number of tasks per process, because starting a process takes time
+_SAMPLED = 5  # number of frames that are read to estimate the size of frames
 
 
 @dataclass(frozen=True)
 class FrameBlock:
-    """Frames that one task copies.
+    """The frames that one task copies.
 
     Attributes:
-        sequence: where they are read.
-        writer: where they are written.
-        frames: their numbers, by field.
+        sequence: the sequence that they are read from.
+        writer: writes them.
+        frames: frame numbers by field.
     """
 
     sequence: Sequence
@@ -51,7 +51,7 @@ class FrameBlock:
 
     @property
     def files(self) -> int:
-        """Number of published files that the frames are."""
+        """Number of published files of these frames."""
         return sum(map(len, self.frames.values()))
 
     def missing(self) -> FrameBlock:
@@ -71,10 +71,10 @@ def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[Fra
 
 
 def copy_blocks(blocks: Series[FrameBlock], run: Run, *, again: bool = False) -> tuple[int, int]:
-    """Copy the blocks of a part of a run in parallel; frames that exist are left as they are, except with `again`.
+    """Copy the blocks of a part of a run in parallel. Existing frames are not written again, unless `again` is given.
 
     Returns:
-        The number of files that were written, and the number of those that were left.
+        The number of files that were written, and the number of existing files that were kept.
     """
     ours = run.part.take(blocks)
     todo = [block for block in (ours if again else [block.missing() for block in ours]) if block.files]
@@ -102,10 +102,10 @@ def _copy(block: FrameBlock) -> int:
 
 
 def copy_documents(sequence: Sequence, writer: SequenceWriter) -> None:
-    """Copy the text files of a sequence to where an interrupted run, or another part of this run, may have left the same ones.
+    """Copy the text files of a sequence. Equal files, from an interrupted run or another part of this run, are kept.
 
     Raises:
-        ConflictError: what is there belongs to another source.
+        ConflictError: an existing text file is different.
     """
     for name in sequence.documents():
         data = sequence.read_document(name)
@@ -113,15 +113,15 @@ def copy_documents(sequence: Sequence, writer: SequenceWriter) -> None:
             raise ConflictError(
                 f"{writer.location}/{name}",
                 expected="the text file of this source",
-                found="another",
-                advice="choose another name, or remove what is there",
+                found="a different file",
+                advice="choose another name, or remove the existing output",
             )
 
 
 def typical_rows(sequence: Sequence) -> dict[str, int]:
-    """Return the largest number of elements of a few frames by field, for `SequenceWriter.expect`; always the same frames.
+    """Return the largest number of elements of a few frames by field, for `SequenceWriter.expect`. The choice of frames is deterministic.
 
-    Fields with one row per point have as many as `points`; grids and boxes are left out, as their sizes are known.
+    Fields with one row per point have the size of `points`. Grids and boxes are left out, because their sizes are known.
     """
     found: dict[str, int] = {}
     for name in sorted(sequence.fields()):
@@ -136,7 +136,7 @@ def typical_rows(sequence: Sequence) -> dict[str, int]:
 
 
 def refuse_overlap(out: str | os.PathLike[str], source: Source) -> None:
-    """Refuse to write into the source, or over it.
+    """Check that the output and the source do not contain each other.
 
     Raises:
         ConflictError: one is inside the other.
@@ -147,7 +147,7 @@ def refuse_overlap(out: str | os.PathLike[str], source: Source) -> None:
         raise ConflictError(
             out,
             expected=f"a path outside of {source.location}",
-            found="one inside it or around it",
+            found="a path inside or above it",
             advice="choose another path",
         )
 
@@ -163,8 +163,8 @@ class UnpackResult:
         out: the folder: a path, or a URL.
         sequences: paths of the sequences in it.
         files: number of files written.
-        kept: number of files that an interrupted run had written.
-        elapsed_s: seconds that it took.
+        kept: number of existing files of an interrupted run.
+        elapsed_s: duration, seconds.
     """
 
     out: Path | str
@@ -181,18 +181,17 @@ def unpack(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> UnpackResult:
-    """Write all sequences of `source` as published files: for a packed store, the same bytes that were packed.
+    """Write all sequences of `source` as published files. A packed store gives the same bytes that were packed.
 
-    An interrupted run leaves `<out>.part`; the same call again continues with the files that are missing. In an object store, and where
-    only a part of the files is written, they are in `out` from the beginning. Processes import the main module again: call this under
-    `if __name__ == "__main__":` in scripts, or with `workers=1`.
+    An interrupted run leaves `<out>.part`; the same call continues with the missing files. In an object store, and in a run of several
+    parts, files are written to `out` directly. Worker processes import the main module again: in scripts, call this function under
+    `if __name__ == "__main__":`, or with `workers=1`.
 
     Args:
         source: a packed store, or anything else that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
-        overwrite: write into a folder that exists and replace files of the same names; other files stay.
-        run: how the work is spread: by one process per core, and fewer where there are few frames, unless `workers` is given. Steps of
-            progress are files.
+        overwrite: write into an existing folder and replace files of the same names; other files are unchanged.
+        run: how the work is distributed. The default is one process per core, fewer for few frames. Progress counts files.
 
     Returns:
         What was written.
@@ -210,7 +209,7 @@ def unpack(
     if isinstance(result.out, Path) and result.out.exists() and not in_place:
         raise ConflictError(
             result.out,
-            expected="nothing there",
+            expected="a new path",
             found="a folder" if result.out.is_dir() else "a file",
             advice="choose another name, or give `overwrite=True`",
         )

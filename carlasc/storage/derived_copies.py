@@ -1,7 +1,7 @@
-"""Copies of a data set in which some fields or text files are others: the files that do not change are hard links to the same bytes.
+"""Copies of a data set with some fields or text files replaced. Unchanged files are hard links to the files of the source.
 
-Grids are left out, because they were made from what changes. A copy is written as `unpack` writes: whatever interrupts it, the same call
-again finishes it. Beside the unfinished copy, a mark says what it is made from, so that no other call does.
+Grids are left out, because they were made from the replaced data. A copy is written like the output of `unpack`: after an interruption, the
+same call finishes it. A mark beside the unfinished copy records its input and options, so that only the same call continues it.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _MOST_UNREAD = 64  # frames
 
 @dataclass
 class CopyResult(UnpackResult):
-    """What writing a copy did: what `unpack` says of the folder, where `files` are those that were not linked, and this.
+    """Result of writing a copy: the attributes of `UnpackResult`, where `files` counts files that are not links, and these.
 
     Attributes:
-        linked: number of files that are hard links to those of the source.
-        left_out: what the copy lacks, because it does not fit what changed: grids, as "evaluation/", and fields.
+        linked: number of files that are hard links to files of the source.
+        left_out: names of grids, such as "evaluation/", and fields that are not copied, because they do not fit the replaced data.
     """
 
     linked: int = 0
@@ -48,13 +48,13 @@ class CopyResult(UnpackResult):
 
 
 class DerivedSequence(SequenceView):
-    """A sequence without grids, some of whose fields and text files are others, or are left out.
+    """A sequence without grids, in which some fields and text files are replaced, added or left out.
 
     Attributes:
-        texts: the text files that are others, or new, by name.
-        made: the fields that are others, or new, each with its frames; a subclass makes them.
-        kept: fields of the sequence that do not change.
-        left_out: what the sequence has and this one does not.
+        texts: the replaced or new text files by name.
+        made: the replaced or new fields, each with its frames; a subclass makes them.
+        kept: the unchanged fields.
+        left_out: names of the grids and fields that are left out.
     """
 
     def __init__(
@@ -65,12 +65,12 @@ class DerivedSequence(SequenceView):
         made: Mapping[str, NDArray[np.int64]] = MappingProxyType({}),
         stale: Collection[str] = (),
     ) -> None:
-        """Show a sequence.
+        """Wrap a sequence.
 
         Args:
             whole: the sequence.
-            texts: the text files that are others, or new, by name.
-            made: fields that are not taken from the sequence, each with its frames.
+            texts: the replaced or new text files by name.
+            made: the replaced or new fields, each with its frames.
             stale: fields that are left out.
         """
         super().__init__(whole)
@@ -80,7 +80,7 @@ class DerivedSequence(SequenceView):
         self.left_out = {*stale} & whole.fields() | {f"{grid}/" for grid in whole.grids}
 
     def fields(self) -> frozenset[str]:
-        """Return the fields that do not change, and those that are made."""
+        """Return the unchanged fields and the replaced or new ones."""
         return self.kept | self.made.keys()
 
     def frames(self, field: str) -> NDArray[np.int64]:
@@ -88,11 +88,11 @@ class DerivedSequence(SequenceView):
         return self.whole.frames(field) if field in self.kept else self.made.get(field, np.empty(0, np.int64))
 
     def make(self, frame: int) -> dict[str, NDArray[Any]]:
-        """Return the fields of a frame that are made."""
+        """Return the replaced or new fields of a frame."""
         return {}
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one field of one frame. Those that are made are kept until the last one, in the order of their names, is read."""
+        """Read one field of one frame. All made fields of a frame are kept in memory until the last of them, by name, is read."""
         if field not in self.made:
             return self.whole.read(field, frame)
         if frame not in self._unread:
@@ -105,11 +105,11 @@ class DerivedSequence(SequenceView):
         return array
 
     def documents(self) -> tuple[str, ...]:
-        """Return the text files of the whole sequence without those of grids, and the new ones."""
+        """Return the text files of the whole sequence, without the ones of grids, and the new text files."""
         return (*self.unchanged_documents(), *self.texts)
 
     def unchanged_documents(self) -> tuple[str, ...]:
-        """Return the text files that do not change."""
+        """Return the unchanged text files."""
         return tuple(name for name in self.whole.documents() if "/" not in name and name not in self.texts)
 
     def read_document(self, name: str) -> bytes:
@@ -121,7 +121,7 @@ def sequences_with_scans(source: Source) -> dict[str, Sequence]:
     """Return the sequences of a source that have points, by path.
 
     Raises:
-        MissingDataError: there are none.
+        MissingDataError: no sequence has points.
     """
     found = {path: one for path, one in source.sequences().items() if len(one.frames("points"))}
     if not found:
@@ -131,14 +131,13 @@ def sequences_with_scans(source: Source) -> dict[str, Sequence]:
 
 @dataclass(frozen=True)
 class DerivedCopy:
-    """A copy that is being written.
+    """A copy of a data set that is being written.
 
     Attributes:
-        source: what it is a copy of.
+        source: the source of the copy.
         out: the folder to write: a path, or a URL of an object store.
-        overwrite: whether it replaces another one.
-        mark: the file that says what the unfinished copy is made from; None where there is none: in object stores, and where only a part
-            of the files is written.
+        overwrite: whether it replaces an existing copy.
+        mark: the file that records input and options of the unfinished copy; None in object stores, and in runs of several parts.
     """
 
     source: Source
@@ -161,17 +160,17 @@ class DerivedCopy:
         """Begin a copy, or continue an interrupted one.
 
         Args:
-            source: what is copied.
+            source: the data set to copy.
             out: the folder to write: a path, or a URL of an object store.
-            made_from: the options, and a digest of what is read beside the source, which an interrupted run must have had too.
-            kind: what the copy has: "predicted labels". Only a data set that has it is replaced.
-            is_kind: whether a sequence has it.
-            overwrite: whether a copy at `out` is replaced; it is removed when the new one is whole.
-            run: how the work is spread.
+            made_from: the options, and a digest of other input files. An interrupted run is continued only if these are equal.
+            kind: name of the replaced data, such as "predicted labels". Only a data set with such data is overwritten.
+            is_kind: returns whether a sequence with this metadata has such data.
+            overwrite: whether a copy at `out` is replaced; it is removed when the new copy is complete.
+            run: how the work is distributed.
 
         Raises:
-            ConflictError: something exists at `out` that may not be replaced, or `out` lies inside `source`, or an interrupted run was
-                made from something else.
+            ConflictError: something at `out` may not be replaced, `out` lies inside `source`, or an interrupted run had another input or
+                other options.
         """
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
@@ -183,7 +182,7 @@ class DerivedCopy:
         return cls(source, out, overwrite, mark)
 
     def writer(self, path: str) -> SequenceWriter | None:
-        """Return where something derived of a sequence is kept until the copy is whole; None where there is no such place."""
+        """Return the writer for data derived from a sequence, kept until the copy is complete; None if they cannot be kept."""
         return None if self.mark is None else FolderSink(unfinished(Path(self.out))).sequence(path)
 
     def write(self, sequences: Mapping[str, DerivedSequence], run: Run) -> CopyResult:
@@ -191,7 +190,7 @@ class DerivedCopy:
 
         Args:
             sequences: the sequences by path.
-            run: how the work is spread. Steps of progress are files.
+            run: how the work is distributed. Progress counts files.
 
         Raises:
             StorageError: the files cannot be written.
@@ -216,16 +215,16 @@ class DerivedCopy:
 
 
 def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwrite: bool) -> None:
-    """Set aside an older copy, if it may be replaced: it is removed when the new one is whole.
+    """Move an older copy aside, if it may be replaced. It is removed when the new copy is complete.
 
     Raises:
-        ConflictError: something exists that may not.
+        ConflictError: the existing files may not be replaced.
     """
     if not out.exists():
         return
     if not overwrite:
         advice = "choose another name, or give `overwrite=True`"
-        raise ConflictError(out, expected="nothing there", found="a folder or a file", advice=advice)
+        raise ConflictError(out, expected="a new path", found="a folder or a file", advice=advice)
     if not out.is_dir() or not all(is_kind(one.metadata) for one in FolderSource(out).sequences().values()):
         expected, advice = f"a data set with {kind} to overwrite", "choose another name"
         raise ConflictError(out, expected=expected, found="something else", advice=advice)
@@ -234,24 +233,24 @@ def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwri
 
 
 def _mark(folder: Path, settings: Mapping[str, Any], *, overwrite: bool) -> Path:
-    """Write beside an unfinished copy what it is made from, and return that file.
+    """Write input and options of an unfinished copy into a file beside it, and return that file.
 
     Raises:
-        ConflictError: what an interrupted run left in the folder was made from something else.
+        ConflictError: the folder holds the files of an interrupted run with another input or other options.
     """
     mark, data = folder.with_name(f"{folder.name}.json"), to_json(dict(settings))
     before = mark.read_bytes() if mark.is_file() else None
     if folder.exists() and before != data:
         if before is None or not overwrite:
-            expected = "what an interrupted run with the same input and options left"
-            raise ConflictError(folder, expected=expected, found="that of another run", advice="remove it")
+            expected = "the files of an interrupted run with the same input and options"
+            raise ConflictError(folder, expected=expected, found="files of another run", advice="remove the folder")
         shutil.rmtree(folder)
     write_atomic(mark, data)
     return mark
 
 
 def _link_files(sequence: DerivedSequence, folder: Path) -> int:
-    """Make the unchanged files of a local folder hard links, as far as the file system allows, and count those of frames that are new."""
+    """Make hard links to the unchanged files of a local folder, if the file system supports it, and return the number of new frame files."""
     whole, count = sequence.whole, 0
     if not isinstance(whole, FolderSequence):
         return 0
@@ -265,9 +264,9 @@ def _link_files(sequence: DerivedSequence, folder: Path) -> int:
         try:
             os.link(os.path.realpath(whole.folder / path), folder / path)
             count += "/" in path  # text files are not counted
-        except FileExistsError:  # of a run that was interrupted, or of another part of this one
+        except FileExistsError:  # from an interrupted run, or from another part of this run
             continue
-        except OSError:  # the file system has no hard links, or not to that place: the other files are copied
+        except OSError:  # the file system has no hard links, or is another one: the remaining files are copied
             break
     sync_all(folders)
     return count

@@ -1,4 +1,4 @@
-"""`download`: fetches the published zips and, if asked to, extracts them.
+"""`download`: fetches the published zips and optionally extracts them.
 
 `ARCHIVES` is the table of the published zips (see the format page, `docs/format.md#layout`).
 """
@@ -27,14 +27,14 @@ SEQUENCES = "sequences"
 
 @dataclass(frozen=True)
 class Archive:
-    """One zip.
+    """One published zip.
 
     Attributes:
         name: file name.
         what: "sequences" (scans, poses, coarse Cartesian grids), or grids alone: "fine", "cylindrical".
-        split: "train", "val", "test"; None if it holds all of them.
+        split: "train", "val", "test"; None if it holds all splits.
         url: its URL.
-        gigabytes: its approximate size.
+        gigabytes: approximate size, GB.
     """
 
     name: str
@@ -45,9 +45,9 @@ class Archive:
 
     @property
     def folder(self) -> str:
-        """Folder that it is extracted to, inside the one that the user chose.
+        """Folder that it is extracted to, relative to the folder that the user chose.
 
-        The grids' zips have folders of their own: in them, the grids have the same names as the coarse grids of the sequences.
+        Zips of grids are extracted to separate folders, because their grids have the same names as the coarse grids of the sequences.
         """
         return "." if self.what == SEQUENCES else self.name.removesuffix(".zip")
 
@@ -69,10 +69,10 @@ ARCHIVES = (
 
 
 def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
-    """Return the zips of some splits, or of some grids.
+    """Return the zips of some splits, or the zip of some grids.
 
     Args:
-        splits: "train", "val", "test" or "all", in any case; none for grids, whose zips hold all splits.
+        splits: "train", "val", "test" or "all", upper or lower case. Empty for grids, because their zips hold all splits.
         what: "sequences", "fine" or "cylindrical".
 
     Raises:
@@ -87,9 +87,9 @@ def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
     if what != SEQUENCES and wanted - {"all"}:
         raise ArgumentError(
             "split",
-            expected=f"none with {what} grids",
+            expected=f"no split for {what} grids",
             found=", ".join(sorted(wanted)),
-            advice="leave it out: one zip holds the grids of all splits",
+            advice="leave `split` out: one zip holds the grids of all splits",
         )
     if what == SEQUENCES and not wanted:
         raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found="none")
@@ -102,15 +102,15 @@ def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
 
 @dataclass(frozen=True)
 class Downloaded:
-    """What `download` did with one zip.
+    """Result of `download` for one zip.
 
     Attributes:
-        name: its file name.
-        path: where the zip is; None if it was extracted and removed.
-        size: its bytes; None if the server does not say.
+        name: file name.
+        path: path of the zip; None if it was extracted and removed.
+        size: size in bytes; None if the server does not report it.
         fetched: bytes that were fetched in this run.
-        folder: where it was extracted to; None if it was not.
-        files: number of files that it was extracted to.
+        folder: folder that it was extracted to; None if it was not extracted.
+        files: number of extracted files.
     """
 
     name: str
@@ -123,11 +123,11 @@ class Downloaded:
 
 @dataclass(frozen=True)
 class DownloadResult:
-    """What `download` did.
+    """Result of `download`.
 
     Attributes:
-        archives: the zips.
-        elapsed_s: seconds that it took.
+        archives: result for each zip.
+        elapsed_s: duration, seconds.
     """
 
     archives: tuple[Downloaded, ...]
@@ -145,36 +145,41 @@ def download(
     connections: int = 4,
     progress: Progress | None = None,
 ) -> DownloadResult:
-    """Fetch the published zips of one or more splits, or of the other grids. Called again, it continues where it stopped.
+    """Fetch the published zips of one or more splits, or of the other grids. The same call continues after an interruption.
 
     A zip need not be extracted: `carlasc.open` reads it in place.
 
     Args:
         out: folder that the zips are written to.
-        split: "train" (two zips), "val", "test", "all", or several of them; none for grids, whose zips hold all splits.
+        split: "train" (two zips), "val", "test", "all", or several of them. Empty for grids, because their zips hold all splits.
         what: "sequences" (scans, poses, coarse grids), or only "fine" or "cylindrical" grids.
-        extract: extract each zip into `out` (grids into a folder of their own there), then remove it.
+        extract: extract each zip into `out` (grids into a separate folder there), then remove it.
         keep: with `extract`, keep the zip too.
-        base_url: fetch from `<base_url>/<name>`, a mirror.
-        connections: number of blocks of a zip that are fetched at once.
-        progress: called with the bytes done and their total, zip by zip: first those fetched, then those extracted.
+        base_url: URL of a mirror: zips are fetched from `<base_url>/<name>`. None fetches from the published URLs.
+        connections: number of blocks of a zip that are fetched at the same time.
+        progress: called with (bytes done, total bytes), for each zip first while fetching, then while extracting.
 
     Returns:
-        What was fetched, and where it is.
+        Size and place of each zip.
 
     Raises:
-        ArgumentError: `split`, `what`, `keep` or `connections` make no sense.
+        ArgumentError: `split`, `what`, `keep` or `connections` is not valid.
         MissingDataError: the server does not have the file.
-        ConflictError: another file has the name of a zip.
-        FormatError: what the server sends is not a zip, or keeps changing.
-        StorageError: there is not enough free space.
-        CarlascError: the server cannot be reached; what was fetched stays, and the next call continues with it.
+        ConflictError: another file with the name of a zip exists.
+        FormatError: the file on the server is not a zip, or keeps changing.
+        StorageError: the disk has too little free space.
+        CarlascError: the server cannot be reached. The next call continues with the bytes fetched so far.
     """
     began = time.perf_counter()
     if connections < 1:
         raise ArgumentError("connections", expected="1 or more", found=str(connections))
     if keep and not extract:
-        raise ArgumentError("keep", expected="`extract=True` with it", found="it alone", advice="zips are kept anyway")
+        raise ArgumentError(
+            "keep",
+            expected="`extract=True` too",
+            found="`keep=True` alone",
+            advice="without extracting, zips are always kept",
+        )
     archives = choose_archives([split] if isinstance(split, str) else split, what)
     folder = Path(out)
     with writing(folder):
@@ -200,17 +205,17 @@ def download(
 
 
 def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float) -> int:
-    """Fetch a zip of at most `most` bytes unless it exists; returns the number of bytes fetched."""
+    """Fetch a zip of at most `most` bytes unless it exists, and return the number of bytes fetched."""
     size = fetch.file.size
     if path.exists():
         if size is not None and path.stat().st_size != size:
             raise ConflictError(
                 path,
-                expected=f"nothing, or the zip of {size} bytes",
-                found=f"{path.stat().st_size} bytes",
+                expected=f"no file, or the zip of {size} bytes",
+                found=f"a file of {path.stat().st_size} bytes",
                 advice="move it away, or choose another folder",
             )
-        fetch.discard_record()  # of a run that was ended before it could
+        fetch.discard_record()  # a killed run can leave it
         return 0
     count = 0
 
@@ -227,7 +232,7 @@ def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float)
 def _extract(result: Downloaded, folder: Path, archive: Archive, keep: bool, progress: Progress | None) -> Downloaded:
     path, target = folder / archive.name, folder / archive.folder
     files = extract_zip(path, target, StepCounter(progress, extracted_size(path)))
-    if not keep:  # record that it was extracted: the next run would fetch it again
+    if not keep:  # record the extraction, otherwise the next run would fetch the zip again
         write_json(_record(folder, archive), {"size": path.stat().st_size, "files": files})
         with writing(path):
             remove_file(path)
@@ -236,7 +241,7 @@ def _extract(result: Downloaded, folder: Path, archive: Archive, keep: bool, pro
 
 
 def _remove_left(path: Path, size: int | None) -> None:
-    """Remove a zip that was extracted, if the run that did so was ended before it could."""
+    """Remove a zip that a killed run extracted but did not remove."""
     if path.is_file() and path.stat().st_size == size:
         with writing(path):
             remove_file(path)
@@ -249,11 +254,11 @@ def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
     try:
         values = parse_json(record.read_bytes(), str(record))
     except FormatError:
-        return None  # what a power failure can leave: the zip is fetched again
+        return None  # a power failure can leave an empty file: the zip is fetched again
     size, files = values.get("size"), values.get("files")
     if not (_is_count(size) and _is_count(files)):
         found = f"{size!r} and {files!r}"
-        raise FormatError(record, expected="whole numbers as size and files", found=found, advice="remove it")
+        raise FormatError(record, expected="integers as size and files", found=found, advice="remove it")
     return Downloaded(archive.name, None, size, 0, str(folder / archive.folder), files)
 
 
@@ -266,7 +271,7 @@ def _record(folder: Path, archive: Archive) -> Path:
 
 
 def _check_space(folder: Path, fetches: dict[Archive, FileFetch], extract: bool) -> None:
-    """Check the free space for all bytes to fetch; the extracted files of a zip take about as much again."""
+    """Check the free space for all bytes to fetch, and for extracted files, which take about the same space."""
     needed = 0
     for archive, fetch in fetches.items():
         needed += 0 if (folder / archive.name).exists() else fetch.remaining()

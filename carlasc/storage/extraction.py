@@ -1,4 +1,4 @@
-"""Extracting a zip into a folder: no file outside of it, each file whole, and continued after an interruption."""
+"""Extracting a zip into a folder. No file is written outside of it, each file is written whole, and an interrupted run can continue."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from carlasc.errors import ConflictError, FormatError, StorageError, reading
 from carlasc.storage.arrays import check_ratio
 from carlasc.storage.files import leads_outside, remove_stale, write_many
 
-_BLOCK = 1 << 20  # bytes that are read at once
+_BLOCK = 1 << 20  # bytes per read
 _TOGETHER = 32  # files that are synced together
 
 
 def extract_zip(archive: Path, folder: Path, advance: Callable[[int], None]) -> int:
-    """Extract all files of a zip, except those that an earlier run has extracted.
+    """Extract all files of a zip. Files that an earlier run extracted are skipped.
 
     Args:
         archive: the zip.
-        folder: where its files are written.
+        folder: folder to write to.
         advance: called with the number of bytes of each file.
 
     Returns:
         The number of files in the zip.
 
     Raises:
-        FormatError: the zip is damaged, or a name in it leads out of the folder; nothing is extracted in the latter case.
+        FormatError: the zip is damaged, or a name in it leads out of the folder. In the latter case nothing is extracted.
         ConflictError: another file of the same name exists.
         StorageError: the disk is full, or the folder cannot be written to.
     """
     with _opened(archive) as opened:
-        with _reading(archive):  # zipfile has no answer for a member without a name
+        with _reading(archive):  # zipfile fails for a member without a name
             members = [member for member in opened.infolist() if not member.is_dir()]
         for member in members:
             check_member(member, archive)
@@ -77,7 +77,7 @@ def _copy(opened: zipfile.ZipFile, member: zipfile.ZipInfo, archive: Path, targe
         source = opened.open(member)
     with source:
         while block := _read(source, archive):
-            target.write(block)  # what fails here is the disk, not the zip
+            target.write(block)  # an error here comes from the disk, not from the zip
     if target.tell() != member.file_size:
         raise FormatError(
             f"{archive}: {member.filename}",
@@ -93,10 +93,10 @@ def _read(source: IO[bytes], archive: Path) -> bytes:
 
 
 def check_member(member: zipfile.ZipInfo, archive: Path) -> None:
-    """Refuse links, names that lead out of the folder, and what unpacks to far more than it takes.
+    """Check that a member is not a link, has a name inside the folder, and has a plausible compression ratio.
 
     Raises:
-        FormatError: names the member.
+        FormatError: it is not; the message names the member.
     """
     name = member.orig_filename  # as written in the zip: zipfile corrects some names by itself
     if leads_outside(name):
@@ -110,7 +110,7 @@ def check_space(folder: Path, needed: int, purpose: str) -> None:
     """Check that a disk has enough free space, before anything is written.
 
     Raises:
-        StorageError: it has not.
+        StorageError: the free space is too small.
     """
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
@@ -129,10 +129,10 @@ def _extracted(member: zipfile.ZipInfo, path: Path) -> bool:
     if path.is_file() and path.stat().st_size == member.file_size:
         return True  # files are renamed into place, so one of the right size is whole
     if path.is_file() and path.stat().st_size == 0:
-        return False  # what a power failure can leave
+        return False  # a power failure can leave an empty file
     raise ConflictError(
         path,
-        expected=f"nothing, or the zip's file of {member.file_size} bytes",
-        found="another file",
+        expected=f"no file, or the file of {member.file_size} bytes in the zip",
+        found="a different file",
         advice="choose another folder",
     )

@@ -1,4 +1,4 @@
-"""What one file of a field holds, and how it is decoded, checked and encoded."""
+"""The files of a field: their content, and how it is decoded, checked and encoded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
 VELOCITY_DTYPE = np.dtype([("voxel", "<i4"), ("velocity", "<f2", (3,))])
-# Level 6, zlib's own, takes 6 times as long, and saves 3 %: voxels are in order, so what repeats is always four bytes back.
+# Level 6, the default of zlib, takes 6 times as long and saves only 3 %: voxels are sorted, so repeats are always four bytes apart.
 _VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
 _MOST_CLASSES = 256
 
@@ -48,12 +48,12 @@ class Field:
         name: name of the field in a Source and a Sink.
         folder: folder under `<coordinates>/`.
         suffix: ending of the file name.
-        per: what one row of the file belongs to: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
-            "vote" (one row per vote), "moving voxel" (one row per voxel that moves), "box" (one row per box), or "scan" (the whole file belongs to the scan).
-        kind: what the values are: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (of a class
-            and its probability), "id" (unsigned whole numbers, such as actors), "value" (any number), "count", "probability" (0 to 1),
+        per: unit of one row of the file: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
+            "vote" (one row per vote), "moving voxel" (one row per moving voxel), "box" (one row per box), or "scan" (one file per scan).
+        kind: kind of the values: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (class
+            and probability), "id" (unsigned integers, such as actors), "value" (any number), "count", "probability" (0 to 1),
             "flags" (bits), "votes", "velocities" and "boxes" (tables), "picture" (the bytes of a file).
-        dtype: NumPy type on disk, little-endian; "" for tables, whose columns have types of their own.
+        dtype: NumPy type on disk, little-endian; "" for tables, whose columns have different types.
         names: name of each value of a row.
         unit: unit of the values.
         meaning: one line for the documentation.
@@ -86,7 +86,7 @@ class Field:
         Args:
             data: the whole file.
             where: the file, for errors.
-            shape: shape of the grid, for its fields; None computes the number of rows from the size of the file.
+            shape: shape of the grid, for fields of a grid; None computes the number of rows from the size of the file.
 
         Raises:
             FormatError: the size of the file does not match.
@@ -117,7 +117,7 @@ class Field:
         return array if self.columns is None else array.reshape(-1, self.columns)
 
     def size_of(self, shape: tuple[int, ...] | None) -> int | None:
-        """Return the bytes of a file of a grid of some shape; None where they are not known before it is read."""
+        """Return the size in bytes of a file of a grid with this shape; None if it is known only after reading."""
         return None if shape is None or self.per != "voxel" else np.dtype(self.dtype).itemsize * math.prod(shape)
 
     def encode(self, array: NDArray[Any], where: str) -> bytes | memoryview:
@@ -160,11 +160,11 @@ class Field:
         if dtype.kind == "u" and array.dtype.kind not in "ub":
             raise FormatError(where, expected="unsigned integers", found=str(array.dtype))
         if dtype.kind == "u" and array.dtype.itemsize > dtype.itemsize:
-            raise FormatError(where, expected=f"at most {dtype.name}", found=str(array.dtype))
+            raise FormatError(where, expected=f"{dtype.name} or a smaller type", found=str(array.dtype))
 
 
 def _decode_votes(data: bytes | memoryview, where: str, shape: tuple[int, ...] | None) -> NDArray[Any]:
-    # A voxel has at most one row for each class; as many for every voxel of a grid are more than any data set has classes.
+    # The largest possible table: one row per voxel and class.
     most = None if shape is None else _MOST_CLASSES * math.prod(shape)
     with open_npz(data, where) as archive:
         labels = archive.read("label", ArrayFormat(("u1", "<u2"), (None,), most))
@@ -184,7 +184,7 @@ def _decode_velocities(data: bytes | memoryview, where: str, shape: tuple[int, .
 
 
 def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
-    """Check a field `<grid>/velocity` of a grid of `count` voxels.
+    """Check a field `<grid>/velocity`, (M,) rows of voxel and velocity, of a grid of `count` voxels.
 
     Raises:
         FormatError: a voxel is not in the grid, or a velocity is not finite; the message names `where`.
@@ -197,7 +197,7 @@ def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
 
 
 def dense_velocity(velocity: NDArray[Any], size: tuple[int, ...], where: str) -> NDArray[np.float32]:
-    """Return (X, Y, Z, 3) the velocity of each voxel of a grid of shape `size`, m/s, zero where nothing moves; see `check_velocity`."""
+    """Return (X, Y, Z, 3) float32 m/s of a grid of shape `size`; zero where nothing moves. Checks `velocity` with `check_velocity`."""
     check_velocity(velocity, math.prod(size), where)
     dense = np.zeros((*size, 3), np.float32)
     dense.reshape(-1, 3)[velocity["voxel"]] = velocity["velocity"]
@@ -208,7 +208,7 @@ def _decode_boxes(data: bytes | memoryview, where: str) -> NDArray[Any]:
     if len(data) % BOXES_DTYPE.itemsize:
         raise FormatError(
             where,
-            expected=f"a multiple of {BOXES_DTYPE.itemsize} bytes (a box each)",
+            expected=f"a multiple of {BOXES_DTYPE.itemsize} bytes (one box)",
             found=str(len(data)),
             advice="the file may be cut short",
         )

@@ -1,7 +1,7 @@
-"""Writing files so that a reader never sees one that is half written; what survives a power failure; JSON; names that lead out of a folder.
+"""Atomic and durable writing of files, JSON, and checks of file names.
 
-File systems keep what was written in memory for up to half a minute, and may store a name before the bytes that belong to it. After a power failure, a
-file that was renamed into place can therefore be empty. `os.fsync` waits until a file, or the names in a folder, are on the disk.
+File systems keep written data in memory for up to half a minute, and may store a file name before the content. After a power failure, a
+renamed file can therefore be empty. `os.fsync` waits until a file, or the names in a folder, are on the disk.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ Content = bytes | memoryview | Callable[[BinaryIO], object]
 
 
 def write_atomic(path: Path, content: Content, *, create: bool = False) -> bool:
-    """Write a file under a temporary name in its folder, then rename it: it exists whole or not at all, also after Ctrl-C or on a full disk.
+    """Write a file under a temporary name in its folder, then rename it. It exists whole or not at all, also after Ctrl-C or on a full disk.
 
-    It exists whole or not at all after a power failure too, and is on the disk when this returns, unless that is turned off
+    The same holds after a power failure, and the file is on the disk when this function returns, unless this is turned off
     (see `is_durable`).
 
     Args:
         path: the file; missing parent folders are created.
         content: the bytes, or a function that writes them to an open file.
-        create: write only a file that does not exist. Of several processes that do so at once, exactly one succeeds.
+        create: write only if the file does not exist. If several processes do this at once, exactly one succeeds.
 
     Returns:
         False if `create` is given and the file exists; True otherwise.
@@ -47,8 +47,8 @@ def write_atomic(path: Path, content: Content, *, create: bool = False) -> bool:
         _write(temporary, content)
         sync_all([temporary])
         if create:
-            os.link(temporary, path)  # a rename would replace a file that another process has just written
-            temporary.unlink()  # before the folder is synced, or a power failure could bring it back
+            os.link(temporary, path)  # unlike a rename, a link fails if another process has written the file
+            temporary.unlink()  # before the folder is synced, otherwise a power failure could restore it
         else:
             temporary.replace(path)
         sync_all([path.parent])
@@ -64,14 +64,13 @@ def write_atomic(path: Path, content: Content, *, create: bool = False) -> bool:
 
 
 def write_many(*groups: Mapping[Path, Content]) -> None:
-    """Write several files as `write_atomic` does, which takes less time than one after the other: they are synced together.
+    """Write several files as `write_atomic` does. They are synced together, which is faster than one after the other.
 
     Args:
-        groups: the files, in the order in which they get their names. After a power failure, no file of a group exists unless all those of the
-            groups before it do.
+        groups: files by path, in order. After a power failure, files of a group exist only if all files of the earlier groups do.
 
     Raises:
-        StorageError: one cannot be written. No file of its group that has not got its name yet exists, nor any of the groups after it.
+        StorageError: a file cannot be written. Files of its group that were not renamed yet, and of later groups, do not exist.
     """
     temporaries = {path: _temporary(path) for group in groups for path in group}
     path = Path()
@@ -92,7 +91,7 @@ def write_many(*groups: Mapping[Path, Content]) -> None:
 
 
 def _temporary(path: Path) -> Path:
-    """Return the temporary name of a file: it is known before the file exists, so that the file is removed whenever a signal ends the writing."""
+    """Return the temporary name of a file. It is determined before the file is created, so that it is removed whenever a signal interrupts."""
     return path.with_name(f".{path.name}.{_HOST}-{os.getpid()}.{os.urandom(4).hex()}{_PART}")
 
 
@@ -106,12 +105,12 @@ def _write(temporary: Path, content: Content) -> None:
 
 
 def _remove(temporary: Path) -> None:
-    with suppress(OSError):  # it does not exist after success, nor does its folder where a file is in the way
+    with suppress(OSError):  # it does not exist after success; its folder may not exist either
         temporary.unlink()
 
 
 def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
-    """Write all bytes at a place of an open file."""
+    """Write all bytes at an offset of an open file."""
     view = memoryview(data)
     while view:
         written = os.pwrite(descriptor, view, offset)
@@ -119,7 +118,7 @@ def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
 
 
 def has_content(path: str | os.PathLike[str]) -> bool:
-    """Whether a file exists and is not empty: a power failure can leave an empty file in the place of one that was not written durably."""
+    """Whether a file exists and is not empty. A power failure can leave empty files, if they were not written durably."""
     try:
         return os.stat(path).st_size > 0
     except (FileNotFoundError, NotADirectoryError):
@@ -127,16 +126,16 @@ def has_content(path: str | os.PathLike[str]) -> bool:
 
 
 def write_output(path: Path, content: Content) -> None:
-    """Write a single file that a user named, as `write_atomic` does, and remove what killed runs left of it.
+    """Write a single output file as `write_atomic` does, and remove the temporary files of killed runs.
 
-    Those who write many files into a folder call `remove_stale` once instead.
+    To write many files into a folder, call `remove_stale` once instead.
     """
     _remove_ended(path.parent.glob(f".{glob.escape(path.name)}.*{_PART}"))
     write_atomic(path, content)
 
 
 def remove_stale(folder: Path, *, deep: bool = False) -> None:
-    """Remove the temporary files that killed writers left in a folder and in the folders in it; with `deep`, also in the folders in these.
+    """Remove the temporary files of killed processes in a folder and its direct subfolders; with `deep`, also one level deeper.
 
     A temporary file is stale if the process on this machine that wrote it has ended, or if it is a day old.
     """
@@ -156,7 +155,7 @@ def _remove_ended(parts: Iterable[Path]) -> None:
 
 def _is_alive(process: int) -> bool:
     try:
-        os.kill(process, 0)  # signal 0 only asks
+        os.kill(process, 0)  # signal 0 only checks that the process exists
     except ProcessLookupError:
         return False
     except PermissionError:
@@ -166,7 +165,7 @@ def _is_alive(process: int) -> bool:
 
 @contextmanager
 def writing(place: str | os.PathLike[str]) -> Iterator[None]:
-    """Report what the operating system refuses as a StorageError of the file that it names, else of `place`."""
+    """Turn an OSError into a StorageError of the file that it names, otherwise of `place`."""
     try:
         yield
     except OSError as error:
@@ -174,7 +173,7 @@ def writing(place: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def storage_error(path: Path, error: OSError) -> StorageError:
-    """Return the error of a file that cannot be written."""
+    """Return the StorageError for a file that cannot be written."""
     advice = {
         errno.ENOSPC: _FREE_SPACE,
         errno.EDQUOT: _FREE_SPACE,
@@ -213,24 +212,24 @@ def parse_json_value(data: bytes | str, where: str) -> Any:
     """Read any JSON value.
 
     Raises:
-        FormatError: `where` (the file) holds something else, is nested too deeply, or has text that no file can hold.
+        FormatError: `where` (the file) is not JSON, is nested too deeply, or has text that is not valid Unicode.
     """
     try:
         value = json.loads(data)
         if _HALF.search(data if isinstance(data, bytes) else data.encode()):
             json.dumps(
                 value, ensure_ascii=False
-            ).encode()  # ValueError: half of a character, which could not be written again
+            ).encode()  # ValueError: a lone surrogate, which could not be written again
         return value
     except (ValueError, RecursionError, TypeError) as error:  # ValueError: also a number of more than 4,300 digits
         raise FormatError(where, expected="JSON", found="something else", advice=describe(error)) from error
 
 
 def leads_outside(name: str) -> bool:
-    """Whether a name with parts joined by "/" may lead out of the folder that it is relative to, on any system.
+    """Whether a relative path with "/" may lead out of its folder, on any operating system.
 
-    Names come from archives and stores, which anybody may have made. Such are absolute names, names with a drive ("C:"), with a part "..", with a
-    backslash, and with a zero byte or half a character, which no file can have.
+    Names come from untrusted archives and stores. Unsafe are absolute names, and names with a drive ("C:"), a part "..", a backslash, a zero
+    byte or a lone surrogate.
     """
     return name.startswith("/") or ".." in name.split("/") or bool(_DRIVE.match(name) or _NEVER.search(name))
 
@@ -247,7 +246,7 @@ DURABLE = "CARLASC_DURABLE"
 
 _VALUES = {"yes": True, "1": True, "true": True, "no": False, "0": False, "false": False}
 _SIDE_BY_SIDE = 16  # files that are synced at the same time
-_UNSUPPORTED = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}  # what file systems answer that cannot sync a folder
+_UNSUPPORTED = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}  # errors of file systems that cannot sync a folder
 
 
 def is_durable() -> bool:
@@ -263,7 +262,7 @@ def is_durable() -> bool:
 
 
 def set_durable(durable: bool) -> None:
-    """Set the policy of this process and of the worker processes that it starts from now on."""
+    """Set whether this process, and the worker processes that it starts from now on, sync files."""
     os.environ[DURABLE] = "yes" if durable else "no"
 
 
@@ -276,7 +275,7 @@ def sync_file(descriptor: int) -> None:
 def sync_all(paths: Iterable[Path]) -> None:
     """Wait until files, and the names in folders, are on the disk, each once. Nothing is done unless `is_durable`.
 
-    They are synced side by side: the file system then writes its journal once for several of them, which takes a quarter of the time.
+    They are synced in parallel: the file system then writes its journal once for several files, which takes a quarter of the time.
 
     Raises:
         OSError: the disk is full or fails; names the path.
@@ -298,13 +297,13 @@ def sync_tree(path: Path) -> None:
 
 
 def rename(old: Path, new: Path) -> None:
-    """Rename a file or a folder whose content is on the disk, and wait until its new name is; an existing file is replaced."""
+    """Rename a synced file or folder, and wait until the new name is on the disk. An existing file is replaced."""
     old.replace(new)
     sync_all([new.parent])
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file, if it exists, and wait until its name is gone from the disk, where the file would mean something to the next run."""
+    """Remove a file, if it exists, and wait until the removal is on the disk. For files that the next run reads."""
     try:
         path.unlink()
     except FileNotFoundError:
@@ -313,7 +312,7 @@ def remove_file(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder, and those above it, unless they exist, and wait until the names of the new ones are on the disk."""
+    """Create a folder and its parents, unless they exist, and wait until the new names are on the disk."""
     if folder.is_dir():
         return
     new = [place for place in (folder, *folder.parents) if not place.exists()]
@@ -330,7 +329,7 @@ def _sync_path(path: Path) -> None:
             os.close(descriptor)
     except OSError as error:
         if error.errno in _UNSUPPORTED and path.is_dir():
-            return  # such as some network shares, which store names in their own way
+            return  # such as some network shares
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
@@ -340,7 +339,7 @@ if sys.platform == "darwin":
     def _sync(descriptor: int) -> None:
         try:
             fcntl.fcntl(descriptor, fcntl.F_FULLFSYNC)  # fsync alone leaves the bytes in the drive's own memory
-        except OSError:  # a file system that has no such call, such as a network share
+        except OSError:  # not supported by the file system, such as a network share
             os.fsync(descriptor)
 
 else:
@@ -350,10 +349,10 @@ else:
 
 
 def unfinished(path: Path) -> Path:
-    """Return where a store or a folder is written until it is whole: `<name>.part` beside it."""
+    """Return the path of an unfinished store or folder: `<name>.part` beside it."""
     return path.with_name(f"{path.name}.part")
 
 
 def replaced(path: Path) -> Path:
-    """Return where an older store waits until the new one is whole: `<name>.replaced`, which users hardly call a copy of their own."""
+    """Return the path of an older store until the new one is complete: `<name>.replaced`, a name that users are unlikely to choose."""
     return path.with_name(f"{path.name}.replaced")

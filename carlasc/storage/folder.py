@@ -1,4 +1,4 @@
-"""The published layout in a folder: reading and writing, one file per frame and field. It is written to object stores too."""
+"""Reading and writing the published layout in a folder, one file per frame and field. The writer supports object stores too."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from carlasc.storage.sinks import SequenceWriter, Sink
 from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 from carlasc.storage.transport.trees import LocalTree
 
-_ZIP_END, _ZIP_END_BYTES = b"PK\x05\x06", 22  # of the record that ends a zip without a comment, as NumPy writes them
+_ZIP_END, _ZIP_END_BYTES = b"PK\x05\x06", 22  # end record of a zip without a comment, as NumPy writes it
 
 
 class FolderSource(PublishedSource):
     """A folder of any level: the root with its splits, a split, a sequence, or one `<coordinates>` folder."""
 
     def __init__(self, source: str | os.PathLike[str]) -> None:
-        """Remember the folder; it is listed when its sequences are asked for.
+        """Keep the path of the folder. It is listed when its sequences are first used.
 
         Raises:
             MissingDataError: the folder does not exist.
@@ -44,7 +44,7 @@ class FolderSource(PublishedSource):
         """Return the sequences found up to four levels down, by path.
 
         Raises:
-            MissingDataError: no sequence was found; says what was looked for.
+            MissingDataError: no sequence was found; the message says what was expected.
         """
         return {path: FolderSequence(self.folder, path) for path in super().sequences()}
 
@@ -61,7 +61,7 @@ class FolderSequence(PublishedSequence):
         super().__init__(LocalTree(source), path)
 
     def _full_path(self) -> str:
-        return str(self.folder.absolute())  # so that "." inside a sequence has a name too
+        return str(self.folder.absolute())  # so that "." inside a sequence has a name
 
 
 class FolderSink(Sink):
@@ -74,17 +74,17 @@ class FolderSink(Sink):
     is_readable = True
 
     def __init__(self, out: str | os.PathLike[str] | Target, **storage_options: Any) -> None:
-        """Take a folder, or the URL of one with options of fsspec; nothing is written yet.
+        """Keep a folder, or its URL with options of fsspec. Nothing is written yet.
 
         Raises:
-            ArgumentError: nothing can be written to the URL.
+            ArgumentError: the URL cannot be written to.
             DependencyError: the URL needs a package that is not installed.
         """
         self.target = target_of(out, **storage_options)
         self.location = self.target.location
 
     def sequence(self, path: str) -> FolderWriter:
-        """Start or continue a sequence's folder; the unfinished files of a run that was killed are removed."""
+        """Start or continue the folder of a sequence. Temporary files of a killed run are removed."""
         target = self.target.below(path)
         if isinstance(target, LocalTarget):
             remove_stale(target.folder)
@@ -114,7 +114,7 @@ class FolderWriter(SequenceWriter):
         self._whole = WholeFiles(self.location) if isinstance(self.target, LocalTarget) else None
 
     def has(self, field: str, frame: int) -> bool:
-        """Whether the file exists and is whole, as far as its size says. In an object store, its folder is listed once."""
+        """Whether the file exists and has a valid size. In an object store, its folder is listed once."""
         if self._whole is not None:
             return self._whole.has(field, frame)
         return self.target.tree.is_file(layout.field_named(field).file(frame))
@@ -128,7 +128,7 @@ class FolderWriter(SequenceWriter):
         self.target.put(*self._file(field, frame, array))
 
     def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
-        """Write the files of several frames side by side, but the last one of each frame after its others."""
+        """Write the files of several frames in parallel. The last file of each frame is written after the other files of that frame."""
         files = [
             [self._file(field, frame, array) for field, array in fields.items()] for frame, fields in frames.items()
         ]
@@ -148,7 +148,7 @@ class FolderWriter(SequenceWriter):
         return entry.decode(self.target.tree.read(path), self.target.tree.where(path))
 
     def remove_grid(self, grid: str) -> None:
-        """Remove the report and the frames of a grid, then its params.json; other files in its folder stay."""
+        """Remove the report and the frames of a grid, then its params.json. Other files in its folder are kept."""
         self.target.remove(layout.report_file(grid))
         parts = [layout.field_named(f"{grid}/{part}").suffix for part in layout.GRID_FIELDS]
         names = [
@@ -170,15 +170,15 @@ class FolderWriter(SequenceWriter):
         return self.target.put(name, data, create=True)
 
     def read_document(self, name: str) -> bytes | None:
-        """Return a text file's bytes, None if it does not exist, or is empty: a power failure can leave that, a run cannot."""
+        """Return the bytes of a text file; None if it does not exist, or is empty after a power failure."""
         return self.target.read(name) or None
 
 
 class WholeFiles:
-    """Whether the files of frames in one `<coordinates>` folder are whole, as far as their sizes say; it can be pickled.
+    """Checks by their sizes whether the files of frames in one `<coordinates>` folder are whole. It can be pickled.
 
-    A power failure can leave empty and short files. Files that are written durably (see `carlasc.storage.files`) are whole as soon as they exist.
-    Others, and those of older versions, are checked by their sizes, which costs little more than to ask whether they exist.
+    A power failure can leave empty and short files, unless they were written durably (see `carlasc.storage.files`). Checking the size costs
+    little more than checking that the file exists.
 
     Args:
         folder: the folder.
@@ -186,13 +186,13 @@ class WholeFiles:
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
-        self._cells: dict[str, int] = {}  # of grids whose params.json has been read
+        self._cells: dict[str, int] = {}  # number of voxels of each grid whose params.json has been read
 
     def has(self, name: str, frame: int) -> bool:
-        """Whether the file of a field exists, and is neither empty nor of a length that it cannot have.
+        """Whether the file of a field exists and has a valid size.
 
-        Files of a grid have a length that params.json tells. Files with a row per point must have as many rows as the points, which have as many as
-        the labels. A table of votes or velocities must end as a zip does. An empty file is valid for boxes, of which there may be none, and for a scan whose points
+        The size of a grid follows from params.json. Fields with one row per point must have as many rows as `points`, and `points` as many as
+        `labels`. Tables of votes or velocities must have the end record of a zip. A file of boxes may be empty, and so may a scan whose points
         and labels are both empty.
         """
         entry = layout.field_named(name)
@@ -213,7 +213,7 @@ class WholeFiles:
         return size > 0
 
     def forget(self, grid: str) -> None:
-        """Forget the size of a grid that is replaced."""
+        """Discard the known size of a grid that is replaced."""
         self._cells.pop(grid, None)
 
     def _size(self, entry: field_files.Field, frame: int) -> int | None:
@@ -227,7 +227,7 @@ class WholeFiles:
             return os.pread(file.fileno(), len(_ZIP_END), max(0, size - _ZIP_END_BYTES)) == _ZIP_END
 
     def _cells_of(self, grid: str) -> int | None:
-        """Return the number of voxels of a grid; None if nothing says it."""
+        """Return the number of voxels of a grid; None if it is not known."""
         if grid not in self._cells:
             where = f"{self._folder}/{layout.params_file(grid)}"
             try:

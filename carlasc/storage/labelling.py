@@ -1,4 +1,4 @@
-"""Labels of a network as those of a data set: a copy of it, with other labels, whose other files are hard links to the same bytes."""
+"""`label`: a copy of a data set with predicted labels. Other files are hard links to the files of the source."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ _PREDICTED = ("labels", "probabilities")
 
 @dataclass
 class LabelResult(CopyResult):
-    """What `label` did: what writing a copy did, and this. Boxes are left out if the labels have other classes.
+    """Result of `label`. Boxes are left out if the labels have another class table.
 
     Attributes:
-        by: what made the labels.
+        by: name of the network that predicted the labels.
         classes: name of the class table of the labels.
         frames: number of frames with labels.
     """
@@ -61,34 +61,34 @@ def label(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> LabelResult:
-    """Write a copy of a data set whose labels are those that a network predicted. The source is not changed.
+    """Write a copy of a data set with the predicted labels of a network. The source is not changed.
 
-    Files that do not change are hard links to those of the source, where both are folders of one file system: no file of either may be
-    edited in place, which carlasc never does. Grids are left out: they were made from other labels. An interrupted run leaves
-    `<out>.part`; the same call again finishes it.
+    Unchanged files are hard links to the files of the source, if both are folders of one file system. Do not edit files of either in place;
+    carlasc never does. Grids are left out, because they were made from other labels. An interrupted run leaves `<out>.part`; the same
+    call finishes it.
 
     Args:
-        source: what has the points: anything that `carlasc.open` takes, or a source.
+        source: the data set with the points: anything that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
         predictions: a folder with one file per frame, in folders such as `<split>/<sequence>/` or `<sequence>/predictions/`; for a single
-            sequence they may lie in the folder itself. `.label`: uint32 per point, of which the lower 16 bits are the class. `.npy`: (N,)
+            sequence they may be in the folder itself. `.label`: uint32 per point, of which the lower 16 bits are the class. `.npy`: (N,)
             class ids, or (N, C) probabilities by class id. `.npz`: `labels` (N,), `probabilities` (N, C), or both.
-        classes: class table of the predictions: its name, a JSON file, or a table; None for the one of each sequence. Labels are converted to
-            the table of the sequence where carlasc knows how, otherwise the result has the table of the predictions.
-        logits: whether (N, C) arrays hold scores from before the softmax.
-        by: what made the labels, as carlasc.json, reports and cards name it; None for the name of the folder `predictions`.
-        frames: range of the frames that get labels; the others are copied without. Each needs a file.
+        classes: class table of the predictions: its name, a JSON file, or a table; None for the table of each sequence. Labels are converted
+            to the table of the sequence if a remap exists; otherwise the result has the table of the predictions.
+        logits: whether (N, C) arrays hold scores before the softmax.
+        by: name of the network in carlasc.json, reports and cards; None for the name of the folder `predictions`.
+        frames: range of frames that get labels; each needs a file. Other frames are copied without labels.
         overwrite: replace a data set at `out` that `label` has made.
-        run: how the work is spread. Steps of progress are files.
+        run: how the work is distributed. Progress counts files.
 
     Returns:
         What was written.
 
     Raises:
         ArgumentError: `classes` or `by` is not valid.
-        ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted run had other predictions.
-        MissingDataError: there are no predictions of a frame.
-        FormatError: a file of predictions does not fit its scan, or its class table.
+        ConflictError: something exists at `out`, `out` lies inside `source`, or an interrupted run had other predictions.
+        MissingDataError: a frame has no predictions.
+        FormatError: a file of predictions does not fit its scan or its class table.
         StorageError: the files cannot be written.
     """
     began = time.perf_counter()
@@ -114,13 +114,13 @@ def label(
 
 
 def checked_name(by: str) -> str:
-    """Return the name of what made labels.
+    """Return the name of the network that predicted labels, if it is valid.
 
     Raises:
         ArgumentError: it is empty, or has several lines.
     """
     if not by.strip() or not by.isprintable():
-        raise ArgumentError("by", expected="a name of one line", found=repr(by))
+        raise ArgumentError("by", expected="a name in one line", found=repr(by))
     return by
 
 
@@ -150,27 +150,28 @@ class _LabelledSequence(DerivedSequence):
     def __init__(self, whole: Sequence, files: PredictedFiles, reader: PredictionReader, by: str) -> None:
         extra = {**whole.metadata.extra, "labels": f"{PREDICTED}{by}"}
         metadata = replace(whole.metadata, classes=reader.target, extra=extra).to_json()
-        stale = {"boxes"} if reader.target != whole.metadata.classes else set()  # their classes are of the other table
-        first = files.path(files.frames[0]) if files.frames else None  # the others are like the first
+        stale = {"boxes"} if reader.target != whole.metadata.classes else set()  # boxes have classes of the other table
+        first = files.path(files.frames[0]) if files.frames else None  # all files are like the first
         own = _PREDICTED[: 1 + (load(first)[1] is not None)] if first else ()
         made = dict.fromkeys(own, np.array(files.frames, np.int64))
         super().__init__(whole, {layout.METADATA: metadata}, made=made, stale={*stale, *_PREDICTED} - {*own})
         self.files, self.reader = files, reader
 
     def make(self, frame: int) -> dict[str, NDArray[Any]]:
-        """Return the labels of a frame, and the probabilities if there are some."""
+        """Return the labels of a frame, and the probabilities if the files have them."""
         path = self.files.path(frame)
         found = dict(zip(_PREDICTED, self.reader.read(path, len(self.whole.read("points", frame))), strict=True))
         if (found["probabilities"] is not None) != ("probabilities" in self.made):
             words = (
                 ("labels", "probabilities") if "probabilities" not in self.made else ("probabilities", "labels only")
             )
-            raise FormatError(path, expected=f"{words[0]}, as in the first file", found=words[1])
+            advice = "predict all frames in the same form"
+            raise FormatError(path, expected=f"{words[0]}, as in the first file", found=words[1], advice=advice)
         return {name: array for name, array in found.items() if array is not None}
 
 
 def reader_for(given: ClassTable | None, sequence: Sequence, logits: bool) -> PredictionReader:
-    """Return what reads predictions for a sequence: as labels in its own table, if the given one can be converted to it."""
+    """Return a reader of predictions for a sequence. It converts labels to the table of the sequence, if a remap exists."""
     own = sequence.metadata.classes
     try:
         remaps_between(given or own, own)

@@ -30,12 +30,10 @@ METADATA = "carlasc.json"
 CAMERAS = "cameras.json"
 PARAMS = "params.json"
 REPORT = "carlasc-report.json"
-DERIVED = ".carlasc"  # the folder of what is derived of a sequence: no field, never packed, safe to delete
+DERIVED = ".carlasc"  # folder of data derived from a sequence: not a field, never packed, safe to delete
 
 FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
-CERTAIN = (
-    65535  # the number that means a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
-)
+CERTAIN = 65535  # value for a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
 
 
 SCAN_FIELDS: dict[str, Field] = {
@@ -157,19 +155,24 @@ IMAGE_FOLDERS = {
     "image_instances": "actor of each pixel, 0 none, as the bytes of a 16-bit PNG",
     "image_depths": "depth of each pixel along the camera's axis in 1/256 m, 0 none, as the bytes of a 16-bit PNG",
 }
-"""Folders with one folder per camera, and what is in them; the field of images/front/000000.jpg is `images.front.jpg`."""
+"""Folders with one subfolder per camera, and their content. The field of images/front/000000.jpg is `images.front.jpg`."""
 IMAGE_SUFFIXES = ("jpg", "png")
 GRID_FIELDS = tuple(_GRID_FIELDS)
-ACTOR_FIELDS = ("instance", "velocity")  # what `carlasc regrid --keep-actors` adds to a grid
-EVIDENCE_FIELDS = ("occupied", "classes", "flags", "views")  # what `carlasc regrid --keep-evidence` adds to a grid
+ACTOR_FIELDS = ("instance", "velocity")  # fields that `carlasc regrid --keep-actors` adds to a grid
+EVIDENCE_FIELDS = (
+    "occupied",
+    "classes",
+    "flags",
+    "views",
+)  # fields that `carlasc regrid --keep-evidence` adds to a grid
 LINE_FIELDS = ("poses", "times")
 
 
 def identity_of(path: str) -> tuple[str | None, str, Coordinates]:
     """Return the split, the name and the coordinates of a sequence from its path.
 
-    The path is that of the `<coordinates>` folder, absolute or relative; leading parts may be missing. If the last part is not the
-    name of coordinates, it is the name of the sequence, whose coordinates are then Cartesian.
+    The path is that of the `<coordinates>` folder, absolute or relative; leading parts may be missing. If the last part is not a
+    name of coordinates, it is the name of the sequence, and the coordinates are Cartesian.
     """
     parts = [part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("/", ".")]
     coordinates = parts.pop() if parts and parts[-1] in COORDINATES else "cartesian"
@@ -209,7 +212,7 @@ def point_fields() -> tuple[str, ...]:
 
 
 def scan_folders() -> frozenset[str]:
-    """Return the folders of the scans' fields, under `<coordinates>/`."""
+    """Return the folders of the fields of scans, under `<coordinates>/`."""
     return frozenset(field.folder for field in SCAN_FIELDS.values())
 
 
@@ -219,7 +222,7 @@ def params_file(grid: str) -> str:
 
 
 def derived(name: str, digest: str) -> str:
-    """Return the path of a file that is derived of a sequence, such as its tracks, by the digest of what it is made from."""
+    """Return the path of a file derived from a sequence, such as its tracks. `digest` identifies its input and settings."""
     return f"{DERIVED}/{name}-{digest[:16]}.npz"
 
 

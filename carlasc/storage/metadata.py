@@ -1,4 +1,4 @@
-"""What carlasc.json says of a sequence, and the version of the files that carlasc adds. See `docs/format.md#carlasc-json`."""
+"""The content of carlasc.json, and the version of the files that carlasc adds. See `docs/format.md#carlasc-json`."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ FORMAT = 2
 """Version of carlasc.json. Version 1 had no key `format`, and `frame` ("carlasc" or "kitti") where version 2 has `axes`."""
 
 PREDICTED = "predicted by "
-"""How the key `labels` of carlasc.json begins where a network made the labels; its name follows."""
+"""Prefix of the key `labels` of carlasc.json for predicted labels; the name of the network follows."""
 _AXES: dict[str, Axes] = {"carlasc": "left", "kitti": "right"}  # by the `frame` of version 1
 
 
 @dataclass(frozen=True)
 class Metadata:
-    """The content of carlasc.json; the defaults are what its absence means.
+    """The content of carlasc.json. The defaults apply if the file does not exist.
 
     Attributes:
         axes: "left" (left-handed, y to the right: CarlaSC, CARLA) or "right" (right-handed, y to the left: SemanticKITTI, ROS).
         classes: class table of the labels.
-        sensor: what took the scans, in words.
-        min_range_m: points nearer than this are left out of grids (the roof of the own car), metres.
+        sensor: description of the sensor.
+        min_range_m: points nearer than this are left out of grids (the roof of the ego vehicle), metres.
         max_range_m: points farther than this are left out of grids, metres.
-        source: what the sequence was made from.
-        extra: further keys, kept as they are.
+        source: data that the sequence was made from.
+        extra: other keys, unchanged.
     """
 
     axes: Axes = "left"
@@ -44,12 +44,12 @@ class Metadata:
 
     @property
     def has_rays(self) -> bool:
-        """Whether points were seen from the sensor. Clouds whose sensor nobody knows say otherwise: nothing tells their free space."""
+        """Whether points have rays from a known sensor position. Without rays, there is no free space."""
         return self.extra.get("rays") is not False
 
     @property
     def predicted(self) -> str | None:
-        """What `labels` says of labels that were predicted: "predicted by ..."; None for others."""
+        """The key `labels`, "predicted by ...", if labels are predicted; otherwise None."""
         labels = self.extra.get("labels")
         return labels if isinstance(labels, str) and labels.startswith(PREDICTED) else None
 
@@ -58,7 +58,7 @@ class Metadata:
         """Read carlasc.json, of this version or an older one; `where` is the file named in errors.
 
         Raises:
-            FormatError: it is no JSON object, of a newer version, or holds unknown axes or an unknown or damaged class table.
+            FormatError: it is not a JSON object, is of a newer version, or has unknown axes or an unknown or damaged class table.
         """
         values = parse_json(data, where)
         check_format(values.pop("format", 1), where)
@@ -76,7 +76,7 @@ class Metadata:
         )
 
     def to_json(self) -> bytes:
-        """Return the bytes of carlasc.json. A class table that carlasc does not have by name is written whole."""
+        """Return the bytes of carlasc.json. A class table that is not built into carlasc is written in full."""
         values: dict[str, Any] = {"format": FORMAT, "axes": self.axes, "classes": table_to_json(self.classes)}
         values |= {"sensor": self.sensor, "min_range_m": self.min_range_m, "max_range_m": self.max_range_m}
         values |= {"source": self.source}
@@ -87,10 +87,10 @@ def check_format(version: object, where: str) -> None:
     """Check that this version of carlasc reads files of a version of the format.
 
     Raises:
-        FormatError: it is no version, or a newer one.
+        FormatError: it is not a version, or is a newer one.
     """
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
-        raise FormatError(where, expected="a whole number above 0 in format", found=repr(version))
+        raise FormatError(where, expected="an integer above 0 in format", found=repr(version))
     if version > FORMAT:
         raise FormatError(
             where, expected=f"format {FORMAT} or older", found=f"format {version}", advice="upgrade carlasc to read it"
@@ -98,7 +98,7 @@ def check_format(version: object, where: str) -> None:
 
 
 def _read_axes(values: dict[str, Any], where: str) -> Axes:
-    """Take `axes` out of carlasc.json, or `frame`, which stood for it in version 1."""
+    """Remove `axes` from the values of carlasc.json, or `frame` of version 1, and return the axes."""
     frame, axes = values.pop("frame", None), values.pop("axes", None)
     if frame is not None and frame not in _AXES:
         raise FormatError(where, expected=f"{' or '.join(_AXES)} in frame", found=repr(frame))

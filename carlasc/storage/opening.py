@@ -23,7 +23,7 @@ from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 from carlasc.storage.transport.zipped import ZipTree
 
 PACKED = (".zarr", ".h5", ".hdf5", ".parquet")
-"""Endings of the names of packed stores."""
+"""Suffixes of packed stores."""
 
 if TYPE_CHECKING:
     from carlasc.storage.zarr.zarr_sink import ZarrSink
@@ -35,13 +35,13 @@ _SIGNATURE = 8  # number of leading bytes that identify the kind of file
 def open(
     path: str | os.PathLike[str], *, cache: str | os.PathLike[str] | Cache | None = None, **storage_options: Any
 ) -> Source:
-    """Open a store of sequences. Its kind is determined from its content, not from the ending of its name.
+    """Open a store of sequences. Its kind is determined from its content, not from its suffix.
 
     Args:
         path: a folder of the published layout (the data set, a split, a sequence, one `<coordinates>` folder), a zip of such a folder (read
             in place), a packed store (zarr, HDF5, Parquet), or the URL of any of these (http, s3, and all other protocols of fsspec).
-        cache: a folder of this machine, or a `carlasc.Cache`, for the files of a packed zarr store or a folder behind a URL: each file
-            is fetched whole, once for all processes. Stores on this machine need none: it is not used for them.
+        cache: a local folder, or a `carlasc.Cache`, for the files of a packed zarr store or a folder at a URL. Each file is fetched
+            once for all processes. It is not used for local stores. None: no cache.
         **storage_options: options of fsspec for the URL, such as `anon=True` or `endpoint_url=...`.
 
     Returns:
@@ -69,7 +69,7 @@ def open(
 
 
 def _is_unfinished(path: Path) -> bool:
-    """Whether a path is that of a store that gets its name when it is whole, or of what is written until then."""
+    """Whether a path is an unfinished store: its final path, or that of its .part file."""
     if not path.exists():
         return bool(path.name) and unfinished(path).exists()
     return path.suffix == unfinished(Path("x")).suffix and path.with_suffix("").suffix in PACKED
@@ -83,16 +83,16 @@ def as_source(source: str | os.PathLike[str] | Source) -> Source:
 def open_sink(
     path: str | os.PathLike[str] | Target, options: PackOptions | None, overwrite: bool, **storage_options: Any
 ) -> PackedSink | ZarrSink:
-    """Start a packed store. The ending of its name gives its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`.
+    """Start a packed store. The suffix determines its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`. None as `options` takes the defaults.
 
     Raises:
-        ArgumentError: another ending, an option that the store does not have, or a URL where the store is written on this machine only.
+        ArgumentError: the suffix is another one, the store lacks an option, or `path` is a URL and the store can be written locally only.
         ConflictError: the path already exists, and `overwrite` is not given.
         DependencyError: a package is missing.
     """
     kind = PurePosixPath(path.location if isinstance(path, Target) else path).suffix
     if kind not in PACKED:
-        raise ArgumentError(path, expected="a store ending in .zarr, .h5 or .parquet", found=kind or "no ending")
+        raise ArgumentError(path, expected="a store ending in .zarr, .h5 or .parquet", found=kind or "no suffix")
     if kind == ".zarr":
         from carlasc.storage.zarr.zarr_sink import ZarrSink
 
@@ -120,26 +120,24 @@ def as_sink(
     part: Part = Part(),  # noqa: B008 (frozen)
     **storage_options: Any,
 ) -> Sink:
-    """Return a Sink unchanged; start one at any other place.
+    """Return a Sink unchanged; otherwise start a store at a path or a URL.
 
     Args:
         out: a folder of the published layout, or a packed store, whose name ends in .zarr, .h5, .hdf5 or .parquet; a path or a URL.
         overwrite: replace an existing packed store.
-        part: the part of a run that writes to it.
+        part: the part of the run that writes to the store.
         **storage_options: options of fsspec for a URL.
 
     Raises:
-        ArgumentError: nothing can be written there, or not by several parts.
-        ConflictError: a packed store exists there, and `overwrite` is not given.
+        ArgumentError: the place cannot be written to, or not by several parts.
+        ConflictError: a packed store exists at `out`, and `overwrite` is not given.
         DependencyError: a package is missing.
     """
     if isinstance(out, Sink):
         return out
     suffix = PurePosixPath(out.location if isinstance(out, Target) else out).suffix
     if part.count > 1 and suffix in PACKED[1:]:
-        raise ArgumentError(
-            "part", expected="a folder or a .zarr store, which several processes can write", found=str(out)
-        )
+        raise ArgumentError("part", expected="a folder or a .zarr store as output of several parts", found=str(out))
     if suffix in PACKED:
         return open_sink(out, None, overwrite, **storage_options)
     return FolderSink(out, **storage_options)
@@ -168,7 +166,7 @@ def _open_folder(tree: Tree) -> Source:
         raise MissingDataError(
             tree.location,
             expected="a folder, a zip or a packed store",
-            found="nothing (or a folder that cannot be listed)",
+            found="nothing, or a folder that cannot be listed",
             advice="check the name; private and gated data need a token in HF_TOKEN"
             if tree.location.startswith(f"{HUB}://")
             else "",
@@ -197,7 +195,10 @@ def _open_file(tree: Tree, name: str) -> Source:
         signature = bytes(tree.read_range(name, 0, _SIGNATURE))
     except FormatError as error:
         raise FormatError(
-            where, expected="a zip or a packed store", found="a file of a few bytes", advice="the file may be cut short"
+            where,
+            expected="a zip or a packed store",
+            found=f"a file of less than {_SIGNATURE} bytes",
+            advice="the file may be cut short",
         ) from error
     if signature.startswith((_ZIP, _EMPTY_ZIP)):
         inside = ZipTree(tree, name)
@@ -208,6 +209,9 @@ def _open_file(tree: Tree, name: str) -> Source:
         return HDF5Source(tree, name)
     if signature.startswith(_PARQUET):
         raise FormatError(
-            where, expected="a packed store", found="one of its files", advice="give the folder that it is in"
+            where,
+            expected="a packed store",
+            found="a file inside a packed store",
+            advice="give the folder of the store",
         )
     raise FormatError(where, expected="a folder, a zip, or a packed store", found="a file that is none of these")

@@ -37,23 +37,23 @@ from carlasc.storage.transport.trees import is_url
 if TYPE_CHECKING:
     from carlasc.storage.zarr.zarr_sink import ZarrSink, ZarrWriter
 
-_BLOCK = 8  # frames that are read together
-_AHEAD = 2  # threads that read ahead of the writer of a store that is appended to
+_BLOCK = 8  # frames per read
+_AHEAD = 2  # threads that read ahead, for stores with one writer
 
 
 @dataclass
 class PackResult:
-    """What `pack` did.
+    """Result of `pack`.
 
     Attributes:
         out: the store: a path, or a URL.
-        is_finished: whether it can be opened; if not, other parts of the run are missing, and sizes are not known yet.
+        is_finished: whether the store can be opened; if not, other parts of the run are missing, and sizes are not known yet.
         sequences: paths of the sequences in it.
         frames: number of frames of all sequences.
         published_bytes: bytes of the published files, per field ("documents": the text files).
         stored_bytes: bytes in the store, per field ("documents": the text files, "index": everything else).
-        left_out: files that the layout does not know, which are not packed: "<sequence>: <file>".
-        elapsed_s: seconds that it took.
+        left_out: files that are not part of the layout and were not packed: "<sequence>: <file>".
+        elapsed_s: duration, seconds.
     """
 
     out: Path | str
@@ -80,27 +80,27 @@ def pack(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> PackResult:
-    """Pack all sequences of `source` into one store. Nothing is lost, unless `lossy_mm` is given.
+    """Pack all sequences of `source` into one store. Packing is lossless, unless `lossy_mm` is given.
 
-    An interrupted run leaves a store that cannot be opened: a `.zarr` at `out`, others at `<out>.part`. The same call again finishes it:
-    zarr continues with the blocks of frames that are missing, Parquet after the last finished sequence, HDF5 starts again. Processes
-    import the main module again: call this under `if __name__ == "__main__":` in scripts, or with `workers=1`.
+    An interrupted run leaves a store that cannot be opened: a `.zarr` at `out`, others at `<out>.part`. The same call finishes it:
+    zarr continues with the missing blocks of frames, Parquet after the last finished sequence, HDF5 starts again. Worker processes
+    import the main module again: in scripts, call this function under `if __name__ == "__main__":`, or with `workers=1`.
 
     Args:
         source: what to pack: anything that `carlasc.open` takes, or a source.
-        out: the store to write, a path or (.zarr) a URL of an object store; its ending, `.zarr`, `.h5` or `.parquet`, says of which kind.
-        small: PCodec for points (zarr only): smaller, but fewer programs can read it.
+        out: the store to write, a path or (.zarr) a URL of an object store. The suffix, `.zarr`, `.h5` or `.parquet`, determines its kind.
+        small: compress points with PCodec (zarr only): smaller, but fewer programs can read it.
         lossy_mm: quantise points to this many millimetres, which the store records. None keeps every bit.
-        overwrite: replace a store that exists at `out`.
-        run: how the work is spread. A `.zarr` is packed in blocks of frames: by one process per core, and fewer where there are few blocks,
-            unless `workers` is given; by an executor; or in parts, of which the one that finds that no frame is missing any more finishes the
-            store. Other stores have one writer: `workers` is the number of threads that read ahead of it. Steps of progress are files.
+        overwrite: replace an existing store at `out`.
+        run: how the work is distributed. A `.zarr` is packed in blocks of frames: by worker processes (default: one per core, fewer for few
+            blocks), by an executor, or in parts; the last part to finish completes the store. Other stores have one writer: `workers` is
+            the number of threads that read ahead of it. Progress counts files.
 
     Returns:
-        What was packed, with the bytes before and after.
+        The packed sequences, with the bytes before and after.
 
     Raises:
-        ArgumentError: `out` has another ending, or an option does not fit it.
+        ArgumentError: `out` has another suffix, or an option is not supported by this kind of store.
         ConflictError: something exists at `out`, or `out` lies inside `source`.
         DependencyError: the package for this kind of store is not installed.
         FormatError, MissingDataError: a file of the source is damaged or missing.
@@ -136,18 +136,18 @@ def pack(
 
 
 def _refuse_several(out: object, run: Run) -> None:
-    """Refuse to write a store of one writer by several."""
+    """Raise ArgumentError if several processes would write a store that supports one writer only."""
     for name, wanted in (("executor", run.executor is not None), ("part", run.part.count > 1)):
         if wanted:
             raise ArgumentError(name, expected="a .zarr store, which several processes can write", found=str(out))
 
 
 def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) -> bool:
-    """Pack a part of the blocks of sequences, in any number of processes, and return whether the store is finished."""
+    """Pack the blocks of one part of the run, in any number of processes, and return whether the store is finished."""
     if sink.is_finished and run.part.count == 1:
         raise ConflictError(
             sink.location,
-            expected="nothing there",
+            expected="a new path",
             found="a finished store",
             advice="choose another name, or give `overwrite=True`",
         )
@@ -173,14 +173,14 @@ def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) ->
 
 @contextmanager
 def _writing(out: object) -> Iterator[None]:
-    """Report a store that cannot be written; sources raise their own errors."""
+    """Turn an OSError of the store into a StorageError; sources raise their own errors."""
     try:
         yield
     except OSError as error:
         raise StorageError(
             out,
             problem=f"cannot be written: {error.strerror or error}",
-            advice="fix that and run the same command again to finish it",
+            advice="fix the cause and run the same command again to finish it",
         ) from error
 
 
@@ -207,7 +207,7 @@ def _append_sequence(
     step: Callable[[int], None],
     threads: int,
 ) -> None:
-    """Copy a sequence field by field and add up its published bytes; None for the writer of a sequence that is already packed."""
+    """Copy a sequence field by field and add up its published bytes. `writer` is None if the sequence is already packed."""
     documents = {name: sequence.read_document(name) for name in sequence.documents()}
     published["documents"] += sum(map(len, documents.values()))
     if writer is not None:
@@ -225,7 +225,7 @@ def _append_sequence(
 
 
 def _read_ahead(sequence: Sequence, name: str, frames: list[int], threads: int) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Yield a field's frames in order, while threads read the next blocks."""
+    """Yield the frames of a field in order. Threads read the next blocks in advance."""
     blocks = [frames[first : first + _BLOCK] for first in range(0, len(frames), _BLOCK)]
     with ThreadPoolExecutor(threads) as pool:
         ahead: deque[Future[list[NDArray[Any]]]] = deque()

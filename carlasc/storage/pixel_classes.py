@@ -1,4 +1,4 @@
-"""The class of each pixel of a camera's images, in the layout or in a folder of what a network wrote. See `docs/howto/cameras.md`."""
+"""The class of each pixel of camera images, in the layout or in a folder of network predictions. See `docs/howto/cameras.md`."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _LAYOUT = "image_labels"
 
 @dataclass(frozen=True)
 class PixelClasses:
-    """What says the class of each pixel of the images of one sequence.
+    """The classes of the pixels of the images of one sequence.
 
     Attributes:
         sequence: the sequence.
-        files: the files by camera and frame; None: those of the layout.
+        files: the files by camera and frame; None for the files of the layout.
     """
 
     sequence: Sequence
@@ -35,16 +35,16 @@ class PixelClasses:
 
     @classmethod
     def find(cls, sequence: Sequence, root: Path | None) -> PixelClasses:
-        """Find the classes of pixels of a sequence.
+        """Find the files with classes of pixels of a sequence.
 
         Args:
             sequence: a sequence with cameras.
-            root: a folder with `<sequence>/<camera>/000000.png` or `.npy`, or `<camera>/000000.png` for a single sequence; None: the
-                `image_labels` of the sequence itself.
+            root: a folder with `<sequence>/<camera>/000000.png` or `.npy`, or `<camera>/000000.png` for a single sequence; None uses the
+                `image_labels` of the sequence.
 
         Raises:
-            MissingDataError: the sequence has no cameras, or there are no classes of its pixels.
-            FormatError: two folders have those of one camera, or there are those of a camera without calibration.
+            MissingDataError: the sequence has no cameras, or no classes of pixels exist.
+            FormatError: two folders belong to the same camera, or a camera has no calibration.
         """
         cameras = cameras_of(sequence)
         if not cameras:
@@ -62,21 +62,21 @@ class PixelClasses:
             )
         if not known:
             expected = f"classes of pixels, such as {sequence.name}/{next(iter(cameras))}/000000.png"
-            advice = "give the folder of those that a network wrote as `pixels`" if root is None else ""
+            advice = "give the folder of a network's predictions as `pixels`" if root is None else ""
             raise MissingDataError(
                 root or f"{sequence.location}/{_LAYOUT}", expected=expected, found="none", advice=advice
             )
         return found
 
     def has(self, camera: str, frame: int) -> bool:
-        """Whether there are classes of the pixels of a camera in a frame."""
+        """Whether the classes of pixels exist for a camera and a frame."""
         if self.files is not None:
             return frame in self.files.get(camera, {})
         field = image_fields(self.sequence, _LAYOUT).get(camera)
         return field is not None and frame in self.sequence.frames(field)
 
     def read(self, camera: CameraModel, frame: int) -> NDArray[Any]:
-        """Return (H, W) whole numbers, ids of classes; or (H, W, C) floats, the probability of each id.
+        """Return (H, W) integers, class ids, or (H, W, C) floats, the probability of each id.
 
         Raises:
             FormatError: the file is damaged, or has another size than the camera's images.
@@ -89,12 +89,12 @@ class PixelClasses:
         array = read_npy(path, ArrayFormat(NUMBERS, None))
         size, is_float = (camera.height, camera.width), array.dtype.kind == "f"
         if array.ndim != 2 + is_float or array.shape[:2] != size:
-            expected = f"{size} whole numbers, or {size} and a column for each class of floats, as camera {camera.name} is calibrated"
+            expected = f"{size} integers, or {size} floats per class, as camera {camera.name} is calibrated"
             raise FormatError(path, expected=expected, found=f"{array.dtype.name} of shape {array.shape}")
         return array
 
     def stamps(self) -> list[tuple[str, int, int]]:
-        """Return names, sizes and times of the files; nothing of those of the layout, which belong to the source."""
+        """Return names, sizes and modification times of the files; empty for files of the layout, which belong to the source."""
         paths = [path for files in (self.files or {}).values() for path in files.values()]
         return [(str(path), found.st_size, found.st_mtime_ns) for path in sorted(paths) for found in (path.stat(),)]
 
@@ -103,7 +103,7 @@ def _files(sequence: Sequence, root: Path) -> dict[str, dict[int, Path]]:
     named: dict[bool, dict[str, dict[int, Path]]] = {
         True: {},
         False: {},
-    }  # by whether the path has the name of the sequence
+    }  # key: whether the path contains the name of the sequence
     for folder, _, names in os.walk(root):
         paths = {
             frame: Path(folder, name)

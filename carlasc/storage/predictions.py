@@ -1,4 +1,4 @@
-"""The predictions of a network in files: a class for each point, and probabilities where the files have them. See `docs/commands/label.md`."""
+"""Files of network predictions: a class per point, and optional probabilities. See `docs/commands/label.md`."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from carlasc.storage.files import parse_json
 from carlasc.storage.protocol import Sequence
 
 SUFFIXES = (".label", ".npy", ".npz")
-_LEAVES = ("labels", "predictions")  # folders of the files of one sequence
+_LEAVES = ("labels", "predictions")  # names of folders with the files of one sequence
 _FLOATS = tuple(kind for kind in NUMBERS if kind not in WHOLE_NUMBERS)
-_TOLERANCE = 1e-3  # of the sum of the probabilities of a point
-_PAIRS = 3  # classes of a point that are kept with their probabilities
-_NAMED = 5  # frames that a message names
+_TOLERANCE = 1e-3  # allowed deviation of the sum of probabilities of a point from 1
+_PAIRS = 3  # number of classes per point that are stored with their probabilities
+_NAMED = 5  # number of frames that a message lists
 
 
 @dataclass(frozen=True)
 class PredictedFiles:
-    """The files of one sequence: `<folder>/000000<suffix>` for each of some frames, which are sorted."""
+    """The files of one sequence: `<folder>/000000<suffix>` for each of the sorted frames."""
 
     folder: Path
     suffix: str
@@ -42,58 +42,59 @@ class PredictedFiles:
 
 
 def find_predictions(root: Path, sequences: Mapping[str, Sequence], chosen: FrameRange) -> dict[str, PredictedFiles]:
-    """Return the files of the frames of each sequence that are in a range.
+    """Return the files of the chosen frames of each sequence.
 
-    The files of a sequence are in the only folder whose path has the name of the sequence, and no other split and coordinates than its own; of
-    several, in the one called labels or predictions. Those of a single sequence may be in `root` itself, or in a folder of these two names.
+    The files of a sequence are in the only folder whose path contains the name of the sequence, and no name of another split or other
+    coordinates. If there are several such folders, the one named labels or predictions is used. The files of a single sequence may also be
+    in `root` itself, or in a folder with one of these two names.
 
     Raises:
         MissingDataError: a sequence has no folder, or a frame no file.
-        FormatError: a sequence has several folders, or a folder files of several endings.
+        FormatError: a sequence has several folders, or a folder has files with several suffixes.
     """
-    found: dict[tuple[str, ...], PredictedFiles] = {}
+    by_folder: dict[tuple[str, ...], PredictedFiles] = {}
     for folder, _, names in os.walk(root):
         for suffix in SUFFIXES:
             stems = [name.removesuffix(suffix) for name in names if layout.frame_of(name, suffix) is not None]
             if numbers := sorted(int(stem) for stem in stems if stem == f"{int(stem):06d}"):
                 parts = Path(folder).relative_to(root).parts
-                if parts in found:
+                if parts in by_folder:
                     raise FormatError(
-                        folder, expected="files of one ending", found=f"{found[parts].suffix} and {suffix}"
+                        folder, expected="files with one suffix", found=f"{by_folder[parts].suffix} and {suffix}"
                     )
-                found[parts] = PredictedFiles(Path(folder), suffix, tuple(numbers))
+                by_folder[parts] = PredictedFiles(Path(folder), suffix, tuple(numbers))
     result, lacking = {}, []
     for path, sequence in sequences.items():
-        named = [parts for parts in found if sequence.name in parts and not _others(sequence) & set(parts)]
-        if not named and len(sequences) == 1:
-            named = [parts for parts in found if parts in ((), *((leaf,) for leaf in _LEAVES))]
-        named = [parts for parts in named if parts and parts[-1] in _LEAVES] or named
-        if len(named) != 1:
-            folders = ", ".join("/".join(parts) or "." for parts in sorted(named or found)[:_NAMED]) or "none"
+        matching = [parts for parts in by_folder if sequence.name in parts and not _others(sequence) & set(parts)]
+        if not matching and len(sequences) == 1:
+            matching = [parts for parts in by_folder if parts in ((), *((leaf,) for leaf in _LEAVES))]
+        matching = [parts for parts in matching if parts and parts[-1] in _LEAVES] or matching
+        if len(matching) != 1:
+            folders = ", ".join("/".join(parts) or "." for parts in sorted(matching or by_folder)[:_NAMED]) or "none"
             expected = f"one folder of files such as {sequence.name}/000000{SUFFIXES[0]} ({', '.join(SUFFIXES[1:])})"
-            raise (FormatError if named else MissingDataError)(root, expected=expected, found=folders)
-        files = found[named[0]]
+            raise (FormatError if matching else MissingDataError)(root, expected=expected, found=folders)
+        files = by_folder[matching[0]]
         wanted = chosen.select(sequence.frames("points"))
         if len(missing := np.setdiff1d(wanted, files.frames)):
             first = ", ".join(f"{frame:06d}" for frame in missing[:_NAMED]) + ", ..." * (len(missing) > _NAMED)
             lacking.append(f"none for {len(missing)} of {len(wanted)} frames of {path or sequence.name} ({first})")
         result[path] = replace(files, frames=tuple(wanted.tolist()))
     if lacking:
-        advice = "predict them too, or leave them out with `frames`"
+        advice = "predict these frames too, or leave them out with `frames`"
         raise MissingDataError(root, expected="a file for each frame", found="; ".join(lacking), advice=advice)
     return result
 
 
 def _others(sequence: Sequence) -> set[str]:
-    """Return the names of splits and coordinates that a path to files of the sequence does not have."""
+    """Return the names of splits and coordinates that do not belong to the sequence."""
     return {*layout.SPLITS, *layout.COORDINATES} - {sequence.split or "", sequence.coordinates}
 
 
 def read_table(classes: str | os.PathLike[str] | ClassTable) -> ClassTable:
-    """Return a class table: itself, the one of this name, or that of a JSON file: a table as carlasc.json has it, or a carlasc.json.
+    """Return a class table, given as a table, its name, or a JSON file: a class table in the form of carlasc.json, or a carlasc.json.
 
     Raises:
-        ArgumentError: it is neither a name nor a file.
+        ArgumentError: `classes` is neither a known name nor a file.
         FormatError: the file holds no class table.
     """
     if isinstance(classes, ClassTable) or str(classes) in TABLES:
@@ -111,7 +112,7 @@ class PredictionReader:
     Attributes:
         classes: class table of the files.
         target: class table of the result.
-        logits: whether scores are taken before the softmax.
+        logits: whether the files hold scores before the softmax.
     """
 
     classes: ClassTable
@@ -119,16 +120,16 @@ class PredictionReader:
     logits: bool = False
 
     def read(self, path: Path, count: int) -> tuple[NDArray[np.uint32], NDArray[np.uint16] | None]:
-        """Return the (N,) labels of the `count` points of a scan, and the (N, 6) field `probabilities`, None without probabilities.
+        """Return the (N,) labels of the `count` points of a scan, and the (N, 6) field `probabilities`, or None if the file has none.
 
         Raises:
             MissingDataError: the file does not exist.
-            FormatError: it is damaged, has not one row for each point, other classes than the table, or rows that are no probabilities.
+            FormatError: it is damaged, has not one row per point, has classes that the table lacks, or has rows that are not probabilities.
         """
         labels, scores = load(path)
         for rows in (labels, scores):
             if rows is not None and len(rows) != count:
-                raise FormatError(path, expected=f"{count} rows, one for each point", found=str(len(rows)))
+                raise FormatError(path, expected=f"{count} rows, one per point", found=str(len(rows)))
         if scores is not None:
             scores = self.probabilities(scores, str(path))
             labels = scores.argmax(axis=1) if labels is None else labels
@@ -139,10 +140,10 @@ class PredictionReader:
         return converted, None if scores is None else self.pairs(scores, str(path))
 
     def check(self, ids: NDArray[np.integer], where: str) -> None:
-        """Check that the class table of the files has some ids.
+        """Check that the class table of the files contains the ids.
 
         Raises:
-            FormatError: it lacks one.
+            FormatError: an id is missing in the table.
         """
         if len(unknown := ids[~np.isin(ids, list(self.classes.names))]):
             expected = f"ids of the class table {self.classes.name}, up to {max(self.classes.names)}"
@@ -150,7 +151,7 @@ class PredictionReader:
             raise FormatError(where, expected=expected, found=str(unknown[0]), advice=advice)
 
     def probabilities(self, scores: NDArray[np.floating], where: str) -> NDArray[np.float32]:
-        """Return the (N, C) float32 probabilities that scores are, after checking that they are such."""
+        """Return (N, C) scores as float32 probabilities. Raises FormatError if they are not probabilities."""
         shares = scores.astype(np.float32)
         with np.errstate(invalid="ignore", over="ignore"):
             if self.logits:
@@ -160,14 +161,14 @@ class PredictionReader:
             wrong = ~((np.abs(sums - 1) <= _TOLERANCE) & (shares.min(axis=1) >= 0))
         if wrong.any():
             row = int(wrong.argmax())
-            found = f"a sum of {sums[row]:g}, the least {shares[row].min():g}, at point {row}"
-            expected = f"probabilities of classes, of which those of each point sum to 1 within {_TOLERANCE}"
+            found = f"a sum of {sums[row]:g} and a minimum of {shares[row].min():g} at point {row}"
+            expected = f"class probabilities that are at least 0 and sum to 1 within {_TOLERANCE} per point"
             advice = "" if self.logits else "give `logits=True` if these are scores before the softmax"
             raise FormatError(where, expected=expected, found=found, advice=advice)
         return shares
 
     def pairs(self, shares: NDArray[np.float32], where: str) -> NDArray[np.uint16]:
-        """Return the likeliest classes of each point of (N, C) probabilities, and their probabilities, added up where classes become one."""
+        """Return the most probable classes of each point of (N, C) probabilities, with their probabilities. Merged classes are added up."""
         columns = np.flatnonzero(shares.max(axis=0, initial=0) * layout.CERTAIN >= 1).astype(np.uint32)
         self.check(columns, where)
         ids, place = np.unique(to_table(columns, self.classes, self.target, where), return_inverse=True)
@@ -184,7 +185,7 @@ class PredictionReader:
 
 
 def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
-    """Return the labels, (N,) whole numbers, and the scores, (N, C) floats, of a file, each if it has some."""
+    """Return the labels, (N,) integers, and the scores, (N, C) floats, of a file; None for what it does not contain."""
     labels: NDArray[Any] | None = None
     scores: NDArray[Any] | None = None
     if path.suffix == ".npz":
@@ -199,7 +200,7 @@ def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
         is_float = array.dtype.kind == "f"
         if array.ndim != 1 + is_float:
             found = f"{array.dtype.name} of shape {array.shape}"
-            raise FormatError(path, expected="(N,) whole numbers, or (N, C) floats: a column per class", found=found)
+            raise FormatError(path, expected="(N,) integers, or (N, C) floats with one column per class", found=found)
         return (None, array) if is_float else (array, None)
     data = path.read_bytes()
     if len(data) % 4:

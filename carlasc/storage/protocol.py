@@ -1,4 +1,4 @@
-"""The protocol by which stores are read: a Source yields sequences. `carlasc.storage.sinks` has that by which they are written.
+"""The protocol for reading stores: a Source yields sequences. `carlasc.storage.sinks` has the protocol for writing.
 
 A sequence is one `<split>/<sequence>/<coordinates>` of the layout. It has fields and frames; one call reads one field of one
 frame as an array. A field that the sequence does not have is not listed by `fields()`. Sources hold paths, never open handles, so
@@ -31,7 +31,7 @@ from carlasc.storage.metadata import Metadata, check_format
 
 
 class FileTree(Protocol):
-    """The files that a store is made of, wherever they are: all that this protocol knows of them.
+    """The part of a tree of files, local or remote, that this protocol uses.
 
     Attributes:
         location: its name in errors: a folder, a zip, a URL.
@@ -44,7 +44,7 @@ class FileTree(Protocol):
 
         Args:
             path: the file, its parts joined by "/".
-            size: the bytes that it has if it is what it should be; None where nothing says it.
+            size: expected size in bytes; None if it is not known.
         """
         ...
 
@@ -52,7 +52,7 @@ class FileTree(Protocol):
 class Sequence(ABC):
     """One `<split>/<sequence>/<coordinates>`: fields and frames, read one at a time.
 
-    It is a collection of frame numbers: `for frame in sequence`, `frame in sequence` and `len(sequence)` are about `scan_frames()`.
+    It is a collection of frame numbers: `for frame in sequence`, `frame in sequence` and `len(sequence)` use `scan_frames()`.
 
     Attributes:
         path: path of the sequence in its Source, such as "Train/Town01_Light/cartesian", which is unique there; "" if the Source is
@@ -61,7 +61,7 @@ class Sequence(ABC):
         split: "Train", "Val", "Test", or None.
         name: "Town01_Light".
         coordinates: "cartesian" or "cylindrical".
-        tree: the tree of files that it is read from; None if it is not read from one.
+        tree: the tree of files that it is read from; None if it is not read from files.
     """
 
     path: str
@@ -105,13 +105,13 @@ class Sequence(ABC):
         """
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
-        """Read one field of several frames, each with the shape that `read` gives. Stores that can do so read them together."""
+        """Read one field of several frames, each with the shape that `read` returns. Some stores read them together, which is faster."""
         return [self.read(field, frame) for frame in frames]
 
     def read_xyz(
         self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
     ) -> list[NDArray[np.float32]]:
-        """Read the coordinates of the points of several frames, in the memory layout of the store. The caller must not keep them.
+        """Read the coordinates of the points of several frames, in the memory layout of the store. The caller must not keep the arrays.
 
         Args:
             frames: numbers of the frames.
@@ -125,7 +125,7 @@ class Sequence(ABC):
     def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
         """Return the files that hold a field of some frames, each once, as paths in the tree of the store.
 
-        A cache fetches these files whole before the frames are read. The list is empty where the store does not say it.
+        A cache fetches these files before the frames are read. The list is empty if the store does not support this.
         """
         return []
 
@@ -218,7 +218,7 @@ class Sequence(ABC):
         """Return (4, 4) first_T_sensor of a frame.
 
         Raises:
-            FormatError: there is no line for it, or a number of it is not finite.
+            FormatError: poses.txt has no line for the frame, or a number in it is not finite.
         """
         line = self.line_of(frame, len(self.poses), layout.POSES)
         pose = self.poses[line]
@@ -231,7 +231,7 @@ class Sequence(ABC):
         """Return the time of a frame in seconds since the first frame.
 
         Raises:
-            FormatError: there is no line for it, or it is no number of seconds.
+            FormatError: times.txt has no line for the frame, or the line is not a valid time.
         """
         line = self.line_of(frame, len(self.times), layout.TIMES)
         return float(check_seconds(self.times[line : line + 1], f"{self.location}/{layout.TIMES}: line {line + 1}")[0])
@@ -259,7 +259,7 @@ class Sequence(ABC):
         raise FormatError(
             f"{self.location}/{document}",
             expected=f"a line for each of {len(positions)} frames (the last is {last})",
-            found=f"{lines}",
+            found=f"{lines} lines",
             advice=f"frame {frame} has none",
         )
 
@@ -269,7 +269,7 @@ class Sequence(ABC):
         return int(frames[-1]) if len(frames) else -1, {int(frame): line for line, frame in enumerate(frames)}
 
     def scan_frames(self) -> NDArray[np.int64]:
-        """Return the (N,) frames of the sequence: those with points, or those of all fields if the sequence has only grids."""
+        """Return the (N,) frames of the sequence: frames with points, or frames of any field if the sequence has no scans."""
         if len(points := self.frames("points")):
             return points
         return np.unique(
@@ -277,7 +277,7 @@ class Sequence(ABC):
         )
 
     def scan(self, frame: int, fields: Iterable[str] | None = None) -> Scan:
-        """Read the points of a frame with those of `fields` that exist; None reads boxes and all fields with one row per point."""
+        """Read the points of a frame and the given `fields`, if they exist. None reads boxes and all fields with one row per point."""
         wanted = {*layout.point_fields(), "boxes"} if fields is None else set(fields)
         boxes = self.boxes(frame) if "boxes" in wanted else None
         wanted -= {"boxes", "remission"}
@@ -290,7 +290,7 @@ class Sequence(ABC):
             raise error.within(f"{self.location}: frame {frame}") from error
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Read the tracked boxes of a frame; None where it was not annotated.
+        """Read the tracked boxes of a frame; None if the frame is not annotated.
 
         Raises:
             FormatError: the boxes are damaged, or are not valid (see `carlasc.Boxes`).
@@ -328,7 +328,7 @@ class Sequence(ABC):
         return f"<{type(self).__name__} {self.location}>"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: what the sequence has, and its first grid from above."""
+        """Return the HTML for notebooks: the content of the sequence, and its first grid from above."""
         fields = ", ".join(sorted(field for field in self.fields() if "/" not in field))
         rows = {"frames": len(self), "fields": fields} | {f"grid {name}": spec for name, spec in self.grids.items()}
         picture, name = None, next(iter(self.grids), "")
@@ -339,14 +339,14 @@ class Sequence(ABC):
         return describe(self.location, rows, picture)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what another process can read again faster than it is sent."""
+        """Leave out cached data that another process can read again faster than it can be sent."""
         return {name: value for name, value in self.__dict__.items() if name not in ("poses", "times", "_frame_lines")}
 
 
 class Source(Mapping[str, Sequence]):
-    """A store that sequences are read from: a mapping of their paths to them, in sorted order.
+    """A store that sequences are read from: a mapping from their sorted paths to sequences.
 
-    `source["Train/Town01_Light"]` finds a sequence by its path. The path may lack the coordinates, if they are Cartesian or the sequence has no others.
+    `source["Train/Town01_Light"]` finds a sequence by its path. The coordinates may be left out of the path, if they are Cartesian or the sequence has only one kind.
 
     Attributes:
         location: name of the source in errors: a folder, a file or a URL.
@@ -362,7 +362,7 @@ class Source(Mapping[str, Sequence]):
         """Return a sequence by its path.
 
         Raises:
-            MissingKeyError: there is none; it is also a KeyError.
+            MissingKeyError: the sequence does not exist; this is also a KeyError.
         """
         sequences = self.sequences()
         for name in (path, *(f"{path}/{coordinates}" for coordinates in layout.COORDINATES)):
@@ -387,7 +387,7 @@ class Source(Mapping[str, Sequence]):
     def __bool__(self) -> bool:
         return True  # a store without sequences is a store
 
-    __eq__, __hash__ = object.__eq__, object.__hash__  # two sources are equal if they are one: nothing is read
+    __eq__, __hash__ = object.__eq__, object.__hash__  # equality by identity: no data are read
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.location}>"

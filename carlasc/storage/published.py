@@ -16,12 +16,12 @@ from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.transport.trees import Tree
 
-_DEPTH = 4  # <split>/<sequence>/<coordinates>, and one folder around them, as some zips have it
+_DEPTH = 4  # <split>/<sequence>/<coordinates>, and one folder around them in some zips
 _CONTAINERS = (".zip", ".zarr", ".h5", ".hdf5", ".parquet")
 
 
 class PublishedSource(Source):
-    """The published layout in a tree: the root with its splits, a split, a sequence, or one `<coordinates>` folder."""
+    """The published layout in a tree of files: the root with its splits, a split, a sequence, or one `<coordinates>` folder."""
 
     def __init__(self, tree: Tree) -> None:
         self.tree = tree
@@ -31,7 +31,7 @@ class PublishedSource(Source):
         """Return the sequences found up to four levels down, by path.
 
         Raises:
-            MissingDataError: no sequence was found; says what was looked for, and what was found instead.
+            MissingDataError: no sequence was found; the message says what was expected and found.
         """
         paths = sorted(_find_sequences(self.tree, "", _DEPTH))
         if not paths:
@@ -70,7 +70,7 @@ class PublishedSequence(Sequence):
 
     @cached_property
     def _listing(self) -> dict[str, field_files.Field]:
-        """The fields whose folders exist: lists the sequence's folder, and asks for one file in each grid's."""
+        """The fields whose folders exist. Lists the folder of the sequence, and checks for params.json in the folder of each grid."""
         folders = {name for name, is_folder in self.tree.entries(self.path).items() if is_folder}
         fields = {name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders}
         for folder in sorted(folders & layout.IMAGE_FOLDERS.keys()):
@@ -91,7 +91,7 @@ class PublishedSequence(Sequence):
         return frozenset(name for name in self._listing if len(self.frames(name)))
 
     def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the frames of a field; its folder is listed once."""
+        """Return the frames of a field. Its folder is listed once."""
         if field not in self._frames:
             self._list_folder_of(field)
         return self._frames[field]
@@ -108,12 +108,12 @@ class PublishedSequence(Sequence):
             return
         folder = self._listing[field].folder
         names = self.tree.entries(self._prefix + folder)
-        for sibling in (f for f in self._listing.values() if f.folder == folder):  # a grid's fields share one
+        for sibling in (f for f in self._listing.values() if f.folder == folder):  # fields of a grid share a folder
             numbers = [number for name in names if (number := layout.frame_of(name, sibling.suffix)) is not None]
             self._frames[sibling.name] = np.array(sorted(numbers), np.int64)
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one file; a local one is memory-mapped: the array is read-only, and its bytes are read when they are used."""
+        """Read one file. A local file is memory-mapped: the array is read-only, and its bytes are read on access."""
         entry = self._entry(field)
         path = self._prefix + entry.file(frame)
         shape = self._shape(entry)
@@ -156,7 +156,7 @@ class PublishedSequence(Sequence):
         return bytes(self.tree.read(self._prefix + name))
 
     def unknown_files(self) -> tuple[str, ...]:
-        """Return the files and folders of the sequence that the layout does not know; names of folders end in "/"."""
+        """Return the files and folders of the sequence that are not part of the layout; names of folders end in "/"."""
         known = {field.folder for field in self._listing.values()}
         texts = {layout.POSES, layout.TIMES, layout.METADATA, layout.CAMERAS}
         known |= {folder.partition("/")[0] for folder in known}
@@ -176,7 +176,7 @@ class PublishedSequence(Sequence):
 
 
 def _marks() -> frozenset[str]:
-    """Return the names that make a folder the `<coordinates>` folder of a sequence."""
+    """Return the names by which a `<coordinates>` folder is recognised."""
     return layout.scan_folders() | {layout.EVALUATION, layout.POSES}
 
 

@@ -1,4 +1,4 @@
-"""How a run continues the output of an earlier one, and protects the output of others.
+"""How a run continues the output of an earlier run, and protects other data.
 
 A grid's params.json holds the five published keys and, under `carlasc`, a record of how the grid was made. A run continues a grid only
 if both are equal to its own. A grid without a record is published data and is never written to. See the format page,
@@ -27,10 +27,10 @@ Kept = TypeVar("Kept")
 
 RECORD = "carlasc"
 RECORD_FORMAT = 1
-"""Version of the record's own layout: of the keys that it has, and of what they mean."""
-_RENAMED = {"source": "observe", "vote": "voting"}  # keys of the records without a format
+"""Version of the record: of its keys and their meaning."""
+_RENAMED = {"source": "observe", "vote": "voting"}  # old and new keys of records without a format
 _TOLERANCE = 1e-6  # metres, entries of a rotation, seconds: the last digits of poses.txt depend on the machine
-_LOOKED_AT = 16  # scans that are read to know a sequence again
+_LOOKED_AT = 16  # number of scans that are read to identify a sequence
 _OTHER_SETTINGS = "choose another `name`, or replace the grid with `overwrite=True`"
 _PUBLISHED = "this is published data, which is never written to: choose another `name` or `out`"
 
@@ -39,13 +39,13 @@ def check_name(name: str) -> str:
     """Return the name of a grid's folder if it is valid.
 
     Raises:
-        ArgumentError: it is not a plain folder name, or the layout uses it for something else.
+        ArgumentError: it is not a plain folder name, or the layout reserves it.
     """
     taken = layout.scan_folders() | {layout.POSES, layout.TIMES, layout.METADATA}
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*", name):
         raise ArgumentError("name", expected="letters, digits and _ . + -", found=repr(name))
     if name in taken:
-        raise ArgumentError("name", expected="a name that the layout does not use for something else", found=repr(name))
+        raise ArgumentError("name", expected="a name that the layout does not reserve", found=repr(name))
     return name
 
 
@@ -55,18 +55,18 @@ def check_grid(
     """Check whether a run may write to a grid.
 
     Args:
-        writer: where the grid is, or will be.
+        writer: writes the grid.
         grid: name of its folder.
         params: the whole params.json of this run.
         frames: the frames that this run would write.
         overwrite: whether a grid that carlasc made with other settings may be replaced.
 
     Returns:
-        Whether the grid exists: made by carlasc, and with the same settings unless `overwrite` is given.
+        Whether the grid exists. It was made by carlasc, and has the same settings unless `overwrite` is given.
 
     Raises:
-        ConflictError: the grid is published data, or has other settings; names the first difference.
-        FormatError: the grid was made by a newer version of carlasc, whose record this version cannot read.
+        ConflictError: the grid is published data, or has other settings; the message names the first difference.
+        FormatError: a newer version of carlasc made the grid, and this version cannot read its record.
     """
     where = f"{writer.location}/{layout.params_file(grid)}"
     data = writer.read_document(layout.params_file(grid))
@@ -84,13 +84,13 @@ def check_grid(
 
 
 def read_record(record: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the record of a grid in the terms of `RECORD_FORMAT`, whichever version of carlasc wrote it.
+    """Return the record of a grid, written by any version of carlasc, converted to `RECORD_FORMAT`.
 
     Records of carlasc 0.1.0 have no "format". They name the version of carlasc instead of that of the rule, "source" instead of
     "observe", and "vote" instead of "voting".
 
     Args:
-        record: what params.json holds under `RECORD`.
+        record: the value of `RECORD` in params.json.
         where: the file, for errors.
 
     Raises:
@@ -127,7 +127,7 @@ def agree_poses(writer: SequenceWriter, poses: NDArray[np.float64]) -> bytes | N
     Existing poses must be equal to those of this run. Lines without a pose (NaN: it could not be read) are filled in.
 
     Raises:
-        ConflictError: an existing pose is not equal; names the frame.
+        ConflictError: an existing pose is different; the message names the frame.
     """
     data = writer.read_document(layout.POSES)
     if data is None:
@@ -141,7 +141,7 @@ def agree_times(writer: SequenceWriter, times: NDArray[np.float64]) -> bytes | N
     """Return the times.txt to write; None if the existing one is complete.
 
     Raises:
-        ConflictError: an existing time is not equal; names the frame.
+        ConflictError: an existing time is different; the message names the frame.
     """
     data = writer.read_document(layout.TIMES)
     if data is None:
@@ -152,9 +152,9 @@ def agree_times(writer: SequenceWriter, times: NDArray[np.float64]) -> bytes | N
 
 
 def _merge(existing: NDArray[np.float64], ours: NDArray[np.float64], where: str) -> NDArray[np.float64] | None:
-    """Return the existing rows, completed by ours; None if nothing was missing."""
+    """Return the existing rows, completed by our rows; None if no row was missing."""
     both = min(len(existing), len(ours))
-    differs = np.abs(existing[:both] - ours[:both]) > _TOLERANCE  # False where either is NaN
+    differs = np.abs(existing[:both] - ours[:both]) > _TOLERANCE  # False if either is NaN
     if differs.any():
         raise _other_data(where, int(np.argwhere(differs)[0, 0]))
     merged = np.concatenate([existing, ours[both:]])
@@ -166,7 +166,7 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
     """Return the carlasc.json to write; None if it exists or would hold only the defaults.
 
     Raises:
-        ConflictError: what exists has other axes or other classes.
+        ConflictError: the existing file has other axes or other classes.
     """
     data = writer.read_document(layout.METADATA)
     where = f"{writer.location}/{layout.METADATA}"
@@ -184,10 +184,10 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
 
 
 def check_scan(writer: SequenceWriter, field: str, frame: int, array: NDArray[Any]) -> bool:
-    """Compare an existing scan field with what this run would write.
+    """Compare an existing field of a scan with the array of this run.
 
     Returns:
-        Whether it need not be written: False if what exists is empty and should not be, as a power failure can leave it.
+        Whether the existing field is complete. False if it is empty after a power failure, and must be written again.
 
     Raises:
         ConflictError: they differ.
@@ -210,7 +210,7 @@ def _other_data(where: str, frame: int) -> ConflictError:
 
 
 def scans_digest(sequence: Sequence, frames: NDArray[np.int64]) -> str:
-    """Return a digest of 16 of the scans of a sequence, so that long drives need not be read: if others are replaced, that is not noticed."""
+    """Return a digest of 16 scans of a sequence. Changes of other scans are not detected, but long drives need not be read."""
     digest = sha256()
     for row in np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist():
         for name in sorted(sequence.fields() & layout.SCAN_FIELDS.keys()):
@@ -220,21 +220,21 @@ def scans_digest(sequence: Sequence, frames: NDArray[np.int64]) -> str:
 
 
 def _bytes_of(sequence: Sequence, name: str, frame: int) -> bytes:
-    """Return the bytes of a field; none if it cannot be read, which is reported when its grid is made."""
-    for _ in range(2):  # an error that passes does not make another scan
+    """Return the bytes of a field; empty if it cannot be read. The error is reported when the grid is made."""
+    for _ in range(2):  # a second try, because a temporary error must not change the digest
         with suppress(CarlascError):
             return np.ascontiguousarray(sequence.read(name, frame)).tobytes()
     return b""
 
 
 def derived_key(sequence: Sequence, frames: NDArray[np.int64], scans: str, **settings: Any) -> str:
-    """Return a digest of settings, poses, times and scans, by which what is derived of a sequence is kept: its actors, or its refined poses.
+    """Return a digest of settings, poses, times and scans. It identifies data derived from a sequence, such as actors or refined poses.
 
     Args:
         sequence: the sequence.
         frames: numbers of its frames with scans.
-        scans: as `scans_digest` returns it.
-        **settings: what else the result depends on.
+        scans: result of `scans_digest`.
+        **settings: everything else that the result depends on.
     """
     about = {
         **settings,
@@ -249,18 +249,18 @@ def derived_key(sequence: Sequence, frames: NDArray[np.int64], scans: str, **set
 def read_derived(
     writer: SequenceWriter, name: str, key: str, read: Callable[[bytes, str], tuple[Kept, str]]
 ) -> Kept | None:
-    """Return what an earlier run derived of a sequence, and kept beside its grids; None if there is nothing of the same key.
+    """Return derived data that an earlier run kept beside the grids of a sequence; None if no file has the same key.
 
     Args:
-        writer: where the sequence is written.
-        name: what it is, such as "tracks".
-        key: as `derived_key` returns it.
-        read: returns what a file holds, and the key in it.
+        writer: writes the sequence.
+        name: kind of the derived data, such as "tracks".
+        key: result of `derived_key`.
+        read: takes the bytes and the name of a file; returns its content and its key.
     """
     file = layout.derived(name, key)
     data = writer.read_document(file)
     try:
         found, made_from = (None, None) if data is None else read(data, file)
-    except CarlascError:  # of another version, or damaged: it is only a copy of what the scans say
+    except CarlascError:  # from another version, or damaged: it is computed again from the scans
         return None
     return found if made_from == key else None

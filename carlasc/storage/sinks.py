@@ -1,6 +1,6 @@
-"""The protocol of stores that are written: a Sink takes sequences, a SequenceWriter their fields and frames.
+"""The protocol for writing stores: a Sink takes sequences, a SequenceWriter their fields and frames.
 
-The other half of `carlasc.storage.protocol`, with the same fields and frames.
+`carlasc.storage.protocol` is the protocol for reading, with the same fields and frames.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class SequenceWriter(ABC):
     Attributes:
         location: name of the output in errors.
         concurrent: whether several processes may write at the same time, each with its own pickled copy of the writer.
-        block: number of frames that are stored together, those of equal `frame // block`. Where `concurrent`, no two processes should
-            write different frames of one block at the same time; two that write the same frames lose nothing.
+        block: number of frames that are stored together: frames with equal `frame // block`. If `concurrent`, two processes should not
+            write different frames of one block at the same time. They may write the same frames.
     """
 
     location: str
@@ -36,14 +36,14 @@ class SequenceWriter(ABC):
     def expect(  # noqa: B027 (most stores have nothing to record)
         self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None
     ) -> None:
-        """Announce what a run is going to write, before it writes any frame.
+        """Announce the frames of a run, before it writes any frame.
 
-        Stores that several processes write cannot be finished as long as announced frames are missing. They also give every frame a
-        place of a fixed size, which must not depend on the frame that happens to be written first.
+        Stores with several writers cannot be finished while announced frames are missing. They also reserve a fixed size for every frame,
+        which must not depend on the frame that is written first.
 
         Args:
             frames: numbers of the frames of each field.
-            rows: number of elements of a typical large frame, by field, such as the most points of a few scans.
+            rows: number of elements of a typical large frame by field, such as the maximum number of points of a few scans.
         """
 
     @abstractmethod
@@ -51,28 +51,28 @@ class SequenceWriter(ABC):
         """Return whether a field of a frame already exists and is complete."""
 
     def refresh(self) -> None:  # noqa: B027 (most stores remember nothing)
-        """Forget which frames were missing: the next `has` sees what other processes have written until now."""
+        """Discard cached listings: the next `has` sees the frames that other processes have written."""
 
     @abstractmethod
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
-        """Write one field of one frame; an existing one is replaced.
+        """Write one field of one frame. An existing one is replaced.
 
         The params.json of a grid must be written before its first frame. Stores that append need the frames of each field in
-        increasing order.
+        ascending order.
 
         Args:
             field: name of the field (see `carlasc.storage.layout`).
             frame: number of the frame.
-            array: the values, with the shape that the field has in its published file: (N, ...) for N points, (X, Y, Z) for a grid.
+            array: the values, with the shape of the published file: (N, ...) for N points, (X, Y, Z) for a grid.
 
         Raises:
             FormatError: the array does not fit the field.
         """
 
     def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
-        """Write the fields of several frames, with the shapes that `write` takes, in the order given: by frame number, then by name of the field.
+        """Write the fields of several frames, in the given order. `frames` maps frame numbers to fields by name, with the shapes of `write`.
 
-        Stores that keep several frames in one file write those of a block together, and best get a whole block at once.
+        Stores with several frames per file write the frames of a block together. They are fastest if they get a whole block at once.
         """
         for frame, fields in frames.items():
             for field, array in fields.items():
@@ -83,9 +83,9 @@ class SequenceWriter(ABC):
         """Write the bytes of a text file; an existing file is replaced."""
 
     def create_document(self, name: str, data: bytes) -> bool:
-        """Write a text file that does not exist yet, and return whether it did not.
+        """Write a text file unless it exists, and return whether it was written.
 
-        Where `concurrent`, exactly one of several processes that do so at once succeeds.
+        If `concurrent` and several processes do this at once, exactly one succeeds.
         """
         if self.read_document(name) is not None:
             return False
@@ -94,7 +94,7 @@ class SequenceWriter(ABC):
 
     @abstractmethod
     def read_document(self, name: str) -> bytes | None:
-        """Return the bytes of an existing text file, or None. A run uses this to continue the output of an earlier run."""
+        """Return the bytes of a text file; None if it does not exist. Runs use this to continue the output of an earlier run."""
 
     def read(self, field: str, frame: int) -> NDArray[Any] | None:
         """Return an existing field of a frame as a flat array or (N, columns) rows; None if the store cannot read it."""
@@ -106,10 +106,10 @@ class SequenceWriter(ABC):
         Raises:
             ConflictError: the store cannot remove grids.
         """
-        raise ConflictError(f"{self.location}: this store cannot replace its grid {grid}: write to a new one")
+        raise ConflictError(f"{self.location}: this store cannot replace its grid {grid}: write to a new store")
 
     def close(self) -> None:  # noqa: B027 (most stores have nothing to finish)
-        """Finish the sequence, for example by writing an index. This is not called if the work failed."""
+        """Finish the sequence, for example by writing an index. This is not called after an error."""
 
     def __enter__(self) -> Self:
         return self
@@ -126,7 +126,7 @@ class Sink(ABC):
 
     Attributes:
         location: name of the store in errors.
-        is_finished: whether it can be opened as it is.
+        is_finished: whether the store can be opened.
         is_readable: whether `source` can be called.
     """
 
@@ -139,30 +139,30 @@ class Sink(ABC):
         """Start or continue the sequence at a path such as "Train/Town01_Light/cartesian"."""
 
     def place(self, path: str) -> str:
-        """Return what to call a sequence, or a grid in one, once the store is finished: the place of the store and the path in it."""
+        """Return the name of a sequence, or of a grid in a sequence, in the finished store: the location of the store and the path in it."""
         return path if self.location == "." else f"{self.location}/{path}"
 
     def finish(self, *, incomplete: bool = False) -> None:  # noqa: B027 (a folder has nothing to finish)
-        """Finish the store: a packed store can be opened from then on. This is not called if the work failed.
+        """Finish the store. A packed store can be opened after that. This is not called after an error.
 
         Args:
-            incomplete: finish although announced frames are missing, because they could not be made.
+            incomplete: finish the store even if announced frames are missing, because they could not be made.
 
         Raises:
             ConflictError: announced frames are missing.
         """
 
     def source(self) -> Source:
-        """Return what was written, to be read while more is written; a packed store must be finished before.
+        """Return a source of the written data. It can be used while more data are written; a packed store must be finished first.
 
         Raises:
-            ConflictError: the store is written from beginning to end, and read after that.
+            ConflictError: the store cannot be read while it is written.
         """
         raise ConflictError(
             self.location,
             expected="a folder or a .zarr store, which can be read while more is added",
-            found="another one",
-            advice="write to one of these, then pack it",
+            found="another kind of store",
+            advice="write to a folder or a .zarr store, then pack it",
         )
 
     def __enter__(self) -> Self:

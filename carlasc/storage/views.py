@@ -1,4 +1,4 @@
-"""Sequences that show others, and sources that hold some of the sequences of others."""
+"""Views of sequences, and sources with selected sequences."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from carlasc.storage.protocol import Sequence, Source
 
 
 class SequenceView(Sequence):
-    """A sequence that shows another one, as far as a subclass does not change what it shows.
+    """A view of another sequence. Subclasses change parts of it.
 
     Attributes:
-        whole: the other sequence.
+        whole: the sequence that is viewed.
     """
 
     def __init__(self, whole: Sequence) -> None:
@@ -45,12 +45,12 @@ class SequenceView(Sequence):
         return self.whole.read_document(name)
 
     def line_of(self, frame: int, lines: int, document: str) -> int:
-        """Return the line of a text file that belongs to a frame: the one in the whole sequence."""
+        """Return the line of a text file of the whole sequence that belongs to a frame."""
         return self.whole.line_of(frame, lines, document)
 
 
 class ChosenSequences(Source):
-    """Some of the sequences of a source, or others in their place."""
+    """A source with a selection of sequences, possibly views of the original ones."""
 
     def __init__(self, location: str, sequences: Mapping[str, Sequence]) -> None:
         self.location, self.chosen = location, sequences

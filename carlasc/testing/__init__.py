@@ -1,4 +1,4 @@
-"""The tests that every Source, every Sink and every converter must pass, for those of your own. They need pytest.
+"""Contract tests for your own Source, Sink or converter. They need pytest.
 
 See `docs/howto/source.md` and `docs/howto/converter.md` for examples.
 """
@@ -14,6 +14,6 @@ except ImportError as error:
 
 pytest.register_assert_rewrite(
     "carlasc.testing.contracts", "carlasc.testing.converters"
-)  # failures show the values that were compared
+)  # so that failures show the compared values
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""The contract tests of a Source and of a Sink: subclass them, and pytest runs them on your store."""
+"""The contract tests of a Source and of a Sink. Subclass them, and pytest runs them on your store."""
 
 # ruff: noqa: D102 (the name of a test says what it tests)
 
@@ -22,23 +22,23 @@ from carlasc.testing.data import FRAMES, GRIDS, SCANS, WHOLE, published_bytes, w
 
 
 def read_sum(sequence: Sequence) -> float:
-    """Return the sum of a scan's coordinates; run in other processes."""
+    """Return the sum of the coordinates of a scan. Called in other processes."""
     return float(sequence.read("points", FRAMES[-1])[:, :3].sum())
 
 
 class SourceContract:
-    """What a Source must do: it gives the sequences, fields, frames, values and text files that `write_dataset` wrote.
+    """Contract of a Source: it returns the sequences, fields, frames, values and text files that `write_dataset` wrote.
 
     A subclass defines `build`.
 
     Attributes:
-        processes: ways to start processes in which the source is read as well ("spawn" takes two seconds); empty where it cannot pickle.
+        processes: start methods of processes in which the source is also read ("spawn" takes two seconds); empty if it cannot be pickled.
     """
 
     processes: tuple[str, ...] = ("fork", "spawn")
 
     def build(self, published: Path, folder: Path) -> Source:
-        """Return a source of the sequences in `published`, a folder of published files; `folder` is empty and yours to write to."""
+        """Return a source of the sequences in `published`, a folder of published files. `folder` is empty and can be written to."""
         raise NotImplementedError
 
     @pytest.fixture(scope="class")
@@ -97,7 +97,7 @@ class SourceContract:
         assert sequence.read("labels", 5).dtype.kind == "u"
         assert sequence.read("evaluation/labels", 5).dtype.kind == "u"
 
-    def test_boxes_are_whole_none_where_nothing_was_and_absent_where_nobody_looked(
+    def test_boxes_are_the_same_empty_without_objects_and_absent_without_annotation(
         self, source: Source, expected: dict[str, Sequence]
     ) -> None:
         sequence = source.sequences()[WHOLE]
@@ -155,7 +155,7 @@ class SourceContract:
     @pytest.mark.parametrize("method", ["fork", "spawn"])
     def test_reads_in_other_processes_after_reading_in_this_one(self, source: Source, method: str) -> None:
         if method not in self.processes:
-            pytest.skip("not among the ways to start processes that this store is tested with")
+            pytest.skip("this store is not tested with this start method of processes")
         sequence = source.sequences()[WHOLE]
         wanted = read_sum(sequence)
         with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(method)) as pool:
@@ -173,12 +173,12 @@ class SourceContract:
 
 
 class SinkContract:
-    """What a Sink must do: it gives back what it took, and refuses what does not fit.
+    """Contract of a Sink: the written data can be read again, and data that do not fit are refused.
 
     A subclass defines `sink` and `read`.
 
     Attributes:
-        rising: whether the frames of a field must come in rising order.
+        rising: whether the frames of a field must be written in ascending order.
     """
 
     rising: bool = True
@@ -207,7 +207,7 @@ class SinkContract:
                     for name in sequence.documents():
                         writer.write_document(name, sequence.read_document(name))
                     frames = sorted({int(f) for name in sequence.fields() for f in sequence.frames(name)})
-                    for frame in frames:  # all fields of a frame, then the next, as a run over frames does
+                    for frame in frames:  # all fields of a frame before the next frame, as in a run over frames
                         for name in order([n for n in sequence.fields() if frame in sequence.frames(n)]):
                             writer.write(name, frame, sequence.read(name, frame))
                             assert writer.has(name, frame)

@@ -1,4 +1,4 @@
-"""The contract tests of a converter: subclass them, and pytest runs them on a simulated drive in the format of your data set."""
+"""The contract tests of a converter. Subclass them, and pytest runs them on a simulated drive in the format of your data set."""
 
 # ruff: noqa: D102 (the name of a test says what it tests)
 
@@ -25,18 +25,18 @@ from carlasc.testing.drives import KINDS, SimulatedDrive, world_T_sensor
 
 
 class ConverterContract:
-    """What a conversion must keep of a drive: points, labels, actors, boxes, poses and times.
+    """Contract of a converter: the conversion keeps points, labels, actors, boxes, poses and times of a drive.
 
     A subclass defines `converter`, `ids` and `write`.
 
     Attributes:
-        converter: its name or its class.
-        ids: class id in the data set of each of `carlasc.testing.KINDS` that occurs.
-        drive: what is written.
-        keeps: what the format holds, of "labels", "instances", "boxes", "poses", "times", "seconds" and "origins".
-        options: of the converter.
-        points_m: how far points may be off; 0 for the same bits.
-        poses_m: how far poses may be off: metres, and entries of a rotation.
+        converter: name or class of the converter.
+        ids: class id in the data set for each of `carlasc.testing.KINDS` that occurs.
+        drive: the drive that is written.
+        keeps: content of the format, from "labels", "instances", "boxes", "poses", "times", "seconds" and "origins".
+        options: options of the converter.
+        points_m: tolerance of points, metres; 0 for bit-exact.
+        poses_m: tolerance of poses: metres, and entries of a rotation.
     """
 
     converter: str | type[Converter]
@@ -52,11 +52,11 @@ class ConverterContract:
         raise NotImplementedError
 
     def arrange(self, frame: int, values: list[NDArray[Any]]) -> NDArray[Any]:
-        """Return values of the points of each sensor in the order in which the conversion gives them; by default, sensor by sensor."""
+        """Return values of the points of all sensors in the order of the converted scan. The default is sensor by sensor."""
         return np.concatenate(values)
 
     def run(self, source: Path, out: Path, axes: str = "right") -> Sequence:
-        """Convert to the data set's own classes, and return the only sequence."""
+        """Convert `source` to a new data set `out` with `axes` and the classes of the data set, and return the only sequence."""
         classes = self._class().classes.name
         result = convert(
             self.converter,
@@ -198,7 +198,7 @@ class ConverterContract:
     ) -> None:
         self.run(source, tmp_path / "out")
         for path in (path for path in (tmp_path / "out").rglob("0*") if path.is_file()):
-            # points are written last of what is read, and flow last of what is derived from it
+            # points are the last field that is read, and flow is the last field that is derived
             number, folder = int(path.name[:6]), path.parent.name
             if (
                 number % 4 == 1
@@ -217,7 +217,7 @@ class ConverterContract:
 
     @property
     def _scan_T_first(self) -> NDArray[np.float64]:
-        """(4, 4) from the frame of the first sensor to that of the scan: axes of the vehicle."""
+        """(4, 4) from the frame of the first sensor to the frame of the scan, which has the axes of the vehicle."""
         turned = self.drive.sensors[0].vehicle_T_sensor.copy()
         turned[:3, 3] = 0
         return turned
@@ -232,13 +232,13 @@ class ConverterContract:
             yield transform_points(sensor.vehicle_T_sensor, scan.deskewed[:, :3]) - first
 
     def boxes_of(self, frame: int) -> Boxes:
-        """Return the expected boxes of a frame, in the frame of the scan; override it where the format keeps fewer."""
+        """Return the expected boxes of a frame, in the frame of the scan. Override this if the format keeps fewer boxes."""
         to_scan = np.eye(4)
         to_scan[:3, 3] = -self.drive.sensors[0].vehicle_T_sensor[:3, 3]
         return self.drive.boxes(frame, {kind: self.ids.get(kind, 0) for kind in KINDS}).transform(to_scan)
 
     def labelled(self, sequence: Sequence) -> list[int]:
-        """Return the frames whose labels are compared; override it where not all frames have labels of their own."""
+        """Return the frames whose labels are compared. Override this if only some frames have their own labels."""
         return sequence.frames("labels").tolist()
 
 

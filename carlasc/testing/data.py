@@ -1,6 +1,7 @@
-"""A small data set with what stores get wrong: gaps in the frames, empty scans, missing fields, grids of several shapes; and mistakes.
+"""A small data set with difficult cases for stores, and simulated errors of labels and poses.
 
-Labels are wrong as a network gets them wrong, and poses as an odometry or a satellite receiver does.
+The data set has gaps in the frames, empty scans, missing fields, and grids of several shapes. Errors of labels are like those of a network,
+errors of poses like those of an odometry or a satellite receiver.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SIZE, SECOND = (4, 6, 2), (8, 4, 3)
 WHOLE = "Train/Town01_Light/cartesian"
 SCANS = "Val/Town07_Heavy/cartesian"
 GRIDS = "Test/Town10_Medium/cylindrical"
-"""Paths of the three sequences: one with every field, one of scans without poses, one of grids without scans."""
+"""Paths of the three sequences: every field; scans without poses; grids without scans."""
 
 
 def params(size: tuple[int, int, int], coordinates: str = "cartesian") -> bytes:
@@ -53,7 +54,7 @@ def scan(rng: np.random.Generator, count: int) -> dict[str, NDArray[Any]]:
 
 
 def boxes(rng: np.random.Generator, count: int) -> Boxes:
-    """Return random boxes, some of them filled in."""
+    """Return random boxes, some of them interpolated."""
     rotations = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     rotations[np.linalg.det(rotations) < 0, :, 0] *= -1
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -64,13 +65,13 @@ def boxes(rng: np.random.Generator, count: int) -> Boxes:
 
 
 def grid(rng: np.random.Generator, size: tuple[int, int, int], whole: bool = True) -> dict[str, NDArray[Any]]:
-    """Return the labels and counts of a random grid; counts are whole numbers, or not."""
+    """Return the labels and counts of a random grid; `whole` counts are integers."""
     counts = rng.integers(0, 40, size).astype(np.float32)
     return {"labels": rng.integers(0, 23, size).astype(np.uint32), "counts": counts if whole else counts / 3}
 
 
 def evidence(rng: np.random.Generator, size: tuple[int, int, int], wide: bool = False) -> dict[str, NDArray[Any]]:
-    """Return the fields of a random grid that say how certain it is; `wide` class ids have two bytes."""
+    """Return the evidence fields of a random grid; `wide` class ids have two bytes."""
     voxels = int(np.prod(size))
     classes = np.zeros(2 * voxels, field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE)
     classes["voxel"], classes["label"] = np.repeat(np.arange(voxels), 2), np.tile([1, 10], voxels)
@@ -85,7 +86,7 @@ def evidence(rng: np.random.Generator, size: tuple[int, int, int], wide: bool = 
 
 
 def actors(rng: np.random.Generator, size: tuple[int, int, int], count: int) -> dict[str, NDArray[Any]]:
-    """Return the fields of a random grid that say which actor a voxel belongs to, and how it moves, of `count` voxels that move."""
+    """Return the actor fields of a random grid with `count` moving voxels: instance and velocity."""
     velocity = np.zeros(count, field_files.VELOCITY_DTYPE)
     velocity["voxel"] = np.sort(rng.permutation(int(np.prod(size)))[:count])
     velocity["velocity"] = rng.normal(scale=5, size=(count, 3))
@@ -104,7 +105,7 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
 
     Args:
         root: folder to write to.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
 
     Returns:
         `root`.
@@ -125,11 +126,11 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
                 whole.write(f"evaluation/{part}", frame, array)
         for part, array in grid(rng, SECOND, whole=False).items():
             whole.write(f"evaluation_8x4x3/{part}", frame, array)
-        if frame != 2:  # a frame that was not annotated; the first one has no objects
+        if frame != 2:  # frame 2 is not annotated; the first frame has no objects
             whole.write("boxes", frame, boxes(rng, frame).to_table())
         whole.write("bev", frame, rng.integers(0, 256, 300 + frame).astype(np.uint8))
     whole.write_document("cameras.json", b'{"format": 1,  "cameras": []}\n')
-    for frame in FRAMES[1:]:  # each camera has images of one kind
+    for frame in FRAMES[1:]:  # each camera has one kind of images
         for number, field in enumerate(("images.front.jpg", "images.left-1.png", "image_depths.front.png")):
             whole.write(field, frame, rng.integers(0, 256, 200 + 10 * frame + number).astype(np.uint8))
         whole.write("evaluation_8x4x3/seen", frame, rng.integers(0, 256, SECOND).astype(np.uint8))
@@ -154,7 +155,7 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
         grids.write(f"evaluation/{part}", 4, array)
     for frame in FRAMES:
         fields = evidence(rng, SECOND, wide=True)
-        if frame == FRAMES[0]:  # whole numbers, which stores often keep in another type, before others
+        if frame == FRAMES[0]:  # integers first, because stores often keep them in another type
             fields["occupied"] = np.round(fields["occupied"])
         for part, array in fields.items():
             whole.write(f"evaluation_8x4x3/{part}", frame, array)
@@ -167,7 +168,7 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
 
 
 def published_bytes(field: str, array: NDArray[Any]) -> bytes:
-    """Return the bytes of the published file of an array of any shape: they must be equal, whatever type a store keeps the array in."""
+    """Return the bytes of the published file of an array of any shape. They do not depend on the type in which a store keeps the array."""
     return bytes(layout.field_named(field).encode(array, field))
 
 
@@ -180,19 +181,19 @@ def wrong_labels(
     classes: Iterable[int] | None = None,
     seed: int = 0,
 ) -> NDArray[np.unsignedinteger]:
-    """Return a copy of labels, some of which are wrong. Points with the class 0 keep it.
+    """Return a copy of labels in which a share is wrong. Points with class 0 are unchanged.
 
-    Clumps are cubes. Which ones are wrong, and the class that they get, depends on their place and on `seed`: with points in the frame of the
-    world and equal seeds, several scans have wrong labels in the same places, as a network that does not know an object; with another seed
-    for each scan, or points in the frame of the sensor, in other places.
+    Clumps are cubes. The wrong clumps and their classes depend on their position and on `seed`. With points in the world frame and equal
+    seeds, several scans have wrong labels at the same positions, like a network that cannot recognise an object. With another seed for each
+    scan, or with points in the sensor frame, the positions differ.
 
     Args:
         labels: (N,) class ids.
-        points: (N, 3) or more columns, of which the first are x, y, z in metres.
-        share: share of the labelled points that get another class, 0 to 1; with clumps the nearest that whole clumps give.
-        clump_m: side of a clump in metres; None for single points at random.
-        classes: ids that wrong labels have; None for those in `labels`. Two at least.
-        seed: of the random numbers.
+        points: (N, 3) or more columns; the first three are x, y, z in metres.
+        share: share of the labelled points that get another class, 0 to 1; with clumps, the nearest share of whole clumps.
+        clump_m: edge length of a clump, metres; None for random single points.
+        classes: at least two ids for wrong labels; None for the ids in `labels`.
+        seed: seed of the random numbers.
 
     Returns:
         (N,) class ids of the type of `labels`.
@@ -220,7 +221,9 @@ def wrong_labels(
         rngs = [np.random.default_rng([seed, *cube]) for cube in (cubes & 0xFFFFFFFF).tolist()]
         order = np.argsort([rng.random() for rng in rngs])
         wanted = share * len(places)
-        above = np.cumsum(counts[order]) - counts[order] / 2 < wanted  # of which more than half is within the share
+        above = (
+            np.cumsum(counts[order]) - counts[order] / 2 < wanted
+        )  # clumps of which more than half is within the share
         chosen = np.zeros(len(cubes), np.bool_)
         chosen[order[above]] = True
         classes_of = np.array([rng.integers(0, len(others)) for rng in rngs])
@@ -241,22 +244,22 @@ def wrong_poses(
     height_drift_m: float = 0.0,
     seed: int = 0,
 ) -> NDArray[np.float64]:
-    """Return poses with errors: the same for equal arguments.
+    """Return poses with errors. Equal arguments give equal poses.
 
     Args:
         poses: (F, 4, 4) world_T_sensor in order of time.
-        jitter_m: standard deviation of an error of each position, along each axis of the world, that is independent of the others.
-        jitter_rad: the same of each rotation, about each axis of the sensor.
-        drift_m: standard deviation of an error of each motion from one pose to the next, along each axis of the sensor; these add up.
-        drift_rad: the same of each rotation.
-        height_drift_m: standard deviation of the steps of a random walk of the height alone.
-        seed: of the random numbers.
+        jitter_m: standard deviation of an independent error of each position, along each axis of the world.
+        jitter_rad: standard deviation of an independent error of each rotation, about each axis of the sensor.
+        drift_m: standard deviation of an error of each motion between two poses, along each axis of the sensor; these errors add up.
+        drift_rad: standard deviation of an error of each rotation between two poses; these errors add up.
+        height_drift_m: standard deviation of the steps of a random walk of the height.
+        seed: seed of the random numbers.
 
     Returns:
-        (F, 4, 4) world_T_sensor. Drift leaves the first pose as it is.
+        (F, 4, 4) world_T_sensor. Drift does not change the first pose.
 
     Raises:
-        ArgumentError: a standard deviation is negative or no number.
+        ArgumentError: a standard deviation is negative or not a number.
     """
     given = {"jitter_m": jitter_m, "jitter_rad": jitter_rad, "drift_m": drift_m, "drift_rad": drift_rad}
     for name, value in (given | {"height_drift_m": height_drift_m}).items():

@@ -1,4 +1,4 @@
-"""A small simulated drive with known truth: what tests of converters write in the format of another data set, and compare with."""
+"""A small simulated drive with known ground truth. Tests of converters write it in the format of another data set and compare."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, rotation_z, transform_points
 
 KINDS = ("none", "road", "building", "vegetation", "pole", "car", "van", "pedestrian", "cyclist")
-"""What things are; the numbers of `DriveScan.kinds` are places in this tuple. 0 does not occur."""
+"""Kinds of things; `DriveScan.kinds` are indices of this tuple. Index 0 is not used."""
 MOVABLE = ("car", "van", "pedestrian", "cyclist")
-"""Kinds of things that have boxes and numbers."""
+"""Kinds of things with boxes and track numbers."""
 
 
-_KEPT = 16  # scans that a drive keeps
+_KEPT = 16  # number of cached scans of a drive
 
 
 @dataclass(frozen=True)
 class Thing:
-    """A cuboid in the world, upright.
+    """An upright cuboid in the world.
 
     Attributes:
         kind: one of `KINDS`.
         center: (x, y, z) at time 0, metres.
-        size: length, width, height.
+        size: length, width, height, metres.
         heading: radians about z.
         speed: metres per second along the heading.
     """
@@ -65,15 +65,15 @@ def _street() -> tuple[Thing, ...]:
 
 @dataclass(frozen=True)
 class DriveScan:
-    """What one sensor saw for one frame.
+    """The scan of one sensor for one frame.
 
     Attributes:
         points: (N, 4) float32, x, y, z in metres in the frame of the sensor at the time of each point, and remission 0 to 1.
         deskewed: (N, 4) float32, the same points in the frame of the sensor at the time of the frame.
-        kinds: (N,) uint8 places in `KINDS`.
-        instances: (N,) uint32, the track of the thing, 0 if it has no box.
-        seconds: (N,) float64 after the time of the frame.
-        world_T_sensor: (N, 4, 4) pose of the sensor at each point.
+        kinds: (N,) uint8 indices of `KINDS`.
+        instances: (N,) uint32 track numbers, 0 for things without a box.
+        seconds: (N,) float64 time of each point after the time of the frame.
+        world_T_sensor: (N, 4, 4) pose of the sensor at the time of each point.
     """
 
     points: NDArray[np.float32]
@@ -86,20 +86,20 @@ class DriveScan:
 
 @dataclass(frozen=True)
 class SimulatedDrive:
-    """A vehicle that drives along a street with traffic, right-handed: x forward, y left, z up. Everything is exact and deterministic.
+    """A vehicle that drives along a street with traffic. Axes are right-handed: x forward, y left, z up. The drive is exact and deterministic.
 
-    The frame of the vehicle is at its rear axle, `axle_m` above the ground. Each sensor turns once around a frame if `rolling`, from half
-    a period before the frame's time to half a period after; otherwise all of its points are taken at the frame's time.
+    The frame of the vehicle is at its rear axle, `axle_m` above the ground. If `rolling`, each sensor makes one turn per frame, from half a
+    period before the time of the frame to half a period after it. Otherwise, all points are taken at the time of the frame.
 
     Attributes:
         frames: number of frames.
-        period_s: time between frames.
-        sensors: its LiDARs.
-        rolling: whether points of a scan are taken one after the other.
-        clockwise: whether sensors that turn do so clockwise, seen from above.
-        speed: of the vehicle, metres per second.
-        axle_m: height of the origin of the vehicle's frame above the ground.
-        things: what is in the street.
+        period_s: time between frames, seconds.
+        sensors: LiDARs of the vehicle.
+        rolling: whether the points of a scan are taken one after the other.
+        clockwise: whether rolling sensors turn clockwise, seen from above.
+        speed: speed of the vehicle, metres per second.
+        axle_m: height of the origin of the vehicle frame above the ground, metres.
+        things: the things in the street.
         channels: number of laser beams.
         columns: number of azimuths.
     """
@@ -127,7 +127,7 @@ class SimulatedDrive:
         return np.arange(self.frames, dtype=np.float64) * self.period_s
 
     def world_T_vehicle(self, seconds: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        """Return the (..., 4, 4) poses of the vehicle at some times: it sways gently from side to side."""
+        """Return the (..., 4, 4) poses of the vehicle at some times. It moves slightly from side to side."""
         at = np.asarray(seconds, np.float64)
         x = self.speed * at
         poses = np.zeros((*at.shape, 4, 4))
@@ -142,8 +142,8 @@ class SimulatedDrive:
         """Return the boxes of the movable things within 60 m at a frame, in the frame of the vehicle.
 
         Args:
-            frame: its number.
-            labels: the class id of each kind; None takes the places in `KINDS`.
+            frame: frame number.
+            labels: class id of each kind; None takes the indices of `KINDS`.
         """
         vehicle_T_world = invert(self.world_T_vehicle(frame * self.period_s))
         found = [
@@ -160,7 +160,7 @@ class SimulatedDrive:
         )
 
     def scan(self, frame: int, sensor: int = 0) -> DriveScan:
-        """Return what a sensor saw for a frame. The last scans are kept; do not write to them."""
+        """Return the scan of a sensor for a frame. The last scans are cached; do not write to them."""
         key = (frame, sensor)
         if key not in self._kept:
             while len(self._kept) >= _KEPT:
@@ -169,7 +169,7 @@ class SimulatedDrive:
         return self._kept[key]
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave out the scans that are kept: they are seen again."""
+        """Leave out the cached scans, which can be simulated again."""
         return {**vars(self), "_kept": {}}
 
     def _look(self, frame: int, sensor: int) -> DriveScan:
@@ -189,15 +189,17 @@ class SimulatedDrive:
         reach, hit = self._nearest(origins, directions, at)
         seen = reach < 60.0
         reach, hit, poses, turn = reach[seen], hit[seen], poses[seen], turn[seen]
-        own = (rays[seen] * reach[:, None]).astype(np.float32)
-        world = np.einsum("nij,nj->ni", poses[:, :3, :3], own.astype(np.float64)) + poses[:, :3, 3]
-        then = transform_points(invert(self.world_T_vehicle(frame * self.period_s) @ mount), world).astype(np.float32)
+        points = (rays[seen] * reach[:, None]).astype(np.float32)
+        world = np.einsum("nij,nj->ni", poses[:, :3, :3], points.astype(np.float64)) + poses[:, :3, 3]
+        deskewed = transform_points(invert(self.world_T_vehicle(frame * self.period_s) @ mount), world).astype(
+            np.float32
+        )
         remission = np.round(0.1 + 0.05 * hit % 0.8, 2).astype(np.float32)[:, None]
         kinds = np.array([KINDS.index("road"), *(KINDS.index(thing.kind) for thing in self.things)], np.uint8)
         tracks = {thing: track for track, thing in enumerate(self._movable, 1)}
         instances = np.array([0, *(tracks.get(thing, 0) for thing in self.things)], np.uint32)
         return DriveScan(
-            np.hstack([own, remission]), np.hstack([then, remission]), kinds[hit], instances[hit], turn, poses
+            np.hstack([points, remission]), np.hstack([deskewed, remission]), kinds[hit], instances[hit], turn, poses
         )
 
     @property
@@ -207,7 +209,7 @@ class SimulatedDrive:
     def _nearest(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], at: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return how far each ray gets, and what it meets: 0 the ground, n the n-th thing from 1."""
+        """Return the length of each ray, and what it hits: 0 for the ground, n for the n-th thing from 1."""
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.where(directions[:, 2] < 0, -origins[:, 2] / directions[:, 2], np.inf)
             hit = np.zeros(len(at), np.int64)

@@ -38,23 +38,23 @@ GRID = "evaluation"
 PATHS = (WHOLE, SCANS)
 FIELDS = ("points", "labels", "flow", f"{GRID}/labels", f"{GRID}/counts")
 LAST = 11
-"""The greatest number of a frame: blocks of eight frames have a neighbour."""
+"""Largest frame number. Blocks of eight frames have a neighbour."""
 
 
 class StoreMachine(RuleBasedStateMachine):
-    """Writes, overwrites and removes frames, abandons the sink as a killed process does, resumes, finishes, and compares.
+    """Writes, overwrites and removes frames, abandons the sink like a killed process, resumes, finishes, and compares.
 
-    A subclass defines `sink` and `read`. What was written is kept in `model`; after each `finish` the store has all of it and nothing else.
-    A resumed run does what every command of carlasc does: it writes the frames that the writer does not have.
+    A subclass defines `sink` and `read`. `model` has all written data; after each `finish`, the store must have exactly these data. A resumed
+    run writes the frames that the writer lacks, like every command of carlasc.
 
     Attributes:
-        rising: whether the frames of a field must come in rising order, so that none can be replaced.
-        reopens: whether more may be written to a finished store. Otherwise each `finish` is followed by a new store.
-        immediate: whether a frame stays when its process is killed after `write` has returned.
-        ending: with which the names of stores end.
-        model: every array that the store must have, by sequence, field and frame.
-        documents: every text file that it must have, by sequence and name.
-        out: where the store is.
+        rising: whether the frames of a field must be written in ascending order, so that none can be replaced.
+        reopens: whether a finished store can be extended. Otherwise, each `finish` is followed by a new store.
+        immediate: whether a frame survives if its process is killed after `write` has returned.
+        ending: suffix of the names of stores.
+        model: expected arrays by sequence, field and frame.
+        documents: expected text files by sequence and name.
+        out: path of the store.
     """
 
     rising: bool = False
@@ -63,7 +63,7 @@ class StoreMachine(RuleBasedStateMachine):
     ending: str = ""
 
     def sink(self, out: Path) -> Sink:
-        """Return a sink that writes to `out`: a new store, one that was abandoned or, with `reopens`, a finished one."""
+        """Return a sink that writes to `out`: a new store, an abandoned store or, with `reopens`, a finished store."""
         raise NotImplementedError
 
     def read(self, out: Path) -> Source:
@@ -77,14 +77,14 @@ class StoreMachine(RuleBasedStateMachine):
         self._begin()
 
     def _begin(self) -> None:
-        """Take a new place, which is empty."""
+        """Choose a new path for a store."""
         self._stores += 1
         self.out = Path(self._folder.name) / f"store{self._stores}{self.ending}"
         self.model: dict[Key, NDArray[Any]] = {}
         self.documents: dict[tuple[str, str], bytes] = {}
         self._sink: Sink | None = None
         self._writers: dict[str, SequenceWriter] = {}
-        self._possible: dict[Key, list[NDArray[Any]]] = {}  # what a frame may hold that was replaced before a kill
+        self._possible: dict[Key, list[NDArray[Any]]] = {}  # possible arrays of a frame that was replaced before a kill
         self._killed = False
 
     def teardown(self) -> None:
@@ -115,7 +115,7 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(path=st.sampled_from(PATHS))
     def remove_grid(self, path: str) -> None:
-        """Remove a grid; a store that cannot says so, and keeps it."""
+        """Remove a grid. A store that does not support this raises ConflictError and keeps the grid."""
         if (path, layout.params_file(GRID)) not in self.documents:
             return
         try:
@@ -130,14 +130,14 @@ class StoreMachine(RuleBasedStateMachine):
     @precondition(lambda self: self._sink is not None)
     @rule()
     def kill(self) -> None:
-        """Abandon the sink and its writers without closing them, as a killed process does."""
+        """Abandon the sink and its writers without closing them, like a killed process."""
         self._sink, self._writers = None, {}
         self._killed = True
 
     @precondition(lambda self: self.model)
     @rule()
     def finish(self) -> None:
-        """Write what is missing, finish the store, and compare all of it with the model."""
+        """Write missing data, finish the store, and compare it with the model."""
         if self._sink is None:
             self._resume()
         for writer in self._writers.values():
@@ -152,13 +152,13 @@ class StoreMachine(RuleBasedStateMachine):
 
     @invariant()
     def a_writer_has_what_it_wrote(self) -> None:
-        """Check `has` of the writers that are open."""
+        """Check `has` of all open writers."""
         for path, writer in self._writers.items():
             for frame in range(LAST + 1):
                 assert writer.has("points", frame) == ((path, "points", frame) in self.model)
 
     def _writer(self, path: str) -> SequenceWriter:
-        """Return the writer of a sequence. A new sequence gets a scan at once: one without frames need not be found."""
+        """Return the writer of a sequence. A new sequence gets a scan immediately, because readers may ignore sequences without frames."""
         if self._sink is None:
             self._resume()
         if path not in self._writers and self._sink is not None:
@@ -178,7 +178,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.documents[path, name] = data
 
     def _resume(self) -> None:
-        """Open the store again, and write what it lacks: its text files, and the frames in rising order."""
+        """Open the store again, and write missing text files, and missing frames in ascending order."""
         self._sink = self.sink(self.out)
         if not self._killed:
             return
@@ -193,7 +193,7 @@ class StoreMachine(RuleBasedStateMachine):
                     self._possible.pop((path, field, frame), None)
 
     def check(self) -> None:
-        """Compare the finished store with the model; a subclass may check more."""
+        """Compare the finished store with the model. A subclass may add checks."""
         found = self.read(self.out).sequences()
         assert set(found) == {key[0] for key in self.model}
         keys = {

@@ -130,7 +130,7 @@ def test_a_missing_folder_sensor_or_frame_is_named(tmp_path):
     with pytest.raises(MissingDataError, match="nowhere: expected a folder, found nothing"):
         Capture(tmp_path / "nowhere")
     (tmp_path / "raw").mkdir()
-    with pytest.raises(MissingDataError, match="raw: expected the ego sensor's folder velodyne0, found no sensor"):
+    with pytest.raises(MissingDataError, match="raw: expected the folder velodyne0 of the ego sensor, found no sensor"):
         _ = Capture(tmp_path).sensors
     (tmp_path / "raw/velodyne2").mkdir()
     with pytest.raises(MissingDataError, match=r"found only the sensors \[2\]"):
@@ -164,7 +164,7 @@ INVALID = {  # folder -> (array that is written over it, what the error says)
         "expected finite coordinates, found .*nan.* at point 0",
     ),
     "infinite": ("velodyne0", np.full((300, 3), np.inf, np.float32), "expected finite coordinates, found .*inf.*"),
-    "beyond the table": ("labels0", np.full(300, 25, np.uint32), "expected class ids 0..24 .*, found 25 on 300 of 300"),
+    "beyond the table": ("labels0", np.full(300, 25, np.uint32), "expected class ids 0..24 .*, found 25 in 300 of 300"),
     "short labels": ("labels0", np.zeros(299, np.uint32), "expected 300 values, one per point .*, found 299"),
     "long instances": ("instances0", np.zeros(301, np.uint32), "expected 300 values, one per point .*, found 301"),
     "signed labels": ("labels0", np.zeros(300, np.int32), "expected uint32 values, found int32"),
@@ -210,7 +210,7 @@ def test_a_file_of_another_size_is_named(tmp_path, change, message):
 
 def test_a_recording_without_labels_is_not_written(tmp_path):
     scan = Scan(np.zeros((1, 3), np.float32))
-    with pytest.raises(FormatError, match="sensor 0, frame 5: expected labels and instances"):
+    with pytest.raises(FormatError, match="sensor 0, frame 5: expected a scan with labels and instances"):
         CaptureWriter(tmp_path).write(0, 5, SensorRecording(scan, np.eye(4), np.empty((0, 4))))
 
 

@@ -75,7 +75,7 @@ def test_all_conventions_are_printed_a_row_each_with_the_reason_where_there_is_n
     for name in ("carlasc", "semantickitti", "sscbench", "occ3d-lidar", "openoccupancy"):
         assert name in result.output
     assert "no score: occ3d-camera" in result.output
-    assert "without cameras" in result.output
+    assert "cameras and the field" in result.output
     figures = json.loads(run(*data, "--all-conventions", "--json").output)
     assert "impossible" in figures["occ3d-camera"]
     assert figures["sscbench"]["miou"] != figures["carlasc"]["miou"]

@@ -443,7 +443,7 @@ def test_files_that_do_not_fit_are_named(tables):
     points.write_bytes(data)
     good = labels.read_bytes()
     labels.write_bytes(b"\xff" + good[1:])
-    with pytest.raises(FormatError, match=r"lidarseg.bin: expected class ids 0\.\.31 .*found 255 on 1 of"):
+    with pytest.raises(FormatError, match=r"lidarseg.bin: expected class ids 0\.\.31 .*found 255 in 1 of"):
         frame.read()
     labels.unlink()
     with pytest.raises(MissingDataError, match=r"lidarseg.bin: expected a file that the tables list, found nothing"):

@@ -110,5 +110,5 @@ def test_what_is_no_camera_is_refused_in_one_line(change, expected):
 def test_a_camera_that_lacks_a_value_is_refused():
     about = camera().to_dict()
     del about["matrix"]
-    with pytest.raises(FormatError, match="one without matrix"):
+    with pytest.raises(FormatError, match="a camera without matrix"):
         CameraModel.from_dict(about, "cameras.json")

@@ -84,7 +84,9 @@ def test_carla_0914_tags_become_ours():
 
 def test_ids_beyond_the_vote_channels_are_named():
     CARLA.check(np.array([0, 24], np.uint32), "a.label")
-    with pytest.raises(FormatError, match=r"a.label: expected class ids 0..24 \(table carla\), found 30 on 2 of 3"):
+    with pytest.raises(
+        FormatError, match=r"a.label: expected class ids 0..24 \(table carla\), found 30 in 2 of 3 labels"
+    ):
         CARLA.check(np.array([0, 30, 30], np.uint32), "a.label")
 
 
@@ -109,7 +111,7 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do():
 
 
 def test_a_table_must_colour_what_it_names():
-    with pytest.raises(ArgumentError, match="expected a name and a colour for each id, found one of the two for 0"):
+    with pytest.raises(ArgumentError, match="expected a name and a colour for each id, found only one of them for 0"):
         ClassTable("t", {0: "a"}, {})
     with pytest.raises(ArgumentError, match="3 -> 99"):
         Remap("r", CARLA, CARLASC11, {3: 99})
@@ -161,8 +163,8 @@ def test_a_table_of_ones_own_is_kept_whole():
         ),
         ({"colors": {"0": [0, 0], "7": [0, 0, 0]}}, "a.json: classes: expected names and colours by id"),
         ({"movable": [9]}, "a.json: class table lab: expected ids of the table in movable, found 9"),
-        ({"moveable": [7]}, "a.json: classes: expected the keys name, names, .*found moveable"),
-        ({"name": "carla"}, "a.json: classes: expected a name that is not in use.*give the table a name of its own"),
+        ({"moveable": [7]}, "a.json: classes: expected only the keys name, names, .*found moveable"),
+        ({"name": "carla"}, "a.json: classes: expected a name that is not in use.*give the table a new name"),
     ],
 )
 def test_a_damaged_table_in_a_file_is_named(change, message):

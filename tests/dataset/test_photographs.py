@@ -43,7 +43,7 @@ def test_samples_have_the_images_of_frames_that_have_all(data):
     sample = dataset[1]
     assert np.array_equal(sample["images"]["front"], pixels + np.uint8(1))
     assert np.array_equal(sample["images"]["other"], pixels) and list(sample["cameras"]) == ["front", "other"]
-    with pytest.raises(ArgumentError, match="without images and cameras to flip"):
+    with pytest.raises(ArgumentError, match="a sample without images and cameras"):
         flip(sample, "y", SPEC)
 
 

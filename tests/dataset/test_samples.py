@@ -473,7 +473,7 @@ def test_damaged_files_are_named_when_they_are_read(tmp_path):
     (folder / "evaluation" / "000001.label").write_bytes(b"1234")
     expect(FormatError, "000001.label: expected 4096 bytes", tmp_path)
     (folder / "labels" / "000001.label").write_bytes(bytes(8))
-    message = "frame 1: expected the same number of each, found 300 points, 2 point_labels"
+    message = "frame 1: expected one value per point, found 300 points, 2 point_labels"
     expect(FormatError, message, tmp_path, fields=("points", "point_labels"))
 
 

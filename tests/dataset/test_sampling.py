@@ -180,7 +180,7 @@ def test_the_state_of_other_data_or_another_order_is_refused(change):
     state = ShardSampler(sequences_of(range(40))).state_dict()
     arguments = {name: value for name, value in change.items() if name in ("shard", "window")}
     sampler = ShardSampler(sequences_of(*change.get("frames", [range(40)])), **arguments)
-    with pytest.raises(ArgumentError, match="state: expected that of a ShardSampler with"):
+    with pytest.raises(ArgumentError, match="state: expected the state of a ShardSampler with"):
         sampler.load_state_dict(state | ({"position": 41} if "position" in change else {}))
 
 

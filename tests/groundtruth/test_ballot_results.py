@@ -34,7 +34,7 @@ def test_an_unknown_rule_is_refused() -> None:
 def test_a_label_beyond_the_table_is_refused_and_casts_no_vote() -> None:
     ballot = Ballot(GridSpec.published())
     labels = np.array([7, 7, 25, 25], np.uint8)
-    with pytest.raises(FormatError, match="expected class ids 0..24 .* found 25 on 2 of 4"):
+    with pytest.raises(FormatError, match="expected class ids 0..24 .* found 25 in 2 of 4"):
         ballot.add(Observation(POINTS, labels, POSE))
     assert len(ballot.votes().to_sparse()) == 0
 

@@ -137,7 +137,7 @@ def test_bad_input_is_one_line(labelled, tmp_path):
         np.save(camera / "000000.npy", np.zeros((HEIGHT, 20), np.uint8))
 
     refused(FormatError, "200 x 100 pixels.*found 20 x 100", changed("size", other_size))
-    refused(FormatError, r"\(100, 200\) whole numbers.*found uint8 of shape \(100, 20\)", changed("array", other_array))
+    refused(FormatError, r"\(100, 200\) integers.*found uint8 of shape \(100, 20\)", changed("array", other_array))
     refused(FormatError, "a whole JPEG or PNG", changed("short", cut_short))
     refused(FormatError, "ids of the class table carla.*found 99", changed("class", unknown_class))
     refused(
@@ -147,7 +147,7 @@ def test_bad_input_is_one_line(labelled, tmp_path):
     )
     refused(MissingDataError, "classes of pixels, such as A/at0/000000.png", None)
     refused(MissingDataError, "cameras in cameras.json, found none", good, source=folder / "truth")
-    refused(ArgumentError, "a name of one line", good, by="\n")
+    refused(ArgumentError, "a name in one line", good, by="\n")
     for more in (["--frames", "1:"], ["--logits"]):
         call = ["label", source, "-o", tmp_path / "out", "--from", "images", "--pixels", good, *more]
         done = CliRunner().invoke(app, list(map(str, call)))

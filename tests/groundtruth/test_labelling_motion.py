@@ -106,7 +106,7 @@ def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_f
 
 def test_what_exists_is_replaced_only_if_this_made_it(numbered, tmp_path):
     folder, _ = numbered
-    with pytest.raises(ConflictError, match="expected nothing there"):
+    with pytest.raises(ConflictError, match="expected a new path"):
         carlasc.label_motion(folder / "in", folder / "out", run=ONE)
     with pytest.raises(ConflictError, match="a data set with motion found by carlasc to overwrite"):
         carlasc.label_motion(folder / "out", folder / "in", overwrite=True, run=ONE)

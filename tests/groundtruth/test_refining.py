@@ -189,7 +189,7 @@ def test_too_few_scans_are_left_alone_and_sequences_without_scans_are_left_out(e
 
 def test_what_exists_is_not_replaced_unless_it_was_refined_and_that_is_asked_for(data, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
-    with pytest.raises(ConflictError, match="expected nothing there"):
+    with pytest.raises(ConflictError, match="expected a new path"):
         carlasc.refine(data, tmp_path / "out", run=ALONE)
     carlasc.refine(data, tmp_path / "out", poses=PoseOptions(refine="always"), overwrite=True, run=ALONE)
     assert open_store(tmp_path / "out").sequences()[TWO].metadata.extra["poses"] == "refined"
@@ -218,7 +218,9 @@ def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(data, 
     ran = subprocess.run([sys.executable, "-c", KILLED, data, out, when], check=False)
     assert ran.returncode == 9 and not out.exists()
     assert len(list((tmp_path / "out.part").glob("*/*/*/.carlasc/poses-*.npz"))) == (1 if when == "25" else 2)
-    with pytest.raises(ConflictError, match=r"out\.part: expected what an interrupted run .*: remove it"):
+    with pytest.raises(
+        ConflictError, match=r"out\.part: expected the files of an interrupted run .*: remove the folder"
+    ):
         carlasc.refine(data, out, poses=PoseOptions(refine="always"), run=ALONE)
     given = poses_of(data)
     write_poses(data / ONE, given + 1e-9)

@@ -292,7 +292,7 @@ def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_p
         ({"name": ""}, "name: expected letters"),
         (
             {"name": "velodyne"},
-            "name: expected a name that the layout does not use for something else, found 'velodyne'",
+            "name: expected a name that the layout does not reserve, found 'velodyne'",
         ),
         ({"name": "poses.txt"}, "name: expected a name that the layout does not .*, found 'poses.txt'"),
     ],

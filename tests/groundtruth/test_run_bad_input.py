@@ -85,7 +85,7 @@ def test_no_capture_and_no_sensor_are_said(tmp_path):
     with pytest.raises(MissingDataError, match="expected a capture .*, found none"):
         regrid(tmp_path, SMALL, observe=FromCapture())
     (tmp_path / "raw").mkdir()
-    with pytest.raises(MissingDataError, match="expected the ego sensor's folder velodyne0, found no sensor"):
+    with pytest.raises(MissingDataError, match="expected the folder velodyne0 of the ego sensor, found no sensor"):
         regrid(tmp_path, SMALL)
     assert read_tree(tmp_path, leave_out="nothing") == {}
 

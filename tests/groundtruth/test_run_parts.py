@@ -109,7 +109,7 @@ def test_a_run_with_other_settings_that_was_a_little_faster_is_found(source, tmp
 
 
 def test_parts_do_not_replace_a_grid(source, tmp_path):
-    with pytest.raises(ArgumentError, match="remove what exists first"):
+    with pytest.raises(ArgumentError, match="remove the existing output first"):
         regrid(source[0], SPEC, tmp_path, run=Run(part=Part(1, 2)), overwrite=True)
     assert not list(tmp_path.iterdir())
 

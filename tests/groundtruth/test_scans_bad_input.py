@@ -208,5 +208,5 @@ def test_boxes_of_frames_without_a_scan_are_left_out(street):
 
 def test_a_box_of_a_class_that_does_not_exist_is_named(street):
     add_boxes(street, 4_294_967_295)
-    with pytest.raises(FormatError, match="boxes of frame 0: expected class ids 0..24 .*, found 4294967295 on 1 of 1"):
+    with pytest.raises(FormatError, match="boxes of frame 0: expected class ids 0..24 .*, found 4294967295 in 1 of 1"):
         make(street, motion=MotionOptions("boxes"))

@@ -184,7 +184,7 @@ def test_images_that_do_not_fit_are_refused_in_one_line(town):
         with pytest.raises(FormatError, match=expected) as error:
             decode_image(bad, "a.jpg", one, color=True)
         assert "\n" not in str(error.value)
-    with pytest.raises(FormatError, match="a PNG with one whole number per pixel"):
+    with pytest.raises(FormatError, match="a PNG with one integer per pixel"):
         decode_image(data, "a.jpg", one, color=False)
     late = one.replaced(times=sequence.times + 0.25)
     with pytest.raises(FormatError, match=r"an image within a frame \(0.100 s\) of the scan, found \+0.250 s"):

@@ -113,7 +113,7 @@ def test_a_bad_frame_is_listed_and_the_others_are_counted(data: tuple[Path, dict
         ["labels", "000002"],
         ["evaluation/labels", "000001"],
     ]
-    assert "found 77 on 100 of 100" in result.failures[0][1]
+    assert "found 77 in 100 of 100" in result.failures[0][1]
     assert (result.total.scans, result.total.grids) == (14, 14)
 
 

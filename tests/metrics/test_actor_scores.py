@@ -95,7 +95,9 @@ def test_true_actors_without_a_number_do_not_count(tmp_path):
 
 def test_grids_without_instances_and_velocities_that_are_not_finite_are_named(truth, tmp_path):
     bare = write(tmp_path / "bare", parts=())
-    with pytest.raises(ArgumentError, match="actors: expected grids with instances on both sides, found .*bare"):
+    with pytest.raises(
+        ArgumentError, match="actors: expected grids with instances for prediction and ground truth, found .*bare"
+    ):
         score(bare, truth)
 
     def break_it(frame, labels, instance, velocity):

@@ -115,9 +115,9 @@ def test_ids_out_of_range_are_named_unless_masked():
 
 
 def test_shapes_and_types_that_do_not_fit_are_refused():
-    with pytest.raises(FormatError, match=r"prediction: expected the truth's shape \(2, 2\), found \(4,\)"):
+    with pytest.raises(FormatError, match=r"prediction: expected the shape of the ground truth \(2, 2\), found \(4,\)"):
         ConfusionMatrix(K).update(np.zeros(4, int), np.zeros((2, 2), int))
-    with pytest.raises(FormatError, match=r"mask: expected the truth's shape \(4,\), found \(3,\)"):
+    with pytest.raises(FormatError, match=r"mask: expected the shape of the ground truth \(4,\), found \(3,\)"):
         ConfusionMatrix(K).update(np.zeros(4, int), np.zeros(4, int), np.ones(3, bool))
     with pytest.raises(FormatError, match="prediction: expected integer class ids, found float64"):
         ConfusionMatrix(K).update(np.zeros(4), np.zeros(4, int))
@@ -203,5 +203,5 @@ def test_truth_is_scored_only_where_the_mask_says():
 def test_truth_of_another_grid_is_refused():
     grid = Grid(SMALL, np.zeros(SMALL.size, np.uint8))
     other = SMALL.with_size((4, 4, 2))
-    with pytest.raises(FormatError, match="expected the reference's"):
+    with pytest.raises(FormatError, match="expected the geometry of the reference"):
         score_truth(grid, Grid(other, np.zeros(other.size, np.uint8)), 2)

@@ -141,7 +141,7 @@ def test_what_cannot_be_scored_is_said_in_one_line():
         convention_named("nuscenes")
     other = ClassTable("lab", {0: "free", 1: "thing"}, {0: (0, 0, 0), 1: (9, 9, 9)})
     with pytest.raises(
-        FormatError, match=r"truth: expected classes that the convention sscbench has a map for \(.*\), found lab"
+        FormatError, match=r"truth: expected a class table with a map in the convention sscbench \(.*\), found lab"
     ):
         CONVENTIONS["sscbench"].check(other, "truth")
     with pytest.raises(FormatError, match=r"prediction: expected class ids of carla, found 77 \(3000 times\)"):

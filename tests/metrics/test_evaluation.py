@@ -163,7 +163,7 @@ def test_frames_that_cannot_be_scored_are_listed_and_the_others_done(folders, wo
 def test_a_prediction_of_another_grid_is_refused(folders, world, tmp_path):
     other = GridSpec("cartesian", (4, 4, 2), SPEC.lower, SPEC.upper)
     write_grids(tmp_path / "other", {key: np.zeros(other.size) for key in world[0]}, spec=other)
-    with pytest.raises(FormatError, match="expected the truth's grid cartesian 8 x 8 x 2"):
+    with pytest.raises(FormatError, match="expected the geometry of the ground truth, cartesian 8 x 8 x 2"):
         evaluate(tmp_path / "other", folders[1])
     plain = tmp_path / "plain"
     plain.mkdir()
@@ -232,7 +232,7 @@ def test_voxels_that_no_camera_sees_do_not_count_for_cameras(folders):
     assert by_camera.matrix.total < 0.8 * by_lidar.matrix.total
     parts = evaluate(folders[0], truth, convention="occ3d-lidar", scoring=Scoring(by=["seen"])).breakdown
     assert parts["seen"] == by_camera.matrix and parts["seen"] + parts["not seen"] == by_lidar.matrix
-    with pytest.raises(MissingDataError, match="without the field `seen`"):
+    with pytest.raises(MissingDataError, match="cameras and the field `seen`"):
         evaluate(folders[0], folders[0], convention="own", scoring=Scoring(by=["seen"]))
 
 
@@ -246,7 +246,7 @@ def test_a_sequence_without_prediction_is_named_in_a_note(folders):
     result = evaluate(*folders)
     assert set(result.sequences) == set(SEQUENCES)
     assert result.notes == (
-        "1 of 3 sequences of the truth have no prediction and were not scored: Test/Town10_New/cartesian",
+        "1 of 3 sequences of the ground truth have no prediction and were not scored: Test/Town10_New/cartesian",
     )
 
 
@@ -328,7 +328,7 @@ def test_plain_folders_of_different_sizes_are_told_by_the_size_of_their_files(tm
     without = write_plain(tmp_path / "without", {"000000.label": np.zeros(4, np.uint32)})
     counted = {"000000.label": np.zeros(4, np.uint32), "000000.bin": np.ones(4, np.float32)}
     assert (
-        r"expected the truth's shape (4,), found (3,)"
+        r"expected the shape of the ground truth (4,), found (3,)"
         in evaluate(source, without, scoring=Scoring(voxels="all")).failures[0][1]
     )
     assert "expected 4 labels" in evaluate(source, write_plain(tmp_path / "counted", counted)).failures[0][1]
@@ -373,7 +373,7 @@ def test_sequences_of_different_classes_are_summed_in_the_classes_of_the_convent
         write_grids(tmp_path, {k: v for k, v in labels.items() if k[0] == path}, counts, classes=classes)
     result = evaluate(tmp_path, tmp_path)
     assert (result.frames, result.matrix.accuracy) == (6, 1.0)
-    with pytest.raises(FormatError, match=r"the convention own has a map for \(carlasc11\), found carla"):
+    with pytest.raises(FormatError, match=r"a class table with a map in the convention own \(carlasc11\), found carla"):
         evaluate(tmp_path, tmp_path, convention="own")
 
 
@@ -381,7 +381,7 @@ def test_of_several_grids_one_is_to_be_named(world, tmp_path):
     for grid in ("evaluation_a", "evaluation_b"):
         write_grids(tmp_path, world[0], world[1], grid=grid)
     with pytest.raises(
-        MissingDataError, match="expected the grid evaluation, found evaluation_a, evaluation_b: choose one with"
+        MissingDataError, match="expected the grid evaluation, found evaluation_a, evaluation_b: choose a grid with"
     ):
         evaluate(tmp_path, tmp_path)
     assert evaluate(tmp_path, tmp_path, truth_grid="evaluation_b").miou > 0.9

@@ -102,7 +102,7 @@ def test_a_missing_forecast_is_a_failure_of_its_frame(tmp_path, truth, world):
     ("names", "options", "message"),
     [
         (["evaluation"], {}, "expected grids of forecasts such as forecast_1s, found evaluation"),
-        (["a_1s", "b_1s"], {}, "grid: expected the name of one of the forecasts, found a_1s and b_1s"),
+        (["a_1s", "b_1s"], {}, "grid: expected one forecast grid per horizon, found a_1s and b_1s"),
         (["a_1s"], {"grid": "b"}, "expected grids of forecasts such as b_1s, found a_1s"),
         (["a_9s"], {}, r"evaluation: expected frames that are 9 s apart, found frames of 2.51 s"),
         (["a_1s"], {"scoring": Scoring(rays=True)}, "scoring: expected .* for forecasts, found rays"),

@@ -40,5 +40,5 @@ def test_counts_of_the_prediction_are_ignored():
     ],
 )
 def test_grids_of_different_geometry_are_refused(other):
-    with pytest.raises(ArgumentError, match="truth: expected the geometry of the prediction's grid"):
+    with pytest.raises(ArgumentError, match="truth: expected the geometry of the predicted grid"):
         compare_grids(grid([0] * 7), Grid(other, np.zeros(other.size, np.uint8)))

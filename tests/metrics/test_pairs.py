@@ -137,7 +137,7 @@ def test_a_truncated_label_file_is_named(tmp_path):
     np.zeros(63, "<u2").tofile(tmp_path / "b" / "000000.label")
     result = evaluate(tmp_path / "b", tmp_path / "a", convention="semantickitti")
     assert "expected 64 labels of 2 or 4 bytes, found 126 bytes" in result.failures[0][1]
-    with pytest.raises(FormatError, match="has a map for"):
+    with pytest.raises(FormatError, match="with a map in the convention"):
         evaluate(tmp_path / "a", tmp_path / "a", convention="occ3d-lidar", source_classes="semanticposs")
 
 

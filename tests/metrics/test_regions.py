@@ -28,7 +28,7 @@ def test_bands_share_the_grid_out():
     np.testing.assert_array_equal(sum(band.astype(int) for band in bands.values()), 1)
     heights = height_bands(SPEC, (-1, 0, 1))
     assert heights["-1-0 m up"][..., :2].all() and not heights["-1-0 m up"][..., 2:].any()
-    with pytest.raises(ArgumentError, match="rising"):
+    with pytest.raises(ArgumentError, match="increasing"):
         height_bands(SPEC, (1, 0))
 
 
@@ -130,7 +130,7 @@ def test_a_vertical_field_of_view_includes_both_ends_and_is_measured_from_the_ho
 
 
 def test_masks_that_can_hold_nothing_are_refused():
-    with pytest.raises(ArgumentError, match="far_m: expected more than 5, where the band starts, found 5"):
+    with pytest.raises(ArgumentError, match="far_m: expected more than 5, the value of `near_m`, found 5"):
         distance_band(SMALL, 5, 5)
     with pytest.raises(ArgumentError, match="near_m: expected 0 or more, found -1"):
         distance_band(SMALL, -1, 5)

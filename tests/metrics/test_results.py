@@ -63,7 +63,7 @@ def test_the_test_of_equals_is_wrong_as_often_as_it_says():
 
 def test_fewer_than_five_sequences_say_nothing():
     few = matrices([0.5] * 4)
-    with pytest.raises(ArgumentError, match="at least 5 to draw from, found 4"):
+    with pytest.raises(ArgumentError, match="at least 5 sequences to resample, found 4"):
         bootstrap(list(few.values()), accuracy)
     with pytest.raises(ArgumentError, match="at least 5"):
         compare(few, few, accuracy)

@@ -71,7 +71,7 @@ def test_it_follows_the_definition_and_parts_can_be_merged(ignored, fewest):
 def test_nothing_is_no_number_and_wrong_input_is_refused():
     metric = TrackingQuality(3, {1})
     assert math.isnan(metric.compute().lstq)
-    with pytest.raises(FormatError, match="classes and numbers of the truth's shape"):
+    with pytest.raises(FormatError, match="classes and numbers with the shape of the ground truth"):
         metric.update("", (np.zeros(3, int), np.zeros(3, int)), (np.zeros(3, int), np.zeros(2, int)))
     with pytest.raises(FormatError, match="truth"):
         metric.update("", (np.zeros(3, int), np.zeros(3, int)), (np.full(3, 3), np.zeros(3, int)))

@@ -34,7 +34,7 @@ def test_what_is_no_cluster(where):
 
 
 def test_two_numbers_of_workers_contradict_each_other():
-    with pytest.raises(ArgumentError, match="workers: expected none beside local:2, found 3"):
+    with pytest.raises(ArgumentError, match="workers: expected no number of workers with local:2, found 3"):
         run("local:2", workers=3)
 
 
@@ -71,7 +71,7 @@ def test_a_cluster_without_workers(tmp_path: Path):
     with (
         dask.config.set({"carlasc.workers-timeout": "300ms"}),
         dask_cluster.scheduler(tmp_path) as (address, _),
-        pytest.raises(CarlascError, match="no worker came within 0.3 s: look at its jobs"),
+        pytest.raises(CarlascError, match="no worker started within 0.3 s: check its jobs"),
     ):
         run(address)
 
@@ -115,7 +115,7 @@ def test_the_scheduler_is_lost_in_the_middle(tmp_path: Path):
         next(results)
         process.send_signal(signal.SIGKILL)
         with pytest.raises(
-            CarlascError, match=f"^the scheduler {address}: the connection was lost: see whether"
+            CarlascError, match=f"^the scheduler {address}: the connection was lost: check that the scheduler"
         ) as caught:
             list(results)
     assert "\n" not in str(caught.value)

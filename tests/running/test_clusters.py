@@ -77,7 +77,7 @@ def test_what_always_kills_its_worker_is_given_up_and_nothing_else(cluster):
     )
     found = list(results)
     assert found[:3] + found[4:] == [0, 1, 2, 4, 5, 6, 7]
-    assert found[3].startswith("3: a task: 3 worker processes died while they did it: they ran out of memory")
+    assert found[3].startswith("3: a task: 3 worker processes died while running it: they ran out of memory")
     with pytest.raises(CarlascError, match="a task: 3 worker processes died"):
         list(run_all(jobs.kill_itself, [0], run=Run(executor=cluster)))
 

@@ -88,11 +88,11 @@ def test_what_always_kills_its_worker_is_given_up_and_nothing_else():
     )
     found = list(results)
     assert found[:3] + found[4:] == [0, 1, 2, 4, 5, 6, 7]
-    assert found[3].startswith("3: a task: 3 worker processes died while they did it: they ran out of memory")
+    assert found[3].startswith("3: a task: 3 worker processes died while running it: they ran out of memory")
 
 
 def test_without_a_result_for_what_is_given_up_there_is_one_clear_line():
-    with pytest.raises(CarlascError, match="a task: 3 worker processes died while they did it") as caught:
+    with pytest.raises(CarlascError, match="a task: 3 worker processes died while running it") as caught:
         list(run_all(jobs.kill_itself, range(2), run=Run(workers=2)))
     assert "\n" not in str(caught.value)
 

@@ -138,8 +138,8 @@ def test_an_unfinished_store_of_any_format_says_the_same(tmp_path: Path, name: s
     with pytest.raises(FormatError) as error:
         carlasc.open(tmp_path / opened)
     assert str(error.value) == (
-        f"{tmp_path / opened}: expected a finished store, found one that is being written, or was interrupted: "
-        "run the same command again to finish it (`carlasc finish` for a .zarr store whose parts are all written)"
+        f"{tmp_path / opened}: expected a finished store, found an unfinished one: a run is writing it, or was interrupted: "
+        "run the same command again to finish it (`carlasc finish` if all parts of a .zarr store are written)"
     )
 
 

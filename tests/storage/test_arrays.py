@@ -82,7 +82,10 @@ def test_an_empty_list_counts_as_rows_and_a_single_value_as_an_array_of_any_shap
         (with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 3)}"), "found -1 x 3"),
         (with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (10**9, 3)}"), "expected a .npy array"),
         (with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 3)}"), "expected 1200000"),
-        (with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"9" * 4000 + b", 3)}"), "can hold"),
+        (
+            with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"9" * 4000 + b", 3)}"),
+            "fits into memory",
+        ),
         (with_header(b"{'descr': '|O', 'fortran_order': False, 'shape': (1, 3)}", b"cos\nsystem\n"), "found object"),
         (with_header(b"{'descr': [('a', '|O')], 'fortran_order': False, 'shape': (1, 3)}"), "expected float32 values"),
         (npy(np.zeros((2, 3), "<f4"))[:6] + b"\x03\x00" + npy(np.zeros((2, 3), "<f4"))[8:], "version"),

@@ -159,7 +159,7 @@ def test_frames_that_a_range_leaves_out_are_copied_without_labels(data, predicti
 
 def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_for(data, predictions, tmp_path):
     carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
-    with pytest.raises(ConflictError, match="expected nothing there"):
+    with pytest.raises(ConflictError, match="expected a new path"):
         carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
     carlasc.label(data, tmp_path / "out", tmp_path / "net", by="x", overwrite=True, frames=(0, 3), run=ALONE)
     made = open_store(tmp_path / "out").sequences()[WHOLE]
@@ -188,7 +188,9 @@ def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(data, 
     out = tmp_path / "out"
     ran = subprocess.run([sys.executable, "-c", KILLED, data, out, tmp_path / "net"], check=False)
     assert ran.returncode == 9 and not out.exists() and (tmp_path / "out.part").is_dir()
-    with pytest.raises(ConflictError, match=r"out\.part: expected what an interrupted run .*: remove it"):
+    with pytest.raises(
+        ConflictError, match=r"out\.part: expected the files of an interrupted run .*: remove the folder"
+    ):
         carlasc.label(data, out, tmp_path / "net", by="another", run=ALONE)
     changed = tmp_path / "net" / WHOLE / "000000.npy"
     times = changed.stat()
@@ -244,7 +246,7 @@ def test_a_record_a_report_and_a_card_say_who_predicted(data, predictions, tmp_p
 
 @pytest.mark.parametrize("by", ["", " ", "a\nb"])
 def test_a_name_is_one_line(data, predictions, tmp_path, by):
-    with pytest.raises(ArgumentError, match="expected a name of one line"):
+    with pytest.raises(ArgumentError, match="expected a name in one line"):
         carlasc.label(data, tmp_path / "out", tmp_path / "net", by=by, run=ALONE)
 
 

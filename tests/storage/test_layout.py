@@ -63,9 +63,9 @@ def test_probabilities_are_rounded_to_float16_when_they_are_written():
 
 
 def test_flags_and_views_that_do_not_fit_are_refused():
-    with pytest.raises(FormatError, match="expected at most uint8, found uint16"):
+    with pytest.raises(FormatError, match="expected uint8 or a smaller type, found uint16"):
         layout.field_named("evaluation/flags").encode(np.zeros(2, np.uint16), "x")
-    with pytest.raises(FormatError, match="expected at most uint16, found uint32"):
+    with pytest.raises(FormatError, match="expected uint16 or a smaller type, found uint32"):
         layout.field_named("evaluation/views").encode(np.zeros(2, np.uint32), "x")
 
 
@@ -107,7 +107,7 @@ def test_boxes_come_back_bit_for_bit():
 
 def test_boxes_of_another_size_or_type_are_refused():
     field = layout.field_named("boxes")
-    with pytest.raises(FormatError, match=r"boxes/0.bin: expected a multiple of 89 bytes \(a box each\), found 90"):
+    with pytest.raises(FormatError, match=r"boxes/0.bin: expected a multiple of 89 bytes \(one box\), found 90"):
         field.decode(bytes(90), "boxes/0.bin")
     with pytest.raises(FormatError, match="expected a table of boxes, found float64"):
         field.encode(np.zeros((2, 13)), "boxes/0.bin")
@@ -145,7 +145,7 @@ def test_arrays_that_do_not_fit_are_refused():
         layout.field_named("points").encode(np.zeros((2, 3), np.float32), "a.bin")
     with pytest.raises(FormatError, match="expected unsigned integers, found int64"):
         layout.field_named("labels").encode(np.zeros(2, np.int64), "a.label")
-    with pytest.raises(FormatError, match="expected at most uint32"):
+    with pytest.raises(FormatError, match="expected uint32 or a smaller type"):
         layout.field_named("labels").encode(np.zeros(2, np.uint64), "a.label")
 
 

@@ -51,9 +51,9 @@ def test_axes_are_read_from_this_version_and_the_one_before(values, axes):
     ("values", "message"),
     [
         ({"format": 3}, "c.json: expected format 2 or older, found format 3: upgrade carlasc to read it"),
-        ({"format": 0}, "c.json: expected a whole number above 0 in format, found 0"),
-        ({"format": "2"}, "c.json: expected a whole number above 0 in format, found '2'"),
-        ({"format": True}, "c.json: expected a whole number above 0 in format, found True"),
+        ({"format": 0}, "c.json: expected an integer above 0 in format, found 0"),
+        ({"format": "2"}, "c.json: expected an integer above 0 in format, found '2'"),
+        ({"format": True}, "c.json: expected an integer above 0 in format, found True"),
         ({"frame": "left"}, "c.json: expected carlasc or kitti in frame, found 'left'"),
         ({"axes": "kitti"}, "c.json: expected left or right in axes, found 'kitti'"),
         ({"frame": "kitti", "axes": "left"}, "c.json: expected the axes right, as frame kitti says, found left"),

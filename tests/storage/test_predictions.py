@@ -73,7 +73,7 @@ def test_numbers_that_are_none_are_no_scores(tmp_path, value):
 
 def test_negative_shares_are_refused(tmp_path):
     np.save(tmp_path / "000000.npy", np.array([[0.5, 0.5], [1.5, -0.5]], np.float32))
-    with pytest.raises(FormatError, match=r"the least -0\.5, at point 1"):
+    with pytest.raises(FormatError, match=r"a minimum of -0\.5 at point 1"):
         CARLA_ONLY.read(tmp_path / "000000.npy", 2)
 
 
@@ -112,12 +112,12 @@ def test_a_scan_without_points_has_predictions_without_rows(tmp_path):
 @pytest.mark.parametrize(
     ("array", "message"),
     [
-        (np.zeros(4, np.int64), "expected 3 rows, one for each point, found 4"),
+        (np.zeros(4, np.int64), "expected 3 rows, one per point, found 4"),
         (np.zeros((4, 23), np.float32), "expected 3 rows"),
         (np.array([1, -1, 2]), "class table carla, up to 22, found -1"),
         (np.array([1, 23, 2]), "class table carla, up to 22, found 23"),
         (np.eye(3, 30, 25, dtype=np.float32), "class table carla, up to 22, found 25"),
-        (np.zeros(3, np.float32), r"\(N,\) whole numbers, or \(N, C\) floats.*found float32 of shape \(3,\)"),
+        (np.zeros(3, np.float32), r"\(N,\) integers, or \(N, C\) floats.*found float32 of shape \(3,\)"),
         (np.zeros((3, 23), np.uint8), r"found uint8 of shape \(3, 23\)"),
         (np.array(["a", "b", "c"]), "expected numeric values"),
     ],
@@ -215,7 +215,7 @@ def test_two_folders_of_a_sequence_and_two_kinds_of_files_are_refused(sequences,
     with pytest.raises(FormatError, match="found a/Town07_Heavy, b/Town07_Heavy"):
         find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)
     write(tmp_path / "a/Town07_Heavy", suffix=".npy")
-    with pytest.raises(FormatError, match=r"files of one ending, found \.label and \.npy"):
+    with pytest.raises(FormatError, match=r"files with one suffix, found \.label and \.npy"):
         find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)
 
 

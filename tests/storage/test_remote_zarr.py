@@ -109,7 +109,7 @@ def test_packing_to_a_bucket_and_back(server: FaultyServer, reference: Path, tmp
     assert there.out == out
     assert (there.stored_bytes, there.published_bytes) == (here.stored_bytes, here.published_bytes)
     assert files_in(RemoteTarget(out)) == files_of(tmp_path / "x.zarr")
-    with pytest.raises(ConflictError, match=r"\.zarr: expected nothing there, found a finished store"):
+    with pytest.raises(ConflictError, match=r"\.zarr: expected a new path, found a finished store"):
         pack(reference, out)
     assert len(pack(reference, out, overwrite=True, run=Run(workers=1)).sequences) == 1
     assert files_in(RemoteTarget(out)) == files_of(tmp_path / "x.zarr")
@@ -124,7 +124,7 @@ def test_nothing_but_a_store_is_written_to(server: FaultyServer, tmp_path: Path)
     target = RemoteTarget(f"s3://{BUCKET}/{tmp_path.name}.zarr")
     target.put("photo.jpg", b"1")
     for overwrite in (False, True):
-        with pytest.raises(ConflictError, match=r"expected nothing there, or a packed store, found photo\.jpg"):
+        with pytest.raises(ConflictError, match=r"expected a new path, or a packed store, found photo\.jpg"):
             ZarrSink(target, overwrite=overwrite)
     assert files_in(target) == {"photo.jpg": b"1"}
 

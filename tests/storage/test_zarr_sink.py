@@ -207,7 +207,7 @@ def test_another_zarr_store_is_refused(tmp_path: Path) -> None:
 def test_an_unfinished_store_is_refused(tmp_path: Path) -> None:
     ZarrSink(tmp_path / "x.zarr").sequence(SCANS).close()
     with pytest.raises(
-        FormatError, match="being written, or was interrupted: run the same command again.*carlasc finish"
+        FormatError, match="a run is writing it, or was interrupted: run the same command again.*carlasc finish"
     ):
         carlasc.open(tmp_path / "x.zarr")
 

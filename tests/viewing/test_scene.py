@@ -159,7 +159,7 @@ def test_the_truth_is_found_by_path_by_name_or_as_the_only_sequence(tmp_path):
 def test_a_truth_of_another_geometry_is_refused_when_errors_are_shown(blocks, tmp_path):
     spec = GridSpec.published().with_size((32, 32, 4))
     other = write_blocks(tmp_path / "Town01_Light" / "cartesian", spec=spec, points=False)
-    with pytest.raises(ArgumentError, match="truth: expected the geometry of the prediction's grid"):
+    with pytest.raises(ArgumentError, match="truth: expected the geometry of the predicted grid"):
         Scene(blocks, truth=other).open()
     assert Scene(blocks, truth=other).open("grid,truth").contents == ("grid", "truth")
 

@@ -21,17 +21,17 @@ from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.layout import CAMERAS
 
 SETTINGS_FILE = "recording.json"
-_REPLAY_TOLERANCE_M = 0.02  # greatest distance of the ego sensor in a replay from where it was recorded
+_REPLAY_TOLERANCE_M = 0.02  # maximum distance between the ego sensor positions of the replay and of the recorded drive
 
 
 @dataclass(frozen=True)
 class RecordResult:
-    """What a recording wrote.
+    """Result of `record`.
 
     Attributes:
         out: folder of the sequence, which holds raw/, or its URL.
         count: number of the requested frames that exist now.
-        written: number of frames that this run wrote; the others existed.
+        written: number of frames that this run wrote; other frames existed.
         sensors: number of sensors.
         vehicles: number of vehicles that were spawned, without the ego vehicle.
         walkers: number of pedestrians that were spawned.
@@ -77,34 +77,34 @@ def record(
 ) -> RecordResult:
     """Record a drive on a CARLA server as a raw capture.
 
-    At the end, also after an error or Ctrl-C, the actors that were spawned are destroyed and the server's settings are restored.
+    At the end, also after an error or Ctrl-C, the spawned actors are destroyed and the settings of the server are restored.
 
-    A second run with the same settings replays the drive from its start with the same seed, and writes the frames that are missing. It
-    stops where the replay departs from the recorded drive.
+    A second run with the same settings replays the drive from its start with the same seed, and writes the missing frames. It stops if the
+    replay deviates from the recorded drive.
 
     Args:
         out: folder of the sequence, or its URL in an object store. Files go to `<out>/raw`.
-        server: where the CARLA server is, and how long it may take to answer.
+        server: address and timeout of the CARLA server.
         town: map to drive in, such as "Town01" or "Town10HD".
         count: number of frames, 0.1 s apart.
         sensors: number of LiDARs. The first is the ego sensor.
-        seed: seed of positions, traffic, the sensors' offsets and the noise.
+        seed: seed of positions, traffic, offsets of the sensors, and noise.
         traffic: "light", "medium" or "heavy": 25, 50 or 100 vehicles, and as many pedestrians.
-        lidar: model of the LiDARs. None: the data set's.
+        lidar: model of the LiDARs; None takes the model of the data set.
         bev: whether to write bird's-eye pictures.
         cameras: names of cameras on the vehicle, as in `carlasc.simulate`. Each has images of colour, class and depth.
-        carla: module of the client. None: the package `carla`.
-        progress: called with (frames done, number of frames).
+        carla: module of the client; None takes the package `carla`.
+        progress: called with (finished frames, number of frames).
 
     Returns:
-        What was written.
+        Numbers of the written frames, sensors and actors.
 
     Raises:
         ArgumentError: an argument is out of its range, or the server has no such town.
         DependencyError: a package of the extra `carla` is missing. Nothing is written.
         ServerError: the server does not answer.
         MissingDataError: the town has no room for the ego vehicle, or the server lacks a sensor.
-        ConflictError: `out` holds another capture, or the replay departs from it.
+        ConflictError: `out` holds another capture, or the replay deviates from it.
         StorageError: `out` cannot be written to.
     """
     check_at_least(1, count=count, sensors=sensors)
@@ -132,7 +132,7 @@ def record(
         rig = SensorRig(connection, actors.ego, offsets, settings.lidar, bev, seed, models)
         spawned = (int(actor.id) for actor in (actors.ego, *actors.vehicles, *actors.walkers))
         numbers = ActorNumbers([*connection.initial_actors, *spawned])
-        writer.write_settings(SETTINGS_FILE, written_settings)  # the town is known to exist now
+        writer.write_settings(SETTINGS_FILE, written_settings)  # only now it is certain that the town exists
         if models:
             writer.target.put(CAMERAS, cameras_to_json(models))
         with TimesLog(writer) as log:
@@ -161,26 +161,26 @@ def _write_frame(writer: CaptureWriter, frame: int, recordings: list[SensorRecor
 
 
 def _check_replay(writer: CaptureWriter, frame: int, replayed: SensorRecording) -> None:
-    """Raise ConflictError where the ego sensor is not where it was when the frame was recorded."""
+    """Raise ConflictError if the ego sensor is not at its recorded position."""
     recorded = Capture(writer.target.tree).read_pose(0, frame)
     distance_m = float(np.linalg.norm(recorded[:3, 3] - replayed.world_T_sensor[:3, 3]))
     if distance_m > _REPLAY_TOLERANCE_M:
         raise ConflictError(
             f"{writer.location}: frame {frame}",
-            expected="the replay to follow the recorded drive",
+            expected="a replay that follows the recorded drive",
             found=f"the ego sensor {distance_m:.2f} m away from it",
-            advice="the server's physics differ between runs: record to another folder",
+            advice="the physics of the server differ between runs: record to another folder",
         )
 
 
 EGO_BLUEPRINTS = ("vehicle.tesla.model3", "vehicle.lincoln.mkz_2017", "vehicle.lincoln.mkz_2020")
 WALKING_MPS = 1.4  # mean speed of the pedestrians
-_ATTEMPTS = 4  # positions that are tried per pedestrian: many are occupied or cannot be reached
+_ATTEMPTS = 4  # attempts per pedestrian, because many positions are occupied or cannot be reached
 
 
 @dataclass(frozen=True)
 class SpawnedActors:
-    """CARLA's actors that move.
+    """The moving actors of CARLA.
 
     Attributes:
         ego: the vehicle with the sensors.
@@ -198,7 +198,7 @@ def spawn_actors(server: Server, number: int, port: int, rng: np.random.Generato
 
     Args:
         server: the server, with its town loaded.
-        number: number of other vehicles, and of pedestrians. Fewer are spawned where there is no room for more.
+        number: number of other vehicles, and of pedestrians. Fewer are spawned if the town has too little room.
         port: port of the traffic manager.
         rng: source of the random numbers.
 
@@ -213,7 +213,7 @@ def spawn_actors(server: Server, number: int, port: int, rng: np.random.Generato
     ego_blueprints = [by_name[name] for name in EGO_BLUEPRINTS if name in by_name] or blueprints
     if not ego_blueprints or not free:
         raise MissingDataError(
-            server.where, expected="vehicles and places for them", found="none", advice="try another `town`"
+            server.where, expected="vehicles and spawn points", found="none", advice="try another `town`"
         )
 
     ego = None
@@ -224,12 +224,14 @@ def spawn_actors(server: Server, number: int, port: int, rng: np.random.Generato
         vehicle = _spawn_vehicle(server, blueprints[rng.integers(len(blueprints))], free.pop(), "autopilot", port)
         vehicles += [] if vehicle is None else [vehicle]
     if ego is None:
-        raise MissingDataError(server.where, expected="a free place for the ego vehicle", found="none")
+        raise MissingDataError(
+            server.where, expected="a free spawn point for the ego vehicle", found="none", advice="try another `town`"
+        )
     return SpawnedActors(ego, tuple(vehicles), tuple(_spawn_walkers(server, number, rng)))
 
 
 def _spawn_vehicle(server: Server, blueprint: Any, transform: Any, role: str, port: int) -> Any | None:
-    """Spawn a vehicle on autopilot. Return None where there is no room for it."""
+    """Spawn a vehicle on autopilot. Return None if there is no room for it."""
     if blueprint.has_attribute("role_name"):
         blueprint.set_attribute("role_name", role)
     vehicle = server.spawn(blueprint, transform)
@@ -256,7 +258,7 @@ def _spawn_walkers(server: Server, number: int, rng: np.random.Generator) -> lis
         walkers.append(walker)
         controller = server.spawn(controller_blueprints[0], server.transform(), parent=walker, before_destroy="stop")
         controllers += [] if controller is None else [controller]
-    server.tick()  # a controller can be started only after the world's first tick with it
+    server.tick()  # a controller can be started only after its first tick
     for controller in controllers:
         controller.start()
         destination = server.random_sidewalk_location()

@@ -1,4 +1,4 @@
-"""The sensors on the ego vehicle, and how their measurements become recordings."""
+"""The sensors on the ego vehicle, and the conversion of their measurements to recordings."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _KINDS = {
     "images": ("rgb", "jpg"),
     "image_labels": ("semantic_segmentation", "png"),
     "image_depths": ("depth", "png"),
-}  # CARLA's cameras that stand in each place, and the ending of what they become, by folder
+}  # by folder of images: camera of CARLA and file suffix
 _FARTHEST_M, _DEPTH_STEP = 1000.0, 256.0
 
 RENUMBERED_FROM = (0, 9, 14)
-"""First version of CARLA whose class ids differ from the data set's."""
+"""First version of CARLA whose class ids differ from those of the data set."""
 
 _ROTATIONS_PER_S = round(1 / FRAME_PERIOD_S)  # one rotation per frame
 
 
 class SensorRig:
-    """The semantic LiDARs on the ego vehicle, with the vehicle's orientation, and the camera above it."""
+    """The semantic LiDARs on the ego vehicle, with the orientation of the vehicle, and the camera above it."""
 
     def __init__(
         self,
@@ -51,12 +51,12 @@ class SensorRig:
 
         Args:
             server: the server.
-            ego: CARLA's actor of the ego vehicle.
-            offsets: (S, 3) offsets of the LiDARs in the vehicle's frame, metres.
-            lidar: model of the LiDARs. CARLA's semantic LiDAR has no noise, so it is added here.
+            ego: actor of the ego vehicle in CARLA.
+            offsets: (S, 3) offsets of the LiDARs in the vehicle frame, metres.
+            lidar: model of the LiDARs. The semantic LiDAR of CARLA has no noise, so noise is added.
             bev: whether to spawn the camera above the vehicle.
             seed: seed of the noise.
-            cameras: cameras on the vehicle, without distortion and level; their places are relative to the first LiDAR.
+            cameras: level cameras on the vehicle, without distortion. Their poses are relative to the first LiDAR.
 
         Raises:
             MissingDataError: the server has no such sensor, or no room for it.
@@ -95,17 +95,17 @@ class SensorRig:
         """Collect the measurements of a tick.
 
         Args:
-            tick: the server's number of the tick.
+            tick: number of the tick on the server.
             frame: frame number in the capture.
-            numbers: the actors' numbers in the capture.
+            numbers: numbers of the actors in the capture.
 
         Returns:
-            The recording of each LiDAR, the simulation's time of each in seconds, the picture from above as JPEG bytes, or None, and the
-            images of the cameras on the vehicle as bytes of files, by field.
+            The recording of each LiDAR, its simulation time in seconds, the bird's-eye picture as JPEG bytes or None, and the images of
+            the cameras on the vehicle as bytes of files, by field.
 
         Raises:
             ServerError: a measurement does not arrive.
-            FormatError: a class id is not in the class table, or a measurement is not of CARLA's form.
+            FormatError: a class id is not in the class table, or a measurement does not have the format of CARLA.
         """
         sweeps = [
             decode_sweep(self._server.measurement(arrived, tick, f"LiDAR {number}"))
@@ -126,7 +126,7 @@ class SensorRig:
     def _mount_camera(
         self, ego: Any, camera: CameraModel, ego_lidar: NDArray[np.float64], kind: tuple[str, str]
     ) -> queue.Queue[Any]:
-        """Spawn one of CARLA's cameras where a camera is."""
+        """Spawn a camera of CARLA at the pose of a camera model, and return the queue of its images."""
         place = camera.sensor_T_camera
         x, y, z = (place[:3, 3] + ego_lidar).tolist()
         yaw_deg = math.degrees(math.atan2(place[1, 2], place[0, 2]))
@@ -136,7 +136,7 @@ class SensorRig:
         return self._mount(ego, f"sensor.camera.{kind[0]}", attributes, where)
 
     def _to_file(self, field: str, image: Any) -> NDArray[np.uint8]:
-        """Return an image as the bytes of a file: colours, ids of classes, or depths, which CARLA spreads over three channels."""
+        """Return an image as the bytes of a file: colours, class ids, or depths, which CARLA encodes in three channels."""
         pixels = _rgb(image)
         folder = field.partition(".")[0]
         if folder == "images":
@@ -151,7 +151,7 @@ class SensorRig:
         return encode_image(np.rint(shares * _FARTHEST_M * _DEPTH_STEP).clip(1, 65535).astype(np.uint16), "PNG")
 
     def _mount(self, ego: Any, name: str, attributes: dict[str, Any], transform: Any) -> queue.Queue[Any]:
-        """Spawn a sensor on the ego vehicle. Return the queue of its measurements."""
+        """Spawn a sensor on the ego vehicle, and return the queue of its measurements."""
         found = self._server.blueprints(name)
         if not found:
             raise MissingDataError(
@@ -186,25 +186,25 @@ class SensorRig:
 
 
 class ActorNumbers:
-    """Numbers for the server's actors, in the order in which they were spawned: the same in every run. 0 is no actor."""
+    """Numbers for the actors of the server, in the order of spawning, equal in every run. 0 is no actor."""
 
     def __init__(self, actors: list[int]) -> None:
         """Number actors from 1.
 
         Args:
-            actors: the server's ids of the actors in the order in which they were spawned.
+            actors: ids of the actors on the server, in the order of spawning.
         """
         self._numbers = {0: 0} | {actor: number for number, actor in enumerate(actors, 1)}
 
     def of(self, actors: NDArray[np.integer]) -> NDArray[np.uint32]:
-        """Return the (N,) numbers of actors by their ids, (N,). An actor that is not known yet gets the next number."""
+        """Return (N,) numbers for (N,) ids of actors. A new actor gets the next number."""
         ids, position = np.unique(actors, return_inverse=True)
         numbers = [self._numbers.setdefault(int(actor), len(self._numbers)) for actor in ids]
         return np.array(numbers, np.uint32)[position.reshape(-1)] if len(ids) else np.empty(0, np.uint32)
 
 
 def photo_fields(cameras: Sequence[CameraModel]) -> tuple[str, ...]:
-    """Return the fields of the layout that the images of cameras are."""
+    """Return the fields of the layout for the images of cameras."""
     return tuple(f"{folder}.{camera.name}.{suffix}" for camera in cameras for folder, (_, suffix) in _KINDS.items())
 
 

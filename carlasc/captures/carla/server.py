@@ -1,7 +1,7 @@
 """The connection to a CARLA server. Only this module calls the `carla` package.
 
-When the `with` block of a connection ends, also with an error, all changes on the server are undone: actors are destroyed in the
-reverse order of their creation, and settings are restored.
+At the end of the `with` block of a connection, also after an error, all changes on the server are undone: actors are destroyed in reverse
+order, and settings are restored.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from carlasc.errors import ArgumentError, CarlascError, FormatError, import_extr
 from carlasc.storage.layout import FRAME_PERIOD_S
 
 DETECTION = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("cos", "<f4"), ("actor", "<u4"), ("tag", "<u4")])
-"""One return of CARLA's semantic LiDAR: position, cosine of the angle of incidence, id of the actor, class id."""
+"""One return of the semantic LiDAR of CARLA: position, cosine of the angle of incidence, actor id, class id."""
 
 
 class ServerError(CarlascError):
-    """A CARLA server did not answer, or did not answer as expected."""
+    """A CARLA server did not answer, or gave an unexpected answer."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class SemanticSweep:
     """The measurement of a semantic LiDAR in one tick.
 
     Attributes:
-        detections: (N,) of type `DETECTION`, in the sensor's frame (x forward, y right, z up).
+        detections: (N,) of type `DETECTION`, sensor frame (x forward, y right, z up).
         world_T_sensor: (4, 4) float64 pose.
-        elapsed_s: the simulation's time, seconds.
+        elapsed_s: simulation time, seconds.
     """
 
     detections: NDArray[np.void]
@@ -47,13 +47,13 @@ class SemanticSweep:
 
 @dataclass(frozen=True)
 class ServerOptions:
-    """Where a CARLA server is, and how long it may take.
+    """Address and timeout of a CARLA server.
 
     Attributes:
         host: host of the server.
         port: RPC port of the server.
         traffic_port: port of the traffic manager.
-        timeout_s: longest time that the server may take to answer, seconds.
+        timeout_s: timeout of answers, seconds.
     """
 
     host: str = "127.0.0.1"
@@ -63,22 +63,22 @@ class ServerOptions:
 
 
 class Server:
-    """A connection to a CARLA server, used in a `with` block. At its end the server is as it was before.
+    """A connection to a CARLA server, used in a `with` block. At its end, the previous state of the server is restored.
 
     Attributes:
         carla: module of the client.
-        where: what errors call the server: its host and port.
-        timeout_s: longest time that it may take to answer, seconds.
-        version: its version.
-        initial_actors: ids of the actors of the town before any was spawned, in ascending order.
+        where: name of the server in errors: host and port.
+        timeout_s: timeout of answers, seconds.
+        version: version of the server.
+        initial_actors: sorted ids of the actors of the town before spawning.
     """
 
     def __init__(self, options: ServerOptions, carla: Any = None) -> None:
-        """Connect.
+        """Connect to a server.
 
         Args:
-            options: where the server is.
-            carla: module of the client. None: the package `carla`.
+            options: address and timeout of the server.
+            carla: module of the client; None takes the package `carla`.
 
         Raises:
             DependencyError: the `carla` package is not installed.
@@ -97,10 +97,10 @@ class Server:
 
     @property
     def version_numbers(self) -> tuple[int, ...]:
-        """The server's version as numbers, such as (0, 9, 15).
+        """The version of the server as numbers, such as (0, 9, 15).
 
         Raises:
-            ServerError: the version is not of this form.
+            ServerError: the version does not have this form.
         """
         match = re.match(r"v?(\d+)\.(\d+)(?:\.(\d+))?", self.version)
         if match is None:
@@ -112,7 +112,7 @@ class Server:
 
         Raises:
             ArgumentError: the server has no such town.
-            ServerError: it does not answer.
+            ServerError: the server does not answer.
         """
         with self._waiting_for(f"the town {town}"):
             towns = sorted({str(name).rsplit("/", 1)[-1] for name in self._client.get_available_maps()})
@@ -130,7 +130,7 @@ class Server:
             self.initial_actors = tuple(sorted(int(actor.id) for actor in self._world.get_actors()))
 
     def set_up_traffic(self, port: int, seed: int) -> None:
-        """Put the traffic manager in synchronous mode, and seed it and the pedestrians."""
+        """Set the traffic manager to synchronous mode, and set its seed and the seed of the pedestrians."""
         with self._waiting_for("its traffic manager"):
             manager = self._client.get_trafficmanager(port)
             self._cleanup.callback(self._attempt, lambda: manager.set_synchronous_mode(False))
@@ -147,33 +147,33 @@ class Server:
         return list(self._world.get_map().get_spawn_points())
 
     def random_sidewalk_location(self) -> Any | None:
-        """Return a random location for a pedestrian, or None where the server found none."""
+        """Return a random location for a pedestrian; None if the server found none."""
         return self._world.get_random_location_from_navigation()
 
     def transform(
         self, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0), pitch_deg: float = 0.0, yaw_deg: float = 0.0
     ) -> Any:
-        """Return CARLA's transform of a position in metres, without a roll."""
+        """Return a CARLA transform from a position, metres, pitch and yaw, degrees, without roll."""
         carla = self.carla
         return carla.Transform(carla.Location(*xyz), carla.Rotation(pitch=pitch_deg, yaw=yaw_deg, roll=0.0))
 
     def transform_at(self, location: Any) -> Any:
-        """Return CARLA's transform of a location, without rotation."""
+        """Return a CARLA transform from a location, without rotation."""
         return self.carla.Transform(location)
 
     def spawn(
         self, blueprint: Any, transform: Any, parent: Any = None, before_destroy: str | None = None
     ) -> Any | None:
-        """Spawn an actor, which is destroyed when the block ends.
+        """Spawn an actor. It is destroyed at the end of the block.
 
         Args:
             blueprint: kind of actor.
-            transform: its pose: in the parent's frame, or in the world's where it has no parent.
-            parent: actor that it is attached to.
-            before_destroy: name of the method to call before it is destroyed, such as "stop".
+            transform: pose in the frame of the parent, or in the world frame without a parent.
+            parent: actor to attach it to; None for no parent.
+            before_destroy: name of the method to call before destroying it, such as "stop".
 
         Returns:
-            The actor, or None where there is no room for it.
+            The actor, or None if there is no room for it.
         """
         with self._waiting_for(f"a {blueprint.id}"):
             actor = self._world.try_spawn_actor(blueprint, transform, attach_to=parent)
@@ -182,26 +182,26 @@ class Server:
         return actor
 
     def listen(self, sensor: Any) -> queue.Queue[Any]:
-        """Return the queue that receives a sensor's measurements."""
+        """Return a queue that receives the measurements of a sensor."""
         arrived: queue.Queue[Any] = queue.Queue()
         sensor.listen(arrived.put)
         return arrived
 
     def tick(self) -> int:
-        """Advance the simulation by 0.1 s. Return the server's number of the tick."""
+        """Advance the simulation by 0.1 s, and return the number of the tick on the server."""
         with self._waiting_for("the next tick"):
             return int(self._world.tick(self.timeout_s))
 
     def measurement(self, arrived: queue.Queue[Any], tick: int, sensor: str) -> Any:
-        """Return what a sensor measured in a tick.
+        """Return the measurement of a sensor in a tick.
 
         Args:
-            arrived: queue of the sensor's measurements.
-            tick: the server's number of the tick.
-            sensor: what errors call the sensor.
+            arrived: queue of the measurements of the sensor.
+            tick: number of the tick on the server.
+            sensor: name of the sensor in errors.
 
         Raises:
-            ServerError: the measurement does not arrive in time, or a later one arrives instead.
+            ServerError: the measurement does not arrive in time, or a later one arrives.
         """
         deadline = time.monotonic() + self.timeout_s
         while True:
@@ -212,7 +212,7 @@ class Server:
                     self.where,
                     expected=f"a measurement of {sensor} within {self.timeout_s:g} s",
                     found="none",
-                    advice="raise `timeout_s`, or lower `points`",
+                    advice="increase `timeout_s`, or reduce `points`",
                 ) from None
             if data.frame == tick:
                 return data
@@ -220,8 +220,8 @@ class Server:
                 raise ServerError(
                     self.where,
                     expected=f"tick {tick} of {sensor}",
-                    found=str(data.frame),
-                    advice="check that no other client ticks this server",
+                    found=f"tick {data.frame}",
+                    advice="check that no other client advances this server",
                 )
 
     def velocities(self, actors: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -244,7 +244,7 @@ class Server:
         self._cleanup.close()
         if self._cleanup_errors and error is None:
             raise ServerError(
-                self.where, problem=f"could not be cleaned up: {self._cleanup_errors[0]}", advice="restart it"
+                self.where, problem=f"could not be cleaned up: {self._cleanup_errors[0]}", advice="restart the server"
             )
 
     def _destroy(self, actor: Any, before: str | None) -> None:
@@ -264,15 +264,17 @@ class Server:
         self._attempt(restore)
 
     def _attempt(self, action: Callable[[], object]) -> None:
-        """Do one step of the clean-up. An error is noted, and the other steps follow."""
+        """Run one step of the clean-up. An error is recorded, and the other steps follow."""
         try:
             action()
-        except RuntimeError as error:  # the only error that the client raises: the actor no longer exists, or no answer
+        except (
+            RuntimeError
+        ) as error:  # the client raises no other errors: the actor no longer exists, or the server does not answer
             self._cleanup_errors.append(str(error))
 
     @contextmanager
     def _waiting_for(self, what: str) -> Iterator[None]:
-        """Raise ServerError where the client reports an error in the block."""
+        """Raise ServerError if the client reports an error in the block."""
         try:
             yield
         except RuntimeError as error:
@@ -280,7 +282,7 @@ class Server:
                 self.where,
                 expected=f"{what} within {self.timeout_s:g} s",
                 found=str(error),
-                advice="check that the server runs, and `host`, `port` and `timeout_s`",
+                advice="check that the server is running, and check `host`, `port` and `timeout_s`",
             ) from error
 
 
@@ -288,7 +290,7 @@ def decode_sweep(measurement: Any) -> SemanticSweep:
     """Read a `carla.SemanticLidarMeasurement`.
 
     Raises:
-        FormatError: its number of bytes is not a multiple of a detection's.
+        FormatError: its size is not a multiple of the size of a detection.
     """
     data = bytes(measurement.raw_data)
     if len(data) % DETECTION.itemsize:

@@ -30,7 +30,7 @@ from carlasc.errors import check_choice
 from carlasc.storage.layout import FRAME_PERIOD_S
 
 _OFFSETS_M = (1.1, 1.75, 2.3)
-"""Distance from the kerb of those who walk along the loop, of those who walk against it, and of those who stand."""
+"""Distance from the kerb of pedestrians who walk along the loop, against it, and who stand."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Walk:
     Attributes:
         loop: (P, 2) closed path, metres. The first point is repeated at the end.
         start_m: distance along the loop at time 0.
-        speed_mps: speed along the loop. It is negative for those who walk against it, and 0 for those who stand.
+        speed_mps: speed along the loop; negative against it, 0 for a standing pedestrian.
         heading_rad: heading of a pedestrian who stands.
     """
 
@@ -50,7 +50,7 @@ class Walk:
     heading_rad: float = 0.0
 
     def pose(self, elapsed_s: float, height_m: float) -> Transform:
-        """Return (4, 4) world_T_pedestrian at a time. The feet are at a height."""
+        """Return (4, 4) world_T_pedestrian at a time. The feet are at `height_m`."""
         stations = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.loop, axis=0), axis=1))])
         along = (self.start_m + self.speed_mps * elapsed_s) % stations[-1]
         point = [np.interp(along, stations, self.loop[:, axis]) for axis in (0, 1)]
@@ -63,7 +63,7 @@ class Walk:
 
 
 def draw_walks(rng: np.random.Generator, blocks: tuple[CityBlock, ...], count: int) -> list[Walk]:
-    """Draw pedestrians: a third walk around a block in each direction, and a third stand.
+    """Draw random pedestrians: a third walk around a block in each direction, and a third stand.
 
     Pedestrians of one block and direction have the same speed and distance from the kerb, so they do not meet.
     """
@@ -116,11 +116,11 @@ class Population:
     """All actors of a town, in any frame."""
 
     def __init__(self, rng: np.random.Generator, town: Town, traffic: TrafficLevel) -> None:
-        """Draw the actors.
+        """Draw random actors.
 
         Args:
             rng: source of the random numbers.
-            town: the town they are in.
+            town: the town.
             traffic: "light", "medium" or "heavy".
 
         Raises:
@@ -152,7 +152,7 @@ class Population:
         actors = []
         for index, mesh in enumerate(self._shapes):
             pose = self._traffic.pose(index, float(along[index]), self._wheelbases[index])
-            step_m = 0.01  # the velocity of the vehicle's middle is a finite difference along its route
+            step_m = 0.01  # the velocity of the centre of the vehicle is a finite difference along its route
             ahead = self._traffic.pose(index, float(along[index]) + step_m, self._wheelbases[index])
             velocity = (ahead[:3, 3] - pose[:3, 3]) / step_m * speed[index]
             actors.append(TownActor(EGO_ID + index, pose, velocity, mesh))
@@ -169,7 +169,7 @@ class Population:
 
 
 def _draw_vehicles(rng: np.random.Generator, count: int) -> tuple[list[Mesh], list[float]]:
-    """Draw the moving vehicles. Return their meshes and lengths, the ego vehicle first."""
+    """Draw random moving vehicles, and return their meshes and lengths, the ego vehicle first."""
     shapes, lengths = [vehicle_mesh(EGO_KIND)], [EGO_KIND.length_m]
     for _ in range(count):
         kind = _draw_kind(rng, VEHICLE_KINDS)
@@ -188,7 +188,7 @@ def _draw_kind(rng: np.random.Generator, kinds: tuple[VehicleKind, ...]) -> Vehi
 
 
 def _draw_ego_start(rng: np.random.Generator, town: Town) -> tuple[int, float]:
-    """Draw where the ego vehicle starts: the index of a lane near the middle of the town, and the distance along it, metres."""
+    """Draw a random start of the ego vehicle: index of a lane near the centre of the town, and distance along it, metres."""
     lanes = [(i, lane) for i, lane in enumerate(town.streets.lanes) if not lane.turn]
     lanes.sort(key=lambda item: float(np.linalg.norm(item[1].point(item[1].length_m / 2))))
     index, lane = lanes[int(rng.integers(8))]

@@ -1,7 +1,7 @@
-"""A drive through the town: where everything is in any frame, and what any LiDAR scans.
+"""A drive through the town: the state of the town in any frame, and the scans of any LiDAR.
 
-All randomness comes from the seed. A recording depends on the seed, the frame and the sensor only, so any frame can be made
-alone, in any process, with the same bytes.
+All randomness comes from the seed. A recording depends only on the seed, the frame and the sensor, so any frame can be made separately, in
+any process, with the same bytes.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from carlasc.captures.town.town import Town, build_town
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points, translation
 from carlasc.core.scans import Scan
 
-REFERENCE_OFFSET_M = 25.6  # greatest offset of a reference sensor in x and y: half the width of the published grid
-SENSOR_MARGIN_M = 37.0  # greatest distance of a sensor from the ego vehicle
+REFERENCE_OFFSET_M = 25.6  # maximum offset of a reference sensor in x and y: half the width of the published grid
+SENSOR_MARGIN_M = 37.0  # maximum distance of a sensor from the ego vehicle
 LONGEST_HALF_M = 6.0  # half the length of the longest vehicle, rounded up
 
 # Streams of random numbers: the second word of the seed.
@@ -36,9 +36,9 @@ class Snapshot:
         frame: frame number.
         world_T_ego: (4, 4) pose of the ego vehicle.
         actors: all actors of the town by id.
-        mesh: everything within the reach of the sensors, actors included, world frame.
+        mesh: everything within the range of the sensors, including actors, world frame.
         instances: (F,) uint32 id of the actor of each triangle, 0 for none.
-        scene: the same mesh, for rays.
+        scene: the same mesh, for ray casting.
     """
 
     frame: int
@@ -53,7 +53,7 @@ class TownDrive:
     """A simulated drive: a town with traffic, and an ego vehicle with LiDARs that drives through it.
 
     Attributes:
-        seed: seed of the town, its traffic, the sensors' offsets and the noise.
+        seed: seed of the town, its traffic, the offsets of the sensors, and the noise.
         traffic: "light", "medium" or "heavy".
         lidar: model of the LiDARs.
         town: the town.
@@ -65,7 +65,7 @@ class TownDrive:
         Args:
             seed: 0 or more.
             traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many pedestrians.
-            lidar: model of the LiDARs. None: the data set's.
+            lidar: model of the LiDARs; None takes the model of the data set.
 
         Raises:
             ArgumentError: the seed is negative, or the level of traffic is unknown.
@@ -79,7 +79,7 @@ class TownDrive:
         self._snapshot: Snapshot | None = None
 
     def ego_pose(self, frame: int) -> Transform:
-        """Return (4, 4) world_T_ego. The origin of the ego vehicle's frame is below its middle, on the ground.
+        """Return (4, 4) world_T_ego. The origin of the ego frame is on the ground below the centre of the vehicle.
 
         Raises:
             ArgumentError: the frame is negative.
@@ -97,7 +97,7 @@ class TownDrive:
         return self._population.at(frame)
 
     def sensor_offsets(self, sensors: int) -> NDArray[np.float64]:
-        """Return the (S, 3) offsets of the sensors in the vehicle's frame, metres, the ego sensor first.
+        """Return the (S, 3) offsets of the sensors in the vehicle frame, metres, the ego sensor first.
 
         A drive with more sensors has the same offsets for the first ones.
 
@@ -117,9 +117,9 @@ class TownDrive:
         return np.stack([ego @ translation(offset) for offset in self.sensor_offsets(sensors)])
 
     def record(self, frame: int, sensor: int = 0) -> SensorRecording:
-        """Return what a sensor of the vehicle records in a frame. Sensor 0 is the ego sensor.
+        """Return the recording of a sensor of the vehicle in a frame. Sensor 0 is the ego sensor.
 
-        Points are in the sensor's frame. Velocities are over ground (without ego motion), on the axes of the sensor's frame.
+        Points are in the sensor frame. Velocities are over ground (without ego motion), on the axes of the sensor frame.
 
         Raises:
             ArgumentError: the frame or the sensor is negative.
@@ -129,7 +129,7 @@ class TownDrive:
         return scan_snapshot(self.snapshot(frame), pose, self.lidar, self._random(_NOISE, frame, sensor))
 
     def scan(self, frame: int, sensor: int = 0) -> Scan:
-        """Return a sensor's scan with the labels, flow and instances of its points.
+        """Return the scan of a sensor with labels, flow and instances.
 
         Raises:
             ArgumentError: the frame or the sensor is negative.
@@ -138,10 +138,10 @@ class TownDrive:
         return replace(recording.scan, flow=recording.flow())
 
     def reference_observations(self, frame: int, sensors: int = 60, seed: int = 0) -> list[SensorRecording]:
-        """Return what additional sensors record at the instant of a frame: a reference for judging ground truth.
+        """Return recordings of additional sensors at the time of a frame, as a reference for ground truth.
 
-        These sensors are in free space anywhere within the area of the published grid, 1 to 5 m high; one in ten is near the ground
-        and one in ten is high above it. None of them is a sensor of the vehicle.
+        These sensors are at random positions in free space within the area of the published grid, 1 to 5 m high; one in ten is near the
+        ground and one in ten is high above it. They are not sensors of the vehicle.
 
         Args:
             frame: frame number.
@@ -165,7 +165,7 @@ class TownDrive:
         return recordings
 
     def is_free(self, frame: int, point: NDArray[np.float64]) -> bool:
-        """Whether a point (3,) of the world is outside all buildings and actors, and not close to one."""
+        """Whether a point (3,) of the world is outside all buildings and actors, with a margin."""
         for footprint, height in self.town.buildings:
             if point[2] < height + 4.0 and footprint.contains(point[:2], 0.8):  # the roof is within these 4 m
                 return False
@@ -177,7 +177,7 @@ class TownDrive:
         return True
 
     def snapshot(self, frame: int) -> Snapshot:
-        """Return the town around the ego vehicle in a frame. The last snapshot is kept.
+        """Return the town around the ego vehicle in a frame. The last snapshot is cached.
 
         Raises:
             ArgumentError: the frame is negative.
@@ -207,7 +207,7 @@ class TownDrive:
 
     @cached_property
     def _extents(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lowest and highest x and y of each triangle of the static town: (F, 2) each."""
+        """Minimum and maximum x and y of each triangle of the static town, (F, 2) each."""
         corners = self.town.mesh.triangles[..., :2]
         return corners.min(axis=1), corners.max(axis=1)
 
@@ -218,10 +218,10 @@ class TownDrive:
 def scan_snapshot(
     snapshot: Snapshot, world_T_sensor: Transform, lidar: Lidar, rng: np.random.Generator
 ) -> SensorRecording:
-    """Return what a LiDAR at a pose records of a snapshot.
+    """Return the recording of a LiDAR at a pose in a snapshot.
 
-    Points on the ego vehicle and unlabelled points are not recorded. Noise is drawn for every ray, so that it does not depend on
-    which rays hit something.
+    Points on the ego vehicle and unlabelled points are not recorded. Noise is drawn for every ray, so that it does not depend on which rays
+    hit a surface.
 
     Args:
         snapshot: the town at one instant.
@@ -241,7 +241,7 @@ def scan_snapshot(
 
 
 def _velocities(snapshot: Snapshot, world_T_sensor: Transform, instances: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Return (K, 4): id and velocity over ground, sensor frame, of every actor that was hit."""
+    """Return (K, 4) id and velocity over ground, m/s, sensor frame, of every actor that was hit."""
     hit = np.unique(instances[instances != 0])
     velocities = np.array([snapshot.actors[int(id)].velocity for id in hit]).reshape(-1, 3)
     return np.column_stack([hit.astype(np.float64), rotate_vectors(invert(world_T_sensor), velocities)])

@@ -1,6 +1,6 @@
-"""What stands beside streets: furniture, along the streets and at crossings, and buildings, with balconies and what else is on them.
+"""Street furniture, along streets and at crossings, and buildings with details such as balconies.
 
-Each piece is made in its own frame: origin on the ground, x along the street, y away from the street.
+Each object is made in its own frame: origin on the ground, x along the street, y away from the street.
 """
 
 from __future__ import annotations
@@ -266,11 +266,11 @@ def add_building(plan: TownPlan, footprint: Rectangle, height_m: float, pitched:
     """Add a building to the plan of a town.
 
     Args:
-        plan: the town's plan.
-        footprint: the building's ground plan.
-        height_m: height of its walls.
-        pitched: whether its roof is pitched; it is flat otherwise.
-        base_m: z of its ground floor.
+        plan: the plan of the town.
+        footprint: ground plan of the building.
+        height_m: height of the walls, metres.
+        pitched: whether the roof is pitched; otherwise it is flat.
+        base_m: z of the ground floor, metres.
     """
     mesh, pose = make_building(plan.rng, footprint, height_m, pitched)
     plan.builder.add_mesh(mesh, translation((0, 0, base_m)) @ pose)
@@ -284,12 +284,12 @@ def make_building(
 
     Args:
         rng: source of the random numbers.
-        footprint: its ground plan.
-        height_m: height of its walls.
-        pitched: whether its roof is pitched; it is flat otherwise.
+        footprint: ground plan of the building.
+        height_m: height of the walls, metres.
+        pitched: whether the roof is pitched; otherwise it is flat.
 
     Returns:
-        The mesh in the building's frame (x along the street, y away from the street), and world_T_building.
+        The mesh in the frame of the building (x along the street, y away from the street), and (4, 4) world_T_building.
     """
     width, depth = footprint.size
     storey = float(rng.uniform(2.9, 3.5))

@@ -1,4 +1,4 @@
-"""Triangle meshes with a class per triangle, the simple solids that the town consists of, and rays that are cast at meshes."""
+"""Triangle meshes with a class per triangle, simple solids to build the town from, and ray casting."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Mesh:
         return Mesh(transform_points(dst_T_src, self.vertices), self.faces, self.labels)
 
     def select(self, keep: NDArray[np.bool_]) -> Mesh:
-        """Return the mesh of the triangles that a mask (F,) selects, without the vertices that none of them uses."""
+        """Return the mesh of the triangles selected by a mask (F,), without unused vertices."""
         faces = self.faces[keep]
         used = np.zeros(len(self.vertices), np.bool_)
         used[faces] = True
@@ -58,7 +58,7 @@ class MeshBuilder:
         self._count = 0
 
     def build(self) -> Mesh:
-        """Return the mesh of everything that was added."""
+        """Return the mesh of all added parts."""
         if not self._faces:
             return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.uint8))
         return Mesh(np.concatenate(self._vertices), np.concatenate(self._faces), np.concatenate(self._labels))
@@ -78,7 +78,7 @@ class MeshBuilder:
         self._count += len(corners)
 
     def add_mesh(self, mesh: Mesh, dst_T_src: Transform) -> None:
-        """Add a mesh with the classes that it has, moved from its frame `src` to the builder's frame `dst`."""
+        """Add a mesh with its classes, transformed from its frame `src` to the frame `dst` of the builder."""
         self._vertices.append(transform_points(dst_T_src, mesh.vertices))
         self._faces.append(mesh.faces + np.int32(self._count))
         self._labels.append(mesh.labels)
@@ -90,7 +90,7 @@ class MeshBuilder:
         Args:
             label: class id.
             base: (3,) or (N, 3) centres of the lower faces, metres.
-            size: (3,) or (N, 3) lengths along each box's own x, y and z, metres.
+            size: (3,) or (N, 3) lengths along x, y and z of each box, metres.
             yaw_rad: () or (N,) rotations about z.
         """
         base, size = np.atleast_2d(np.asarray(base, np.float64)), np.atleast_2d(np.asarray(size, np.float64))
@@ -107,7 +107,7 @@ class MeshBuilder:
         Args:
             label: class id.
             centre: (3,) or (N, 3) metres.
-            size: (2,) or (N, 2) lengths along each rectangle's own x and y, metres.
+            size: (2,) or (N, 2) lengths along x and y of each rectangle, metres.
             yaw_rad: rotation about z.
         """
         centre, size = np.atleast_2d(np.asarray(centre, np.float64)), np.atleast_2d(np.asarray(size, np.float64))
@@ -242,7 +242,7 @@ def _unit_cylinder(sections: int) -> tuple[Vertices, NDArray[np.int64]]:
     return np.asarray(cylinder.vertices) + (0, 0, 0.5), np.asarray(cylinder.faces)
 
 
-_EDGE_ON = 1e-4  # sine of the angle between a ray and a triangle below which the triangle counts as seen edge-on
+_EDGE_ON = 1e-4  # below this sine of the angle between ray and triangle, the triangle counts as edge-on
 
 
 def rotate_exactly(dst_T_src: Transform, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -255,7 +255,7 @@ def rotate_exactly(dst_T_src: Transform, vectors: NDArray[np.float64]) -> NDArra
 
 
 class RayScene:
-    """A mesh that rays can be cast at. Coordinates are in the mesh's frame."""
+    """A mesh for ray casting. Coordinates are in the frame of the mesh."""
 
     def __init__(self, mesh: Mesh, centre: NDArray[np.float64]) -> None:
         """Build the search tree.
@@ -286,7 +286,7 @@ class RayScene:
         Args:
             origin: (3,) metres.
             directions: (R, 3) unit vectors.
-            range_m: greatest distance of a hit.
+            range_m: maximum distance of a hit, metres.
 
         Returns:
             rays: (H,) indices of the rays that hit a triangle.
@@ -305,10 +305,10 @@ class RayScene:
         with np.errstate(divide="ignore", invalid="ignore"):
             slope = x * directions[rays, 0] + y * directions[rays, 1] + z * directions[rays, 2]
             distances = height / slope
-        # The distance to a triangle that is seen edge-on is not defined.
+        # The distance to an edge-on triangle is not defined.
         valid = (np.abs(slope) > _EDGE_ON) & (distances > 0) & (distances <= range_m)
         return rays[valid], triangles[valid], distances[valid]
 
     def normals(self, triangles: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Return (H, 3) unit normals of triangles. They may point to either side."""
+        """Return (H, 3) unit normals of triangles, which may point to either side."""
         return self._normals[triangles]

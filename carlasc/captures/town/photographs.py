@@ -1,4 +1,4 @@
-"""What cameras on the roof of the ego vehicle see of the town: colour, class, depth and instance of every pixel, at one instant."""
+"""Images of cameras on the roof of the ego vehicle: colour, class, depth and instance of every pixel, at one time."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ CAMERA_YAWS_DEG = MappingProxyType(
         "back": 180,
     }
 )
-"""The cameras that the town's ego vehicle may have, and where they look: degrees from x towards y, which is to the right."""
+"""The available cameras of the ego vehicle, and their viewing directions: degrees from x towards y (to the right)."""
 
 IMAGE_SIZE = (800, 450)
-"""Columns and rows of the images."""
+"""Numbers of columns and rows of the images."""
 
 _FIELD_DEG, _AHEAD_M, _BELOW_M = (
     70.0,
     0.4,
     0.15,
-)  # width of an image; place of a camera from the ego sensor, where it looks
+)  # horizontal field of view; position of a camera relative to the ego sensor: ahead in its viewing direction, and below
 _RANGE_M, _DEPTH_STEP = 255.0, 256.0
 _SKY, _SKY_LABEL = (196, 216, 235), 13
 _SUN = np.array([0.35, -0.45, 0.82])
@@ -49,7 +49,7 @@ PHOTO_SUFFIXES = MappingProxyType(
 
 
 def town_cameras(names: Sequence[str]) -> tuple[CameraModel, ...]:
-    """Return the cameras of some names.
+    """Return the cameras with some names.
 
     Raises:
         ArgumentError: a name is unknown, or occurs twice.
@@ -72,7 +72,7 @@ def _camera(name: str) -> CameraModel:
 
 
 def photo_fields(cameras: Iterable[CameraModel]) -> tuple[str, ...]:
-    """Return the fields of the layout that photographs of cameras are."""
+    """Return the fields of the layout for the images of cameras."""
     return tuple(f"{folder}.{camera.name}.{suffix}" for camera in cameras for folder, suffix in PHOTO_SUFFIXES.items())
 
 
@@ -83,7 +83,7 @@ def photograph(
 
     Args:
         snapshot: the town at one instant.
-        cameras: the cameras, whose places are relative to the ego sensor.
+        cameras: the cameras, with poses relative to the ego sensor.
         world_T_sensor: (4, 4) pose of the ego sensor.
 
     Raises:

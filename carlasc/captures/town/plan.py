@@ -1,6 +1,6 @@
-"""The plan of a town while it is built: its mesh, its buildings and its parking spaces so far, its plants, and which land is occupied.
+"""The plan of a town while it is built: mesh, buildings, parking spaces, plants and occupied land.
 
-Leaves of plants are separate triangles, so some rays of a LiDAR enter a crown and some pass through it.
+Leaves of plants are separate triangles, so that some rays of a LiDAR enter a crown and some pass through it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ VEGETATION = CARLA.id_of("Vegetation")
 
 
 class PlantCatalogue:
-    """The plants of a town: a few of each kind, which are used many times with other rotations and scales."""
+    """The plants of a town: a few of each kind, used many times with different rotations and scales."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -150,8 +150,8 @@ class Rectangle:
 
     Attributes:
         centre: (2,) metres.
-        size: (2,) lengths along its own x and y, metres.
-        yaw_rad: rotation, x towards y.
+        size: (2,) lengths along x and y of the rectangle, metres.
+        yaw_rad: rotation, x towards y, radians.
     """
 
     centre: Points
@@ -160,16 +160,16 @@ class Rectangle:
 
     @cached_property
     def axes(self) -> Points:
-        """(2, 2) unit vectors of its own x and y, one per row."""
+        """(2, 2) unit vectors of x and y of the rectangle, one per row."""
         cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[cos, sin], [-sin, cos]])
 
     def local(self, points: Points) -> Points:
-        """Return points (..., 2) on its own axes, relative to its centre."""
+        """Return points (..., 2) in the frame of the rectangle, relative to its centre."""
         return (points - self.centre) @ self.axes.T
 
     def contains(self, points: Points, margin_m: float = 0.0) -> NDArray[np.bool_]:
-        """Return which points (..., 2) are inside it, or outside by no more than a margin."""
+        """Return (...) bool: whether points (..., 2) are inside the rectangle, enlarged by a margin."""
         inside: NDArray[np.bool_] = np.abs(self.local(points)) <= np.array(self.size) / 2 + margin_m
         return np.asarray(inside.all(axis=-1))
 
@@ -184,7 +184,7 @@ class Rectangle:
         return float(self.centre[0]), float(self.centre[1]), float(np.hypot(*self.size)) / 2
 
     def overlaps(self, other: Rectangle, margin_m: float = 0.0) -> bool:
-        """Whether two rectangles are closer to each other than a margin: no axis of either separates them."""
+        """Whether two rectangles are closer than a margin: no axis of either separates them."""
         (x, y, radius), (other_x, other_y, other_radius) = self._circle, other._circle
         if math.hypot(x - other_x, y - other_y) > radius + other_radius + margin_m:
             return False
@@ -196,11 +196,11 @@ class Rectangle:
 
 @dataclass
 class Land:
-    """The land of a block, and which parts of it are occupied.
+    """The land of a block and its occupied parts.
 
     Attributes:
         boundary: (K, 2) loop around it, metres. The inside is on the right.
-        occupied: footprints of what has been built.
+        occupied: footprints of the existing objects.
     """
 
     boundary: Points
@@ -226,8 +226,8 @@ class Land:
 
         Args:
             rectangle: the footprint.
-            margin_m: smallest distance to other footprints.
-            edge_m: smallest distance to the boundary.
+            margin_m: minimum distance to other footprints.
+            edge_m: minimum distance to the boundary.
 
         Returns:
             Whether the rectangle was free.
@@ -240,17 +240,17 @@ class Land:
 
 KERB_M = 0.15  # height of the sidewalks above the road
 PAINT_M = 0.01  # height of road markings above the road
-INNER_M = HALF_ROAD_M + SIDEWALK_M  # from a street's centre line to the land behind the sidewalk
+INNER_M = HALF_ROAD_M + SIDEWALK_M  # distance from the centre line of a street to the land behind the sidewalk
 
 
 @dataclass
 class TownPlan:
-    """A town while it is built: each step adds to it.
+    """A town while it is built. Each step adds to it.
 
     Attributes:
         rng: source of all random numbers.
         plants: the plants to choose from.
-        builder: the town's mesh so far.
+        builder: the mesh of the town so far.
         buildings: footprints of the buildings with the heights of their roofs, metres.
         parking: parking spaces: world_T_vehicle of a vehicle parked in each.
     """
@@ -267,7 +267,7 @@ class TownPlan:
         Args:
             mesh: the object in its own frame.
             position: (2,) x and y of its origin, metres.
-            yaw_rad: its heading.
-            height_m: z of its origin.
+            yaw_rad: heading, radians.
+            height_m: z of its origin, metres.
         """
         self.builder.add_mesh(mesh, translation((*position, height_m)) @ rotation_z(yaw_rad))

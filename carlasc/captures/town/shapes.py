@@ -15,7 +15,7 @@ from carlasc.core.tables import CARLA
 
 VEHICLE = CARLA.id_of("Vehicle")
 PEDESTRIAN = CARLA.id_of("Pedestrian")
-GAIT_PHASES = 8  # number of poses in the cycle of two steps
+GAIT_PHASES = 8  # number of poses in a cycle of two steps
 
 
 @dataclass(frozen=True)
@@ -24,13 +24,13 @@ class VehicleKind:
 
     Attributes:
         name: name of the kind.
-        length_m: from bumper to bumper.
-        width_m: without mirrors.
-        body: (x, z) corners of the body's side view, convex; x from 0 (rear) to 1 (front), z in metres.
-        cabin: the same for the cabin or box on the body, which is narrower at its top.
+        length_m: length from bumper to bumper, metres.
+        width_m: width without mirrors, metres.
+        body: (x, z) corners of the convex side view of the body; x from 0 (rear) to 1 (front), z in metres.
+        cabin: (x, z) corners of the side view of the cabin or box on the body, which is narrower at its top.
         wheels: (x, radius) of the wheels of each axle; x from 0 to 1, radius in metres.
-        share: frequency relative to the other kinds.
-        cabin_taper: how much narrower the cabin is at its top than at its base, metres per side.
+        share: frequency relative to other kinds.
+        cabin_taper: difference of the half widths of the cabin at its base and at its top, metres.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A drive through the simulated town, as a capture whose recordings and pictures are computed when they are read, and written by `simulate`.
+"""A drive through the simulated town: a capture that is computed on reading, and `simulate`, which writes it.
 
 See the format page, `docs/format.md#raw-capture`.
 """
@@ -39,11 +39,11 @@ from carlasc.storage.transport.targets import check_shared
 
 _SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
 _BACKGROUND = (255, 255, 255)
-_REDUCTION = 2  # rays are cast for every second row and column of pixels, and the picture is enlarged
+_REDUCTION = 2  # rays are cast for every second row and column of pixels; the picture is enlarged afterwards
 
 
 def render_birdseye(snapshot: Snapshot) -> bytes:
-    """Return the picture as JPEG bytes: 1920 x 1080 pixels, 90 degrees wide. Its upper edge is ahead of the vehicle.
+    """Return the bird's-eye picture as JPEG bytes: 1920 x 1080 pixels, 90 degrees wide, with its upper edge ahead of the vehicle.
 
     Raises:
         DependencyError: a package of the extra `simulate` is missing.
@@ -66,7 +66,7 @@ def _render(
 
     Args:
         snapshot: the town.
-        world_T_view: (4, 4) frame of `origin` and `directions`.
+        world_T_view: (4, 4) from the frame of `origin` and `directions` to the world frame.
         origin: (3,) start of the rays, metres.
         directions: (H, W, 3) unit vectors, one per pixel.
 
@@ -95,12 +95,12 @@ def _downward_rays() -> NDArray[np.float64]:
 
 
 class SimulatedCapture(Capture):
-    """A drive through the simulated town, for `carlasc.regrid`: ground truth without a capture on disk.
+    """A drive through the simulated town, to make ground truth with `carlasc.regrid` without a capture on disk.
 
-    What it returns is equal to what `carlasc.simulate` writes with the same settings. It can be pickled.
+    Its data are equal to the output of `carlasc.simulate` with the same settings. It can be pickled.
 
     Attributes:
-        location: what to call it in errors.
+        location: name of the capture in errors.
         classes: class table of the labels.
     """
 
@@ -116,7 +116,7 @@ class SimulatedCapture(Capture):
         bev: bool = True,
         cameras: Sequence[str] = (),
     ) -> None:
-        """Take the settings of a simulation; the arguments are those of `carlasc.simulate`.
+        """Keep the settings of a simulation. The arguments are those of `carlasc.simulate`.
 
         Raises:
             ArgumentError: an argument is out of its range.
@@ -131,7 +131,7 @@ class SimulatedCapture(Capture):
 
     @cached_property
     def sensors(self) -> tuple[int, ...]:
-        """The sensors' numbers."""
+        """The numbers of the sensors."""
         return tuple(range(self._count))
 
     @cached_property
@@ -140,7 +140,7 @@ class SimulatedCapture(Capture):
         return np.array(self._frames, np.int64)
 
     def read(self, sensor: int, frame: int) -> SensorRecording:
-        """Simulate what a sensor records in a frame."""
+        """Simulate the recording of a sensor in a frame."""
         self._check(frame)
         return self._drive.record(frame, sensor)
 
@@ -159,11 +159,11 @@ class SimulatedCapture(Capture):
         return np.stack([self.read_pose(sensor, frame) for frame in frames])
 
     def read_times(self, sensor: int = 0) -> Mapping[int, float]:
-        """Return the simulation's time in seconds per frame number."""
+        """Return the simulation time by frame number, seconds."""
         return {frame: frame * FRAME_PERIOD_S for frame in self._frames}
 
     def read_bev(self, frame: int) -> bytes | None:
-        """Draw a frame's bird's-eye picture: JPEG bytes; None if the simulation has none."""
+        """Return the bird's-eye picture of a frame as JPEG bytes; None without `bev`."""
         self._check(frame)
         return render_birdseye(self._drive.snapshot(frame)) if self._bev else None
 
@@ -172,17 +172,17 @@ class SimulatedCapture(Capture):
         return self._bev and frame in self._frames
 
     def image_fields(self, frame: int) -> tuple[str, ...]:
-        """Return the names in the layout of the images that a frame has."""
+        """Return the layout names of the images of a frame."""
         return photo_fields(self.cameras.values())
 
     def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
-        """Return the bytes of the files of a frame's images, by their names in the layout."""
+        """Return the image files of a frame as bytes, by their layout names."""
         if not self.cameras:
             return {}
         return photograph(self._drive.snapshot(frame), tuple(self.cameras.values()), self.read_pose(0, frame))
 
     def light(self) -> Capture:
-        """Return the capture: it holds settings only."""
+        """Return the capture itself, which has only settings."""
         return self
 
     @property
@@ -197,27 +197,27 @@ class SimulatedCapture(Capture):
 
 @lru_cache(maxsize=1)
 def _cached_drive(seed: int, traffic: TrafficLevel, lidar: Lidar) -> TownDrive:
-    """Return the drive of this process: the town is built once."""
+    """Return the drive of this process. The town is built once."""
     return TownDrive(seed, traffic, lidar)
 
 
 SETTINGS_FILE = "simulation.json"
 
 TOWN_VERSION = 1
-"""Goes up whenever the same seed makes another town: frames of both must not be mixed in one capture."""
+"""Version of the simulation. It increases when the same seed gives another town, because their frames must not be mixed in one capture."""
 
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """What a simulation wrote.
+    """Result of `simulate`.
 
     Attributes:
         out: folder of the sequence, which holds raw/, or its URL.
         count: number of the requested frames that exist now.
-        written: number of frames that this run wrote; the others existed.
+        written: number of frames that this run wrote; other frames existed.
         sensors: number of sensors.
         points: number of points that this run wrote.
-        classes: number of these points per class name.
+        classes: number of these points by class name.
     """
 
     out: str
@@ -255,24 +255,23 @@ def simulate(
 ) -> SimulationResult:
     """Record a drive through a simulated town as a raw capture. The same arguments write the same bytes.
 
-    A second run with the same settings writes the frames that are missing, so it continues an interrupted run or adds frames.
+    A second run with the same settings writes the missing frames. It continues an interrupted run, or adds frames.
 
     Args:
         out: folder of the sequence, or its URL in an object store. Files go to `<out>/raw`.
         count: number of frames, 0.1 s apart.
-        first_frame: number of the first frame. The drive starts with frame 0, at rest.
+        first_frame: number of the first frame. The drive starts at rest in frame 0.
         sensors: number of LiDARs. The first is the ego sensor.
         seed: seed of the town, its traffic, the sensors' offsets and the noise.
         traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many pedestrians.
         lidar: model of the LiDARs. None: the data set's.
         bev: whether to write bird's-eye pictures.
-        cameras: names of the cameras on the roof of the vehicle, of "front", "front_left", "front_right", "left", "right", "back_left",
+        cameras: names of the cameras on the roof of the vehicle, from "front", "front_left", "front_right", "left", "right", "back_left",
             "back_right" and "back". Each has images of colour, class, instance and depth; see the format page, `docs/format.md#cameras`.
-        run: how the work is spread, whether this is only a part of it, and who is told of its progress. The part that finds that no frame
-            is missing any more writes the times.
+        run: how the work is distributed, the part of it, and the progress callback. The last part to finish writes the times.
 
     Returns:
-        What was written.
+        Numbers of the written frames, sensors and points.
 
     Raises:
         ArgumentError: an argument is out of its range.
@@ -305,10 +304,10 @@ def simulate(
     with TimesLog(writer) as log:
 
         def note(frame: int) -> None:
-            if run.part.count == 1:  # several parts that wrote one file would overwrite each other's lines
+            if run.part.count == 1:  # several parts would overwrite the lines of each other
                 log.add(frame, [frame * FRAME_PERIOD_S] * sensors)
 
-        for frame in sorted(complete - writer.timed_frames(sensors)):  # a run was killed before it wrote their times
+        for frame in sorted(complete - writer.timed_frames(sensors)):  # frames whose times a killed run did not write
             note(frame)
         for frame, points_of_frame in zip(missing, recorded, strict=True):
             points.update(points_of_frame)
@@ -325,7 +324,7 @@ def simulate(
 
 
 def check_dependencies(bev: bool = True) -> None:
-    """Check that the packages exist that a simulation needs.
+    """Check that the packages for a simulation are installed.
 
     Args:
         bev: whether bird's-eye pictures are drawn.
@@ -339,7 +338,7 @@ def check_dependencies(bev: bool = True) -> None:
 
 
 def _record_frame(writer: CaptureWriter, drive: SimulatedCapture, frame: int) -> dict[str, int]:
-    """Write the recordings of all sensors and the picture of a frame. Return the number of points per class name."""
+    """Write the recordings of all sensors and the picture of a frame, and return the number of points by class name."""
     points = np.zeros(CARLA.num_channels, np.int64)
     for sensor in drive.sensors:
         recording = drive.read(sensor, frame)

@@ -17,8 +17,8 @@ Points = NDArray[np.float64]
 LANE_WIDTH_M = 3.5
 HALF_ROAD_M = LANE_WIDTH_M  # a road has two lanes, one per direction
 SIDEWALK_M = 2.6
-CORNER_RADIUS_M = 6.0  # of the kerb at a crossing
-STOP_BACK_M = 4.5  # from the end of the kerb's corner to the stop line; the crosswalk is between them
+CORNER_RADIUS_M = 6.0  # radius of the kerb at a crossing
+STOP_BACK_M = 4.5  # distance from the end of the corner of the kerb to the stop line; the crosswalk is between them
 BAY_M = 2.2  # depth of a parking bay
 PATH_STEP_M = 0.5
 
@@ -36,7 +36,7 @@ class Outline:
     normal: Points
 
     def at(self, offset_m: float) -> Points:
-        """Return the (K, 2) loop at an offset from the centre lines. Larger offsets than the corners' radius are not valid."""
+        """Return the (K, 2) loop at an offset from the centre lines. The offset must not exceed the radius of the corners."""
         return self.anchor + offset_m * self.normal
 
 
@@ -45,7 +45,7 @@ class Side:
     """The side of a block along one street, with the block on the right.
 
     Attributes:
-        start: (2,) start of the street's straight part, on its centre line.
+        start: (2,) start of the straight part of the street, on its centre line.
         direction: (2,) unit vector along the street.
         length_m: length of the straight part.
         has_bay: whether the street has a parking bay on this side.
@@ -81,9 +81,9 @@ class CityBlock:
     """The land between streets, or the land around the town.
 
     Attributes:
-        outline: its edge.
-        sides: its sides, one per street.
-        outside: whether it is the land around the town.
+        outline: edge of the block.
+        sides: sides of the block, one per street.
+        outside: whether the block is the land around the town.
     """
 
     outline: Outline
@@ -97,8 +97,8 @@ class Lane:
 
     Attributes:
         path: (P, 2) centre line, metres, points about PATH_STEP_M apart.
-        start: index of the crossing where a street's lane starts, or that a turn crosses.
-        end: index of the crossing where a street's lane ends, or that a turn crosses.
+        start: index of the crossing where the lane of a street starts; for a turn, of its crossing.
+        end: index of the crossing where the lane of a street ends; for a turn, of its crossing.
         turn: whether it is a turn.
         exits: indices of the lanes that follow.
     """
@@ -161,7 +161,7 @@ def right_of(direction: Points) -> Points:
 
 
 def draw_streets(rng: np.random.Generator, rows: int = 5, columns: int = 5) -> Streets:
-    """Draw the streets of a town: a grid with random spacing and crossings, and without some of its streets."""
+    """Draw the random streets of a town: a grid with random spacing and crossings, with some streets left out."""
     nodes, edges = _draw_grid(rng, rows, columns)
     loops = _trace_faces(nodes, edges)
     stop_distances = _stop_distances(nodes, loops)
@@ -267,7 +267,7 @@ def _make_block(
 
 
 def _rounded_corner(node: Points, arriving: Points, leaving: Points, turn: float) -> tuple[Points, Points]:
-    """Return anchors and normals of a block's outline at a corner."""
+    """Return anchors and normals of the outline of a block at a corner."""
     count = max(2, int(np.ceil(abs(turn) / 0.16)) + 1)
     heading = np.arctan2(arriving[1], arriving[0]) + np.linspace(0, turn, count)
     normal = right_of(np.stack([np.cos(heading), np.sin(heading)], axis=1))

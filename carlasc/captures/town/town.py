@@ -33,7 +33,7 @@ GROUND, TERRAIN, WATER = (CARLA.id_of(name) for name in ("Ground", "Terrain", "W
 def pave_roads(plan: TownPlan, streets: Streets) -> None:
     """Add one level road surface below the whole town. The blocks lie on it."""
     low, high = streets.nodes.min(axis=0) - 8, streets.nodes.max(axis=0) + 8
-    tile = 12.0  # metres: small triangles make rays exact and the search tree efficient
+    tile = 12.0  # metres; with small triangles, rays are exact and the search tree is efficient
     xs, ys = np.arange(low[0], high[0] + tile, tile), np.arange(low[1], high[1] + tile, tile)
     for x, following in pairwise(xs):
         plan.builder.ribbon(
@@ -45,7 +45,7 @@ def paint_markings(plan: TownPlan, streets: Streets) -> None:
     """Add centre lines, edge lines, stop lines and crosswalks."""
     for block in streets.blocks:
         for side in block.sides:
-            if -np.pi / 2 < side.yaw_rad <= np.pi / 2:  # only one of a street's two sides adds the centre line
+            if -np.pi / 2 < side.yaw_rad <= np.pi / 2:  # only one of the two sides of a street adds the centre line
                 if plan.rng.random() < 0.4:
                     for offset in (-0.12, 0.12):
                         _paint_line(plan, side, offset, 0.0, side.length_m, dashed=False)
@@ -79,7 +79,7 @@ def lay_sidewalk(plan: TownPlan, block: CityBlock) -> NDArray[np.float64]:
 
 
 def lay_ground(plan: TownPlan, loop: NDArray[np.float64], label: int) -> None:
-    """Add the land inside a loop as rings towards its middle. Terrain is slightly uneven.
+    """Add the land inside a loop as rings towards its centre. Terrain is slightly uneven.
 
     Args:
         plan: the town's plan.
@@ -107,7 +107,7 @@ BLOCK_USES = ("downtown", "houses", "houses", "park", "square")
 
 
 def fill_block(plan: TownPlan, block: CityBlock, use: str) -> None:
-    """Add the sidewalk and land of a block, and what belongs to its use, one of BLOCK_USES."""
+    """Add the sidewalk, the land and the objects of a block. `use` is one of BLOCK_USES."""
     inner = lay_sidewalk(plan, block)
     land = Land(inner)
     lay_ground(plan, inner, {"downtown": GROUND, "square": GROUND}.get(use, TERRAIN))
@@ -273,8 +273,8 @@ class Town:
     """A town without its traffic.
 
     Attributes:
-        streets: its street network.
-        mesh: all static objects, world frame: x and y as the streets have them, z up, the road at z = 0.
+        streets: the street network.
+        mesh: all static objects, world frame: x and y of the streets, z up, the road at z = 0.
         buildings: footprints of the buildings with the heights of their roofs, metres.
         parking: parking spaces: world_T_vehicle of a vehicle parked in each.
     """

@@ -1,7 +1,7 @@
-"""How vehicles move: they follow each other along lanes and give way to each other at crossings.
+"""The motion of vehicles: they follow each other along lanes and give way at crossings.
 
-Vehicles follow the intelligent driver model (Treiber, Hennecke and Helbing, 2000). A vehicle enters a crossing only while no vehicle
-on it has a turn that conflicts with its own, and when the lane beyond has room for it. So vehicles do not collide or stop on a crossing.
+Vehicles follow the intelligent driver model (Treiber, Hennecke and Helbing, 2000). A vehicle enters a crossing only if no vehicle on it has
+a conflicting turn, and if the next lane has room for it. Therefore, vehicles do not collide or stop on a crossing.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ BRAKING = 2.5  # m/s^2, comfortable
 HEADWAY_S = 1.2
 STANDSTILL_GAP_M = 2.0  # gap between vehicles at rest
 LOOK_AHEAD_M = 60.0
-LATERAL_ACCELERATION = 2.4  # m/s^2, greatest one in a turn
-CLEARANCE_M = 3.1  # smallest distance between the centre lines of two turns that do not conflict
+LATERAL_ACCELERATION = 2.4  # m/s^2, maximum in a turn
+CLEARANCE_M = 3.1  # minimum distance between the centre lines of turns without a conflict
 
 Queues = dict[int, list[int]]
-"""Indices of the vehicles on each street's lane and on the turns that leave it, by lane, the foremost vehicle first."""
+"""Indices of the vehicles on the lane of a street and on the turns that leave it, by lane, the foremost vehicle first."""
 
 
 @dataclass
@@ -32,15 +32,15 @@ class Vehicle:
     """The state of a moving vehicle.
 
     Attributes:
-        length_m: from bumper to bumper.
-        cruise_mps: its speed on a free road.
-        turns: random numbers in 0..1, one per crossing, that choose its turns.
-        route: indices of the lanes that it drives on, in order, as far as they have been chosen.
+        length_m: length from bumper to bumper, metres.
+        cruise_mps: speed on a free road, m/s.
+        turns: random numbers in 0..1, one per crossing, which select its turns.
+        route: indices of the lanes of its route so far, in order.
         starts: distance along the route at which each of these lanes starts, metres.
-        along_m: distance of its middle along the route.
-        speed_mps: its speed.
-        leg: index in `route` of the lane that its middle is on.
-        granted: index in `route` of the last lane that it may drive on.
+        along_m: distance of its centre along the route, metres.
+        speed_mps: speed, m/s.
+        leg: index in `route` of the lane of its centre.
+        granted: index in `route` of the last lane that it may enter.
     """
 
     length_m: float
@@ -56,20 +56,20 @@ class Vehicle:
 
 @dataclass
 class _Crossing:
-    inside: list[int] = field(default_factory=list)  # vehicles that may cross it and have not left it yet
-    waiting: dict[int, int] = field(default_factory=dict)  # lane -> step at which its first vehicle arrived
+    inside: list[int] = field(default_factory=list)  # vehicles that were let in and have not left yet
+    waiting: dict[int, int] = field(default_factory=dict)  # step of arrival of the first vehicle, by lane
 
 
 class Traffic:
-    """All moving vehicles, simulated frame by frame from frame 0. The states of all frames are kept."""
+    """All moving vehicles, simulated frame by frame from frame 0. The states of all frames are cached."""
 
     def __init__(self, streets: Streets, vehicles: list[Vehicle]) -> None:
-        """Take the initial states of the vehicles. The first one is the ego vehicle."""
+        """Start with the initial states of the vehicles. The first one is the ego vehicle."""
         self.streets = streets
         self.vehicles = vehicles
         self._conflicts = _find_conflicts(streets)
         self._crossings = [_Crossing() for _ in streets.nodes]
-        self._exit_claims: dict[int, list[int]] = {}  # lane -> vehicles on a crossing that will enter the lane
+        self._exit_claims: dict[int, list[int]] = {}  # vehicles on a crossing that will enter a lane, by lane
         self._limits = [_speed_limit(lane) for lane in streets.lanes]
         for vehicle in vehicles:
             self._extend_route(vehicle)
@@ -85,7 +85,7 @@ class Traffic:
         return self._along[frame], self._speed[frame]
 
     def pose(self, index: int, along_m: float, wheelbase_m: float) -> Transform:
-        """Return (4, 4) world_T_vehicle of a vehicle at a distance along its route. The middles of both axles are on the route."""
+        """Return (4, 4) world_T_vehicle of a vehicle at a distance along its route. The centres of both axles are on the route."""
         vehicle = self.vehicles[index]
         front = self._point(vehicle, along_m + wheelbase_m / 2)
         rear = self._point(vehicle, along_m - wheelbase_m / 2)
@@ -96,7 +96,7 @@ class Traffic:
         leg = int(np.searchsorted(vehicle.starts, along_m, side="right")) - 1
         leg = min(max(leg, 0), len(vehicle.route) - 1)
         lane, local = self.streets.lanes[vehicle.route[leg]], along_m - vehicle.starts[leg]
-        if local < 0:  # before the first lane of the route: its straight extension
+        if local < 0:  # before the first lane, the route is extended straight
             return lane.path[0] + local * (lane.path[1] - lane.path[0]) / np.linalg.norm(lane.path[1] - lane.path[0])
         return lane.point(local)
 
@@ -114,7 +114,7 @@ class Traffic:
             self._extend_route(vehicle)
 
     def _extend_route(self, vehicle: Vehicle) -> None:
-        """Choose the route for at least two crossings ahead."""
+        """Extend the route to at least two crossings ahead."""
         while len(vehicle.route) < vehicle.leg + 6:
             lane = self.streets.lanes[vehicle.route[-1]]
             number = vehicle.turns[len(vehicle.route) % len(vehicle.turns)]
@@ -122,7 +122,7 @@ class Traffic:
             vehicle.starts.append(vehicle.starts[-1] + lane.length_m)
 
     def _queues(self) -> Queues:
-        """Return the vehicles on each street's lane and on the turns that leave it, the foremost vehicle first."""
+        """Return the vehicles on the lane of each street and on the turns that leave it, the foremost vehicle first."""
         queues: dict[int, list[tuple[float, int]]] = {}
         for index, vehicle in enumerate(self.vehicles):
             leg = self._street_leg(vehicle)
@@ -131,7 +131,7 @@ class Traffic:
         return {lane: [index for _, index in sorted(queue)] for lane, queue in queues.items()}
 
     def _street_leg(self, vehicle: Vehicle) -> int:
-        """Return the index in its route of the street's lane that it is on, or on a crossing, that it came from."""
+        """Return the index in the route of the lane of the street where the vehicle is; on a crossing, of the lane before it."""
         return vehicle.leg - self.streets.lanes[vehicle.route[vehicle.leg]].turn
 
     def _release_crossings(self) -> None:
@@ -146,7 +146,7 @@ class Traffic:
         return vehicle.along_m - vehicle.length_m / 2 > vehicle.starts[vehicle.granted] + 0.5
 
     def _grant_crossings(self, step: int, queues: Queues) -> None:
-        """Let vehicles enter the crossings that they have come close to."""
+        """Let vehicles enter the crossings near them."""
         requests: dict[int, list[tuple[int, int]]] = {}
         for lane, queue in queues.items():
             index = next((i for i in queue if self.vehicles[i].route[self.vehicles[i].leg] == lane), None)
@@ -154,7 +154,7 @@ class Traffic:
                 continue
             vehicle, node = self.vehicles[index], self.streets.lanes[lane].end
             if vehicle.granted > vehicle.leg:
-                continue  # it may enter already
+                continue  # already let in
             distance = vehicle.starts[vehicle.leg + 1] - vehicle.along_m - vehicle.length_m / 2
             if distance < 10.0 + vehicle.speed_mps**2 / (2 * BRAKING):
                 self._crossings[node].waiting.setdefault(lane, step)
@@ -164,15 +164,15 @@ class Traffic:
             self._grant(self._crossings[node], requests[node], ego_lane, queues)
 
     def _grant(self, crossing: _Crossing, requests: list[tuple[int, int]], ego_lane: int, queues: Queues) -> None:
-        """Let vehicles enter a crossing in the order of their arrival, but those of the ego vehicle's lane first.
+        """Let vehicles enter a crossing in the order of arrival, but vehicles on the lane of the ego vehicle first.
 
         Args:
             crossing: the crossing.
-            requests: (lane, vehicle) of those that have come close to it.
-            ego_lane: the lane that the ego vehicle is on.
+            requests: (lane, vehicle) of the vehicles near the crossing.
+            ego_lane: the lane of the ego vehicle.
             queues: the vehicles of each lane.
         """
-        held: list[int] = []  # turns of vehicles that arrived earlier and must still wait
+        held: list[int] = []  # turns of vehicles that arrived earlier and still wait
         for lane, index in sorted(requests, key=lambda item: (item[0] != ego_lane, crossing.waiting[item[0]], item[0])):
             vehicle = self.vehicles[index]
             turn = vehicle.route[vehicle.leg + 1]
@@ -189,7 +189,7 @@ class Traffic:
             self._exit_claims.setdefault(vehicle.route[vehicle.granted], []).append(index)
 
     def _has_room_beyond(self, index: int, queues: Queues) -> bool:
-        """Whether the lane beyond the crossing has room for the vehicle, and for those on the crossing that will enter it."""
+        """Whether the lane after the crossing has room for the vehicle, and for vehicles on the crossing that will enter it."""
         vehicle = self.vehicles[index]
         exit_lane = vehicle.route[vehicle.leg + 2]
         claims = self._exit_claims.get(exit_lane, [])
@@ -237,7 +237,7 @@ class Traffic:
             for other in queues.get(lane, ()):
                 leader = self.vehicles[other]
                 position = vehicle.starts[ahead] + leader.along_m - leader.starts[self._street_leg(leader)]
-                # A vehicle behind this one is not its leader. Equal positions are ordered by index.
+                # The leader is ahead of this vehicle. Equal positions are ordered by index.
                 if other == index or (position, -other) <= (vehicle.along_m, -index):
                     continue
                 gap = position - vehicle.along_m - (leader.length_m + vehicle.length_m) / 2
@@ -263,7 +263,7 @@ def _speed_limit(lane: Lane) -> float:
 
 
 def _find_conflicts(streets: Streets) -> NDArray[np.bool_]:
-    """Return (L, L) which turns of one crossing are closer to each other than CLEARANCE_M."""
+    """Return (L, L) bool: whether two turns of one crossing are closer than CLEARANCE_M."""
     conflicts = np.zeros((len(streets.lanes),) * 2, np.bool_)
     turns = [(index, lane) for index, lane in enumerate(streets.lanes) if lane.turn]
     for a, one in turns:
@@ -282,12 +282,12 @@ def place_vehicles(
     Args:
         rng: source of the random numbers.
         streets: the street network.
-        lengths_m: length of each vehicle. The first is the ego vehicle, which starts at rest.
-        ego_lane: lane that the ego vehicle starts on.
-        ego_along_m: distance along this lane at which it starts.
+        lengths_m: length of each vehicle, metres. The first is the ego vehicle, which starts at rest.
+        ego_lane: index of the first lane of the ego vehicle.
+        ego_along_m: start of the ego vehicle along this lane, metres.
 
     Returns:
-        The vehicles that found room.
+        The vehicles for which there was room.
     """
     lanes = [i for i, lane in enumerate(streets.lanes) if not lane.turn]
     occupied: dict[int, list[tuple[float, float]]] = {}

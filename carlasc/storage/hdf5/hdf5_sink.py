@@ -1,4 +1,4 @@
-"""Writing packed stores in HDF5, by appending: one writer, frames in rising order."""
+"""Writing packed stores in HDF5 by appending: one writer, frames in ascending order."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ _AHEAD = 16  # chunks that are encoded in parallel
 
 
 class HDF5Sink(PackedSink):
-    """Writes a packed HDF5 file, which gets its name when the sink is finished, and not before."""
+    """Writes a packed HDF5 file. It gets its final name only when the sink is finished."""
 
     def __init__(
         self, path: str | os.PathLike[str], options: PackOptions | None = None, overwrite: bool = False
     ) -> None:
-        """Start a file; what an interrupted run left is removed.
+        """Start a file. The file of an interrupted run is removed.
 
         Raises:
-            ArgumentError: `small` is given, for which HDF5 has no filter.
+            ArgumentError: `small` is given, but HDF5 has no filter for PCodec.
             ConflictError: something exists at `path`, and `overwrite` is not given.
             DependencyError: h5py, hdf5plugin, numcodecs or google-crc32c is not installed.
         """
@@ -72,7 +72,7 @@ class HDF5Sink(PackedSink):
         self._sequences: dict[str, str] = {}
 
     def finished(self, path: str) -> bool:
-        """Whether this run has written the sequence whole: what an interrupted run left is not continued."""
+        """Whether this run has completed the sequence. Interrupted runs are not continued."""
         return path in self._sequences
 
     def sequence(self, path: str) -> HDF5Writer:
@@ -106,7 +106,7 @@ class HDF5Writer(PackedWriter):
         self._fields: dict[str, HDF5FieldWriter] = {}
 
     def expect(self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None) -> None:
-        """Note how large a typical frame is: chunks are made for it."""
+        """Record the size of a typical frame, which determines the size of chunks."""
         self._rows.update(rows or {})
 
     def _start_field(self, field: str) -> FieldWriter:
@@ -119,7 +119,7 @@ class HDF5Writer(PackedWriter):
         return self._fields[field]
 
     def close(self) -> None:
-        """Write what is held back and mark the sequence as whole."""
+        """Write buffered frames and mark the sequence as complete."""
         for field in self._fields.values():
             field.close()
         for name, data in self.contents.items():
@@ -142,7 +142,7 @@ class HDF5FieldWriter(FieldWriter):
 
     Attributes:
         table: the frames written so far.
-        layout: where its frames are; known from the first frame on that is not empty.
+        layout: layout of the field, determined by the first frame that is not empty.
     """
 
     layout: FieldLayout
@@ -159,7 +159,7 @@ class HDF5FieldWriter(FieldWriter):
         self._columns: dict[str, HDF5ColumnWriter] = {}
 
     def write(self, frame: int, array: NDArray[Any]) -> None:
-        """Divide one frame into chunks, which are written with those of other frames."""
+        """Divide one frame into chunks. Chunks of several frames are written together."""
         if not self._planned and array.size:
             self.layout, self._planned = self._plan([array]), True
         counts, parts = self.layout.divide(array, limited=False) if self._planned else ({}, {})
@@ -170,7 +170,7 @@ class HDF5FieldWriter(FieldWriter):
         self.table[frame] = counts
 
     def close(self) -> None:
-        """Write what is held back, and the group of the field."""
+        """Write buffered frames, and the group of the field."""
         if not self._planned:
             self.layout = self._plan([])
         for column in self._columns.values():
@@ -179,7 +179,7 @@ class HDF5FieldWriter(FieldWriter):
 
 
 class HDF5ColumnWriter:
-    """Writes the chunks of a column, which are encoded several at a time."""
+    """Writes the chunks of a column. Several chunks are encoded in parallel."""
 
     def __init__(self, output: HDF5Output, node: str, field_layout: FieldLayout, name: str) -> None:
         column = field_layout.columns[name]
@@ -197,7 +197,7 @@ class HDF5ColumnWriter:
             self._flush()
 
     def close(self, frames: int) -> None:
-        """Write what is held back, and the checksums of all chunks; the data set gets room for so many frames."""
+        """Write buffered chunks and the checksums of all chunks, and set the length of the data set to `frames`."""
         self._flush()
         self._dataset.resize(frames, axis=0)
         about = {"type": "carlasc.checksums", "version": VERSION, "dtype": "uint32"}
@@ -220,7 +220,7 @@ class HDF5ColumnWriter:
 
 
 class HDF5Output:
-    """Writes an HDF5 file with h5py; chunks are encoded here, in parallel, as the Blosc filter would encode them."""
+    """Writes an HDF5 file with h5py. Chunks are encoded here in parallel, in the same way as by the Blosc filter."""
 
     def __init__(self, path: Path, place: Path) -> None:
         h5py = import_extra("h5py", "hdf5")
@@ -253,9 +253,9 @@ class HDF5Output:
         self.check()
 
     def create(self, node: str, field_layout: FieldLayout, column: Column) -> Any:
-        """Create the data set of a column, of no frames yet."""
+        """Create the data set of a column, without frames."""
         shape, encoding = field_layout.frame_shape(column), column.encoding
-        most = shape if field_layout.is_grid else (*shape[:-1], None)  # a frame of more than it has room for is rare
+        most = shape if field_layout.is_grid else (*shape[:-1], None)  # rarely, a frame is longer, and the axis grows
         blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
         dataset = self._file.create_dataset(
             node, (0, *shape), column.dtype, chunks=field_layout.chunk_shape(column), maxshape=(None, *most), **blosc
@@ -265,7 +265,7 @@ class HDF5Output:
         return dataset
 
     def remove(self, node: str) -> None:
-        """Remove a node; the file uses its space again."""
+        """Remove a node. The file reuses its space."""
         for name in (node, node + CRC):
             if name in self._file:
                 del self._file[name]
@@ -279,10 +279,10 @@ class HDF5Output:
 
 
 def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
-    """Replace a node's attributes: text and numbers are written as they are, other values as JSON under `<name>:json`.
+    """Replace the attributes of a node. Text and numbers are written unchanged, other values as JSON under `<name>:json`.
 
-    Text has a fixed length. HDF5 would keep text of variable length in its global heaps, the only part of a file's structure that has no
-    checksum: with a few zeros there, HDF5 2.0 searches for ever.
+    Text has a fixed length. HDF5 stores text of variable length in global heaps, the only structure of a file without a checksum. If a
+    heap is damaged by a few zeros, HDF5 2.0 hangs.
     """
     for name in list(node.attrs):
         del node.attrs[name]

@@ -1,7 +1,7 @@
 """Reading packed stores in HDF5: groups and chunked data sets, compressed by the Blosc filter.
 
-Any HDF5 reader with hdf5plugin opens them. Here, h5py looks up the places of the chunks in the file, once per data set; the chunks
-themselves are read and decoded directly.
+Any HDF5 reader with hdf5plugin can open them. This module looks up the offsets of chunks with h5py once per data set, and reads and
+decodes the chunks directly.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.requests import holding_a_lock
 from carlasc.storage.transport.trees import Tree
 
-_BLOSC = 32001  # the filter's registered number
-_GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # those of the filters that HDF5 brings
+_BLOSC = 32001  # registered number of the filter
+_GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 itself
 _SMALL_FILTERS = {_GZIP, _SHUFFLE, _FLETCHER32}
 _UNTRUSTED = "carlasc did not write this: do not use this store"
-CRC = "_crc32c"  # suffix of the data set with the checksums of another one's chunks
+CRC = "_crc32c"  # suffix of the data set with the checksums of the chunks
 
 
 class HDF5Source(ArraySource):
@@ -39,7 +39,7 @@ class HDF5Source(ArraySource):
 
         Raises:
             DependencyError: h5py or the codecs are not installed.
-            FormatError: it is another HDF5 file, unfinished, or of another version.
+            FormatError: it is not a packed store, is unfinished, or has another version.
         """
         for module in ("h5py", "numcodecs", "google_crc32c"):
             import_extra(module, "hdf5")
@@ -47,7 +47,7 @@ class HDF5Source(ArraySource):
 
 
 class HDF5Store(ArrayStore):
-    """The nodes of an HDF5 file, which is opened for each call and closed again."""
+    """The nodes of an HDF5 file. The file is opened and closed in each call."""
 
     def __init__(self, tree: Tree, path: str) -> None:
         self.tree = tree
@@ -83,7 +83,7 @@ class HDF5Store(ArrayStore):
             )
 
     def stored_bytes(self, node: str) -> int:
-        """Return the bytes of the data sets below a node; for the root, those of the file."""
+        """Return the stored bytes of the data sets below a node; for the root, the size of the file."""
         if not node:
             return Path(self.location).stat().st_size
         h5py = import_extra("h5py", "hdf5")
@@ -109,7 +109,7 @@ class HDF5Store(ArrayStore):
     @contextmanager
     def _open(self) -> Iterator[Any]:
         h5py = import_extra("h5py", "hdf5")
-        with reading(self.location, "an HDF5 file", "is it truncated or corrupted?"):
+        with reading(self.location, "an HDF5 file", "the file may be truncated or corrupted"):
             if isinstance(self.tree, RemoteTree):
                 with self.tree.open(self.path) as remote, holding_a_lock(), h5py.File(remote, "r") as file:
                     yield file
@@ -119,7 +119,7 @@ class HDF5Store(ArrayStore):
 
 
 class HDF5Array(StoredArray):
-    """A chunked data set with the Blosc filter, and the place and the checksum of each chunk that exists."""
+    """A chunked data set with the Blosc filter, and the offset and the checksum of each existing chunk."""
 
     extra = "hdf5"
     _path: str
@@ -128,13 +128,13 @@ class HDF5Array(StoredArray):
 
     @classmethod
     def from_dataset(cls, tree: Tree, path: str, dataset: Any, checksums: NDArray[np.uint32]) -> HDF5Array:
-        """Look up the places of a data set's chunks.
+        """Look up the offsets of the chunks of a data set.
 
         Args:
             tree: the tree of files that holds the HDF5 file.
             path: the file.
             dataset: the open data set.
-            checksums: (n,) those of its chunks, in the order of their places in the data set.
+            checksums: (n,) checksums of the existing chunks, in the order of chunk numbers.
 
         Raises:
             FormatError: it is not chunked, has other filters, or another number of chunks.
@@ -144,7 +144,7 @@ class HDF5Array(StoredArray):
             raise FormatError(
                 where,
                 expected="a chunked data set with the Blosc filter",
-                found="another",
+                found="other filters or no chunks",
                 advice="the store is damaged",
             )
         array = cls(tree, dataset.name, dataset.dtype, shape, chunk, Encoding())
@@ -170,7 +170,7 @@ class HDF5Array(StoredArray):
         return array
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
-        """Return the places of chunks."""
+        """Return the file, the first byte and the end of each chunk."""
         for number in numbers:
             if number not in self._places:
                 raise FormatError(
@@ -182,7 +182,7 @@ class HDF5Array(StoredArray):
         return [(self._path, *self._places[number]) for number in numbers]
 
     def files(self, numbers: Sequence[int]) -> list[str]:
-        """Return the one file."""
+        """Return the HDF5 file."""
         return [self._path]
 
     def verify(self, data: memoryview, number: int) -> memoryview:
@@ -197,13 +197,12 @@ class HDF5Array(StoredArray):
 
 
 def find_node(file: Any, node: str, where: str) -> Any:
-    """Return a group or a data set of a file, None if it does not exist. Only links to what is in the file itself are followed.
+    """Return a group or a data set of a file; None if it does not exist. Only hard links inside the file are followed.
 
-    HDF5 can also put the path of another file into a link, or into a data set: anybody may have made the store, and what it shows must not
-    be another file of this machine.
+    In HDF5, a link or a data set can refer to another file. An untrusted store must not give access to other files of this machine.
 
     Raises:
-        FormatError: a link on the way leads to another file.
+        FormatError: a link on the path refers to another file, or is symbolic.
     """
     h5py = import_extra("h5py", "hdf5")
     found = file
@@ -213,36 +212,36 @@ def find_node(file: Any, node: str, where: str) -> Any:
             return None
         if not isinstance(link, h5py.HardLink):
             kind = "a link to another file" if isinstance(link, h5py.ExternalLink) else "a symbolic link"
-            raise FormatError(f"{where}: {node}", expected="what the file itself holds", found=kind, advice=_UNTRUSTED)
+            raise FormatError(f"{where}: {node}", expected="data in the file itself", found=kind, advice=_UNTRUSTED)
         found = found[name]
     if isinstance(found, h5py.Dataset) and (found.is_virtual or found.external):
         raise FormatError(
-            f"{where}: {node}", expected="values in the file itself", found="those of other files", advice=_UNTRUSTED
+            f"{where}: {node}", expected="values in the file itself", found="values in other files", advice=_UNTRUSTED
         )
     return found
 
 
 def check_small(dataset: Any, what: str) -> None:
-    """Check that a data set which is read whole is not larger in memory than what it takes in the file allows.
+    """Check that a data set that is read whole has a plausible size in memory, compared with its stored size.
 
     Raises:
-        FormatError: it is, or it has other values or filters than those that carlasc writes.
+        FormatError: it is too large, or has values or filters that carlasc does not write.
     """
     size, stored, filters = dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size(), _filters(dataset)
     if dataset.dtype.kind not in "uif" or not set(filters) <= _SMALL_FILTERS:
-        raise FormatError(what, expected="numbers, packed by gzip or not at all", found="others", advice=_UNTRUSTED)
+        raise FormatError(what, expected="numbers without filters or with gzip", found="other data", advice=_UNTRUSTED)
     check_ratio(size, stored, what)
     if dataset.chunks is None or not size:
         if size > stored:  # HDF5 would fill the rest with zeros
             raise FormatError(what, expected=f"{size} bytes", found=f"{stored}", advice="the store is damaged")
         return
     if dataset.chunks != dataset.shape or dataset.id.get_num_chunks() != 1:
-        raise FormatError(what, expected="one chunk", found="several", advice="the store is damaged")
-    if _GZIP in filters:  # HDF5 unpacks all that a chunk holds, however much it is
+        raise FormatError(what, expected="one chunk", found="several chunks", advice="the store is damaged")
+    if _GZIP in filters:  # HDF5 decompresses a whole chunk without a limit
         packed = dataset.id.read_direct_chunk((0,) * len(dataset.shape))[1]
         unpacked = zlib.decompressobj().decompress(packed, size + 1)
         if len(unpacked) != size:
-            raise FormatError(what, expected=f"{size} bytes", found="others", advice=_UNTRUSTED)
+            raise FormatError(what, expected=f"{size} bytes", found="another size", advice=_UNTRUSTED)
 
 
 def _filters(dataset: Any) -> list[int]:

@@ -1,4 +1,4 @@
-"""Reading the frames of a field in a store of arrays: which chunks a frame has, and what their values are."""
+"""Reading the frames of a field in a store of arrays: finding, fetching and decoding the chunks of a frame."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from carlasc.storage.packed.columns import WIDE, Column, PointsPacking
 
 
 class ArrayField:
-    """A field of a sequence: its frames, and the columns that they are in."""
+    """A field of a sequence in a store of arrays: its frames and its columns."""
 
     def __init__(
         self,
@@ -31,15 +31,15 @@ class ArrayField:
         *,
         local: bool,
     ) -> None:
-        """Take what is known of the field.
+        """Create a field.
 
         Args:
-            where: its name in errors.
-            field_layout: where its frames are.
-            frames: (n,) numbers of frames, in rising order.
-            counts: (n,) elements of each in each column; -1 in frames that the field does not have.
-            array_of: returns the array of a column. Called when a frame is read, for the columns that some frame needs.
-            local: whether its bytes are on this machine.
+            where: name of the sequence in errors.
+            field_layout: layout of the field.
+            frames: (n,) sorted frame numbers.
+            counts: (n,) number of elements of each frame, by column; -1 if the field does not have the frame.
+            array_of: returns the array of a column. Called on the first read, for the columns that are in use.
+            local: whether the store is on this machine.
         """
         exists = np.zeros(len(frames), np.bool_)
         for column in counts.values():
@@ -65,7 +65,7 @@ class ArrayField:
         return found
 
     def read(self, frames: list[int]) -> list[NDArray[Any]]:
-        """Read frames: from a remote store all their chunks are fetched at once; frames are decoded in parallel."""
+        """Read frames. All their chunks are fetched at once from a remote store, and frames are decoded in parallel."""
         positions = [self._position(frame) for frame in frames]
         tasks = {name: self._parts(column, frames) for name, column in self.columns.items()}
         main = self.columns.get(self.packing.columns[0].name)
@@ -109,7 +109,7 @@ class ArrayField:
         return list(dict.fromkeys(file for found in files for file in found))
 
     def _stored_in(self, column: Column, position: int) -> str | None:
-        """Return the name of the stored column that has a frame's elements: the column or its wide one."""
+        """Return the name of the stored column with the elements of a frame: the column or its wide column."""
         stored = [name for name in (column.name, f"{column.name}{WIDE}") if name in self.columns]
         return next((name for name in stored if self.columns[name].counts[position]), stored[0] if stored else None)
 
@@ -124,7 +124,7 @@ class ArrayField:
 
     @contextmanager
     def _naming(self, frames: list[int]) -> Iterator[None]:
-        """Add the field and the frames to the place of an error; columns that do not fit each other are one too."""
+        """Add the field and the frames to errors, and turn errors of inconsistent columns into a FormatError."""
         where = f"{self.where}: field {self.packing.entry.name}, frame {', '.join(map(str, frames))}"
         with reading(where, "the columns of a frame", "the store is damaged"):
             try:
@@ -145,7 +145,7 @@ class FramePart:
     Attributes:
         chunks: numbers of the chunks that hold it.
         count: elements of the frame.
-        fetched: the bytes of the chunks, if they were fetched before.
+        fetched: the bytes of the chunks, if they are already fetched.
     """
 
     chunks: range
@@ -154,13 +154,13 @@ class FramePart:
 
 
 class StoredColumn:
-    """One array of a field, and which of its chunks each frame has.
+    """One array of a field, and the chunks of each frame in it.
 
     Attributes:
-        column: what is in it.
-        array: its chunks.
+        column: description of the column.
+        array: the chunks.
         firsts: number of the first chunk of each frame.
-        counts: number of elements of each frame; for a grid, any number above 0 says that it is there.
+        counts: number of elements of each frame; for a grid, a number above 0 means that the frame exists.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class StoredColumn:
             task.fetched = [next(data) for _ in task.chunks]
 
     def memory_for(self, task: FramePart, spare: list[NDArray[Any]]) -> NDArray[Any]:
-        """Return memory to decode a frame into: that of a spare array of the same shape, or new memory, which is slower to write to."""
+        """Return memory to decode a frame into: a spare array of the same shape, otherwise new memory, which is slower to write to."""
         shape = (self.column.rows or 1, len(task.chunks) * self.array.step)
         while spare:
             memory = spare.pop().base

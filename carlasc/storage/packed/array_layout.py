@@ -1,7 +1,7 @@
-"""Where the frames of a field are in a store of arrays, zarr or HDF5. See `docs/packed-format.md#arrays`.
+"""The layout of the frames of a field in a store of arrays, zarr or HDF5. See `docs/packed-format.md#arrays`.
 
-A frame has a place that depends on its number alone: frame i of a column is entry i of its array. So any block of frames can be
-written without knowing the others, and found without a table of places.
+The position of a frame depends only on its number: frame i of a column is entry i of its array. Any block of frames can therefore be
+written independently of the others, and found without an index.
 """
 
 from __future__ import annotations
@@ -24,24 +24,22 @@ from carlasc.storage.packed.stores import VERSION, PackOptions
 
 SEQUENCE, FIELD, COLUMN, DOCUMENT = "carlasc.sequence", "carlasc.field", "carlasc.column", "carlasc.document"
 _SLOTS = 16  # a frame has room for this many typical frames
-_PCODEC = "pcodec"  # value of the attribute `codec` of points that are packed smaller
+_PCODEC = "pcodec"  # value of the attribute `codec` of points that PCodec compressed
 _HEADROOM = 1.125  # a chunk is this much larger than a typical frame, so that few frames need a second one
-_CELLS_PER_ROW = {
-    "vote": 4,
-    "moving voxel": 64,
-}  # a frame has room for four votes per voxel, and for a quarter that moves
-_PICTURE = 1 << 18  # bytes of a picture, unless the first ones are larger: their size must not decide
+# A frame has room for four votes per voxel, and for one moving voxel in four.
+_CELLS_PER_ROW = {"vote": 4, "moving voxel": 64}
+_PICTURE = 1 << 18  # bytes of a picture, unless the first pictures are larger
 FrameTable = dict[int, dict[str, int]]
-"""Frames of a field: the number of elements of each in each column that it needs."""
+"""The frames of a field: for each, the number of elements by column."""
 
 
 class FieldLayout:
-    """Where the frames of a field are, from the attributes of its group.
+    """The layout of the frames of a field, from the attributes of its group.
 
     Attributes:
-        packing: how an array becomes columns.
-        attributes: those of the field's group in the store.
-        columns: the columns by name, with the wide ones.
+        packing: converts arrays to columns and back.
+        attributes: attributes of the group of the field in the store.
+        columns: the columns by name, including wide columns.
         is_grid: whether the field has one value per voxel.
     """
 
@@ -53,15 +51,15 @@ class FieldLayout:
 
     @classmethod
     def read(cls, where: str, field: str, attributes: Mapping[str, Any] | None) -> FieldLayout:
-        """Return the layout of a field that exists.
+        """Return the layout of an existing field.
 
         Args:
-            where: the field's group, for errors.
-            field: its name.
-            attributes: those of the group; None if there is no such group.
+            where: group of the field, for errors.
+            field: name of the field.
+            attributes: attributes of the group; None if the group does not exist.
 
         Raises:
-            FormatError: the attributes are not those of this field.
+            FormatError: the attributes are missing or do not fit the field.
         """
         if attributes is None or attributes.get("type") != FIELD:
             raise FormatError(
@@ -82,7 +80,7 @@ class FieldLayout:
         if not all(type(number) is int and 0 < number < 2**31 for number in numbers) or (
             len(numbers) != 3 if packing.kind == "grid" else isinstance(size, list)
         ):
-            raise FormatError(where, expected="the size of its chunks", found=repr(size), advice="the store is damaged")
+            raise FormatError(where, expected="a chunk size above 0", found=repr(size), advice="the store is damaged")
         return cls(packing, attributes)
 
     @classmethod
@@ -90,8 +88,8 @@ class FieldLayout:
         """Return the layout of a new field.
 
         Args:
-            field: its name.
-            options: those of the store.
+            field: name of the field.
+            options: options of the store.
             typical: the shape of a grid, or (number of elements of a typical frame,).
         """
         entry = layout.field_named(field)
@@ -106,14 +104,14 @@ class FieldLayout:
         return cls(packing, about | size | codec | dict(packing.attributes))
 
     def frame_shape(self, column: Column) -> tuple[int, ...]:
-        """Return the shape of one entry of a column's array: (X, Y, Z) of a grid, else ([rows,] elements that a frame has room for)."""
+        """Return the shape of one entry of the array of a column: (X, Y, Z) for a grid, otherwise ([rows,] most elements of a frame)."""
         if self.is_grid:
             return tuple(self.attributes["shape"])
         typical, step = self._typical(column), self._step(column)
         return (*((column.rows,) if column.rows else ()), -(-_SLOTS * typical // step) * step)
 
     def chunk_shape(self, column: Column) -> tuple[int, ...]:
-        """Return the shape of a chunk of a column's array, which is of one frame."""
+        """Return the shape of a chunk of the array of a column. A chunk belongs to one frame."""
         shape = self.frame_shape(column)
         return (1, *shape) if self.is_grid else (1, *shape[:-1], self._step(column))
 
@@ -128,17 +126,17 @@ class FieldLayout:
         return FEW if column.least == FEW else int(self.attributes["chunk"])
 
     def check(self, array: StoredArray, column: Column, last: int, most: int, where: str) -> None:
-        """Check that a stored array is that of a column, and has room for what the store says of it.
+        """Check that a stored array fits a column, and has room for the frames that the store lists.
 
         Args:
             array: the stored array.
-            column: the column that it should be.
-            last: largest number of a frame.
+            column: the column.
+            last: largest frame number.
             most: largest number of elements of a frame.
-            where: what to call the array in errors.
+            where: name of the array in errors.
 
         Raises:
-            FormatError: it is another array, or too small.
+            FormatError: the array does not fit, or is too small.
         """
         rest = tuple(self.attributes["shape"]) if self.is_grid else (column.rows,) if column.rows else ()
         rest += () if self.is_grid else (array.step,)
@@ -159,11 +157,11 @@ class FieldLayout:
         """Divide a frame into chunks.
 
         Args:
-            array: the frame's array.
-            limited: whether a frame may not have more elements than the store has room for; if not, its last column grows.
+            array: the array of the frame.
+            limited: whether the number of elements is limited to the reserved room. If not, the last column grows.
 
         Returns:
-            The number of elements in each column that the frame needs, and the column's chunks.
+            The number of elements and the chunks, both by column, of the columns that the frame uses.
 
         Raises:
             FormatError: the array does not fit the field.
@@ -186,7 +184,7 @@ class FieldLayout:
         return counts, chunks
 
     def _column_for(self, family: Column, values: NDArray[Any], limited: bool) -> Column:
-        """Return the column that takes the values of a frame: the first with a type and a size that hold them."""
+        """Return the column for the values of a frame: the first whose type and size hold them."""
         *narrower, widest = family.both
         for column in (*(one for one in narrower if np.can_cast(values.dtype, one.dtype)), widest):
             if self.is_grid or values.shape[-1] <= self.frame_shape(column)[-1]:
@@ -218,16 +216,16 @@ def typical_size(
     rows: Mapping[str, int],
     read_document: Callable[[str], bytes | None],
 ) -> tuple[int, ...]:
-    """Return what decides the chunks of a new field, for `FieldLayout.plan`.
+    """Return the typical size of a new field, for `FieldLayout.plan`.
 
     Args:
         entry: the field.
-        arrays: its first frames.
-        rows: the number of elements of a typical frame by field, as a run has announced them.
-        read_document: returns a text file of the sequence, None if there is none.
+        arrays: the first frames.
+        rows: the announced number of elements of a typical frame, by field.
+        read_document: returns a text file of the sequence, None if it does not exist.
 
     Returns:
-        The shape of a grid, or (number of elements of a typical frame,): as announced, else the most of the first frames.
+        The shape of a grid, or (number of elements of a typical frame,): as announced, otherwise the maximum of the first frames.
     """
     if entry.per == "voxel":
         return arrays[0].shape
@@ -242,7 +240,7 @@ def typical_size(
 
 
 def _cells(grid: str, read_document: Callable[[str], bytes | None]) -> int:
-    """Return the number of voxels of a grid, 0 if nothing says it."""
+    """Return the number of voxels of a grid; 0 if it is not known."""
     data = read_document(layout.params_file(grid))
     try:
         return 0 if data is None else math.prod(GridSpec.from_params(parse_json(data, grid), grid).size)
@@ -253,15 +251,15 @@ def _cells(grid: str, read_document: Callable[[str], bytes | None]) -> int:
 def count_elements(
     layouts: Mapping[str, FieldLayout], tables: Mapping[str, FrameTable]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
-    """Return the arrays `frames` and `counts` of a sequence, by which it is read.
+    """Return the arrays `frames` and `counts` of a sequence, which readers use to find frames.
 
     Args:
         layouts: the layout of each field.
-        tables: the frames of each field, which has at least one.
+        tables: the frames of each field, at least one.
 
     Returns:
-        The (N,) numbers of all frames in rising order; the (N, C) numbers of elements of each in each column, -1 where a field lacks the
-        frame; and the nodes of the columns.
+        frames: (N,) sorted frame numbers; counts: (N, C) number of elements per frame and column, -1 if the field lacks the frame; and
+        the nodes of the C columns.
     """
     frames = sorted({frame for table in tables.values() for frame in table})
     columns: dict[str, list[int]] = {}
@@ -276,25 +274,25 @@ def count_elements(
 
 
 def number_arrays(read_document: Callable[[str], bytes | None]) -> Iterator[tuple[str, NDArray[Any], dict[str, Any]]]:
-    """Yield poses and times as arrays too, for programs that do not read the text files: the name, the numbers and the attributes."""
+    """Yield poses and times as arrays, for programs that do not read the text files: name, values and attributes."""
     for name, document, decode, unit in (
         ("poses", layout.POSES, layout.decode_poses, "m"),
         ("times", layout.TIMES, layout.decode_times, "s"),
     ):
         data = read_document(document)
-        with suppress(FormatError):  # not numbers: the text is kept as it is, and its reader reports the error
+        with suppress(FormatError):  # not numbers: the text is kept unchanged, and its reader reports the error
             if data is not None:
                 about = {"type": "carlasc.numbers", "version": VERSION, "dtype": "float64", "unit": unit}
                 yield name, decode(data, document), about | {"document": document}
 
 
 def field_node(field: str) -> str:
-    """Return the node of a field in its sequence's group."""
+    """Return the node of a field in the group of its sequence."""
     return f"grids/{field}" if "/" in field else f"scans/{field}"
 
 
 def document_node(name: str) -> str:
-    """Return the node of a text file in its sequence's group."""
+    """Return the node of a text file in the group of its sequence."""
     return f"documents/{name}"
 
 

@@ -24,12 +24,12 @@ _T = TypeVar("_T")
 
 
 class ArrayStore(ABC):
-    """A tree of groups and arrays to read from. It holds no handle between two calls.
+    """A tree of groups and arrays to read from. It keeps no handle open between calls.
 
     Attributes:
-        location: what to call it in errors.
-        local: whether its bytes are on this machine.
-        tree: the tree of files that it is in.
+        location: name of the store in errors.
+        local: whether the store is on this machine.
+        tree: the tree of files with the store.
     """
 
     location: str
@@ -38,11 +38,11 @@ class ArrayStore(ABC):
 
     @abstractmethod
     def attributes(self, node: str) -> dict[str, Any] | None:
-        """Return the attributes of a group or an array, None if there is no such node."""
+        """Return the attributes of a group or an array; None if the node does not exist."""
 
     @abstractmethod
     def read_small(self, node: str) -> NDArray[Any]:
-        """Return a whole array, which has one chunk."""
+        """Return a whole array of one chunk."""
 
     @abstractmethod
     def read_document(self, node: str) -> bytes:
@@ -54,10 +54,10 @@ class ArrayStore(ABC):
 
     @abstractmethod
     def stored_bytes(self, node: str) -> int:
-        """Return the bytes that a node and those below take."""
+        """Return the stored bytes of a node and the nodes below it."""
 
     def forget(self) -> bool:
-        """Forget what is known of the store, and return whether it can have grown since it was opened."""
+        """Discard cached metadata, and return whether the store may have grown since it was opened."""
         return False
 
 
@@ -68,7 +68,7 @@ class ArraySource(PackedSource):
         """Read the attributes of the store's root.
 
         Raises:
-            FormatError: it is something else, unfinished, or of another version.
+            FormatError: it is not a packed store, is unfinished, or has another version.
         """
         super().__init__(store.location, store.attributes(""))
         self.store = store
@@ -81,7 +81,7 @@ class ArraySource(PackedSource):
         return {path: ArraySequence(self.store, path, group) for path, group in self.nodes.items()}
 
     def published_bytes(self) -> dict[str, int]:
-        """Return the bytes that the published files of each field have, from the numbers of elements of the frames."""
+        """Return the size of the published files by field, computed from the numbers of elements."""
         sizes: Counter[str] = Counter()
         for sequence in self._sequences().values():
             sizes["documents"] += sum(len(sequence.read_document(name)) for name in sequence.documents())
@@ -90,7 +90,7 @@ class ArraySource(PackedSource):
         return dict(sizes)
 
     def stored_bytes(self) -> dict[str, int]:
-        """Return the bytes that each field takes."""
+        """Return the stored bytes by field."""
         sizes: Counter[str] = Counter()
         for path, sequence in self.sequences().items():
             group = self.nodes[path]
@@ -101,13 +101,13 @@ class ArraySource(PackedSource):
 
 
 class ArraySequence(PackedSequence[ArrayField]):
-    """One sequence of a packed store of arrays: one table says how many elements each frame has in each column."""
+    """One sequence of a packed store of arrays. A table holds the number of elements per frame and column."""
 
     def __init__(self, store: ArrayStore, path: str, group: str) -> None:
         """Read the attributes of the sequence's group.
 
         Raises:
-            FormatError: there is no such group, or it is damaged.
+            FormatError: the group does not exist or is damaged.
         """
         self.store = store
         self.group = group
@@ -125,14 +125,14 @@ class ArraySequence(PackedSequence[ArrayField]):
         return self._read_again(lambda: self._field(field).read([frame])[0])
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
-        """Read several frames: fetched together, decoded in parallel."""
+        """Read several frames. They are fetched together and decoded in parallel."""
         numbers = list(frames)
         return self._read_again(lambda: self._field(field).read(numbers))
 
     def read_xyz(
         self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
     ) -> list[NDArray[np.float32]]:
-        """Read points as they are stored, as planes: the 4th column is not read, and no rows are put together."""
+        """Read the coordinates of points as contiguous planes, as they are stored. The 4th column is not read."""
         numbers = list(frames)
         return self._read_again(lambda: self._field("points").read_planes(numbers, spare or []))
 
@@ -146,11 +146,11 @@ class ArraySequence(PackedSequence[ArrayField]):
         return self._field(field).files_of(list(frames))
 
     def published_bytes(self, field: str) -> int:
-        """Return the bytes of a field's files in the published layout, from the numbers of elements."""
+        """Return the size of the published files of a field, computed from the numbers of elements."""
         return self._field(field).published_bytes()
 
     def _read_again(self, read: Callable[[], _T]) -> _T:
-        """Read once more, with what the store says now, where something does not fit: a store can grow while it is read."""
+        """Call `read`; after an error, once more with new metadata, because the store may have grown meanwhile."""
         try:
             return read()
         except FormatError:
@@ -162,10 +162,10 @@ class ArraySequence(PackedSequence[ArrayField]):
 
     @cached_property
     def _counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
-        """The frames of the sequence, and the number of elements of each in each column; -1 where the field lacks the frame."""
+        """The frames of the sequence, and the number of elements per frame by column; -1 if the field lacks the frame."""
         try:
             return self._read_counts()
-        except FormatError:  # what was added to the store since its metadata were read may have replaced them
+        except FormatError:  # new frames may have replaced the arrays since the metadata were read
             if not self.store.forget():
                 raise
             return self._read_counts()
@@ -174,13 +174,15 @@ class ArraySequence(PackedSequence[ArrayField]):
         where = f"{self.location}/counts"
         frames = self.store.read_small(f"{self.group}/frames").astype(np.int64)
         if frames.ndim != 1 or (np.diff(frames, prepend=-1) <= 0).any():
-            raise FormatError(where, expected="rising numbers of frames", found="others", advice="the store is damaged")
+            raise FormatError(
+                where, expected="ascending frame numbers", found="other values", advice="the store is damaged"
+            )
         counts = self.store.read_small(f"{self.group}/counts").astype(np.int64)
         columns = (self.store.attributes(f"{self.group}/counts") or {}).get("columns")
         columns = columns if isinstance(columns, list) else []
         if counts.shape != (len(frames), len(columns)) or not all(isinstance(name, str) for name in columns):
             raise FormatError(
-                where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, of rising frames", found="others",
+                where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, with ascending frame numbers", found="other values",
                 advice="the store is damaged",
             )  # fmt: skip
         return frames, {column: counts[:, number] for number, column in enumerate(columns)}
@@ -198,22 +200,23 @@ class ArraySequence(PackedSequence[ArrayField]):
         )
 
     def _check_grid(self, field: str, shape: tuple[int, ...]) -> None:
-        """Check that the chunks of a field of a grid have the shape that the grid's params.json says.
+        """Check that the chunks of a field of a grid have the shape of the grid in params.json.
 
         Raises:
-            FormatError: they have another one.
+            FormatError: they have another shape.
         """
         grid = self.grids.get(field.rpartition("/")[0])
-        if grid is None:  # written last, or not at all
+        if grid is None:  # params.json is written last, and may be missing
             check_size(shape, np.dtype("<u4"), f"{self.location}: field {field}")
         elif shape != grid.size:
             raise FormatError(
                 f"{self.location}: field {field}",
                 expected=f"grids of shape {grid.size}, as in params.json",
                 found=f"{shape}",
+                advice="the store is damaged",
             )
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
-        state.pop("_counts", None)  # a worker reads what it needs
+        state.pop("_counts", None)  # a worker process reads them again
         return state

@@ -1,8 +1,8 @@
 """Chunked arrays, read directly from the files that hold the chunks.
 
-A chunk is a range of bytes in a file, in zarr's shards and in HDF5's chunked data sets alike. It is fetched, its checksum is verified,
-and numcodecs decodes it: about a millisecond for a whole scan, where the stores' own libraries take several. No handle stays open, so
-these objects can be pickled, and used on both sides of a fork.
+A chunk is a range of bytes in a file, in zarr shards and in chunked data sets of HDF5. It is fetched, its checksum is verified, and
+numcodecs decodes it. This takes about a millisecond per scan; the zarr and HDF5 libraries take several. No handle stays open, so these
+objects can be pickled, and used on both sides of a fork.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ BLOCK = 1 << 21  # bytes that Blosc compresses together: a whole scan, because s
 
 @dataclass(frozen=True)
 class Encoding:
-    """How chunks become bytes.
+    """How chunks are encoded as bytes.
 
     Attributes:
         codec: "blosc" (Zstandard after a shuffle) or "pcodec".
@@ -49,21 +49,21 @@ class Encoding:
     shuffle: int = NO_SHUFFLE
 
     def encode(self, chunk: NDArray[Any], extra: str) -> bytes:
-        """Return a chunk's bytes as they are stored, without the checksum."""
+        """Return the encoded bytes of a chunk, without the checksum."""
         if self.codec == "pcodec":
             return bytes(_pcodec(self.level, extra).encode(np.ascontiguousarray(chunk).reshape(-1)))
         blosc = import_extra("numcodecs.blosc", extra)
         return bytes(blosc.compress(np.ascontiguousarray(chunk), b"zstd", self.level, self.shuffle, BLOCK))
 
     def decode(self, data: bytes | memoryview, out: NDArray[Any], extra: str) -> None:
-        """Decode a chunk's bytes into `out`, a contiguous array of the chunk's shape and dtype.
+        """Decode the bytes of a chunk into `out`, a contiguous array with the shape and dtype of the chunk.
 
         Raises:
-            FormatError: they cannot be decoded, or are those of another number of elements.
+            FormatError: the bytes cannot be decoded, or have another number of elements.
         """
         try:
             if self.codec == "pcodec":
-                # numcodecs does not say how many numbers there were: fewer would leave the rest of `out` as it is.
+                # numcodecs does not report the number of decoded values: with too few, the rest of `out` would be unset.
                 # PCodec before 1.1 has `standalone` as a module alone, not as an attribute of the package.
                 progress = import_extra("pcodec.standalone", extra).simple_decompress_into(bytes(data), out.reshape(-1))
                 if progress.n_processed != out.size or not progress.finished:
@@ -73,21 +73,21 @@ class Encoding:
                 import_extra("numcodecs.blosc", extra).decompress(data, out)
         except (CarlascError, KeyboardInterrupt, SystemExit):
             raise
-        except BaseException as error:  # each codec raises its own types; a panic of PCodec, in Rust, is no Exception
+        except BaseException as error:  # each codec raises other types; a Rust panic in PCodec is not an Exception
             raise FormatError("its bytes", problem=f"cannot be decoded: {describe(error)}") from error
 
 
 def _check_blosc(data: bytes | memoryview, size: int) -> None:
-    """Check the header of bytes that Blosc will decode, as `blosc_cbuffer_validate` of C-Blosc does: Blosc believes it.
+    """Check a Blosc header as `blosc_cbuffer_validate` of C-Blosc does, because the Blosc decoder does not check it.
 
-    The header is that of Blosc 1 (README_CHUNK_FORMAT.rst): version, version of the codec, flags, size of a type, and then as 32-bit
-    numbers the bytes that were compressed, those of a block, and the compressed ones.
+    The header of Blosc 1 (README_CHUNK_FORMAT.rst) has the version, the version of the codec, flags and the type size, followed by three
+    32-bit numbers: uncompressed bytes, bytes per block and compressed bytes.
 
     Raises:
-        ValueError: it is that of other data.
+        ValueError: the header does not fit the data.
     """
     if len(data) < _BLOSC_HEADER.size:
-        raise ValueError(f"{len(data)} bytes are no Blosc chunk")
+        raise ValueError(f"{len(data)} bytes are not a Blosc chunk")
     *_, decoded, block, encoded = _BLOSC_HEADER.unpack_from(data)
     if (decoded, encoded) != (size, len(data)) or not 0 < block <= max(decoded, 1):
         raise ValueError(f"{decoded} bytes from {encoded}, in blocks of {block}, instead of {size} from {len(data)}")
@@ -99,16 +99,16 @@ def _pcodec(level: int, extra: str) -> Any:
 
 
 class StoredArray:
-    """An array of a store in chunks, which are counted in C order. The array of a column has an entry for each frame along its first axis.
+    """A chunked array of a store. Chunks are numbered in C order. The array of a column has one entry per frame along its first axis.
 
     Attributes:
         tree: the tree of files that holds the chunks.
         name: name of the array, for errors.
         dtype: type of the elements, little-endian.
-        shape: of the whole array.
+        shape: shape of the whole array.
         chunk: shape of a chunk.
-        encoding: how chunks become bytes.
-        slots: number of chunks that an entry of the first axis has room for.
+        encoding: how chunks are encoded.
+        slots: number of chunks per entry of the first axis.
     """
 
     extra = "zarr"
@@ -144,7 +144,7 @@ class StoredArray:
         raise NotImplementedError
 
     def verify(self, data: memoryview, number: int) -> memoryview:
-        """Return a chunk's encoded bytes without their checksum.
+        """Verify the checksum of a chunk, and return its encoded bytes without it.
 
         Raises:
             FormatError: the checksum does not match.
@@ -152,7 +152,7 @@ class StoredArray:
         raise NotImplementedError
 
     def fetch(self, numbers: Sequence[int]) -> list[memoryview]:
-        """Read chunks as they are stored; all at once from a remote store."""
+        """Read encoded chunks; all at once from a remote store."""
         return [memoryview(data) for data in self.tree.read_ranges(self.locate(numbers))]
 
     def decode(self, data: memoryview, number: int, out: NDArray[Any]) -> None:
@@ -168,9 +168,9 @@ class StoredArray:
 
 
 def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
-    """Apply a function to several items in threads; it should spend its time in decoders, which release the GIL.
+    """Apply a function to several items in threads. The function should mostly run decoders, which release the GIL.
 
-    A worker process, such as a DataLoader's, uses one thread: the user has chosen the number of processes.
+    A worker process, such as one of a DataLoader, uses one thread, because the user has chosen the number of processes.
     """
     items = list(items)
     if len(items) < 2 or multiprocessing.parent_process() is not None:
@@ -179,10 +179,10 @@ def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
 
 
 def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
-    """Apply a function in other threads than this one.
+    """Apply a function in threads other than the main thread.
 
-    In the main thread, Blosc compresses the blocks of a large chunk in threads of its own, and writes them in the order in which they are
-    done: the bytes would differ from run to run.
+    In the main thread, Blosc compresses the blocks of a large chunk in several threads and writes them in the order of completion, so the
+    bytes would differ from run to run.
     """
     with postponed_interrupts():
         results = _pool(os.getpid()).map(function, items)
@@ -190,7 +190,7 @@ def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
 
 
 def crc32c(data: bytes | memoryview, extra: str) -> int:
-    """Return the CRC-32C of some bytes: processors have an instruction for it, which makes it six times as fast as CRC-32."""
+    """Return the CRC-32C of some bytes. CPUs have an instruction for it, which makes it six times as fast as CRC-32."""
     source = data.obj if isinstance(data, memoryview) else data
     whole = (
         source if isinstance(source, bytes) and len(source) == len(data) else bytes(data)
@@ -199,7 +199,7 @@ def crc32c(data: bytes | memoryview, extra: str) -> int:
 
 
 def scratch(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return uninitialised memory of this thread, which the next call returns again."""
+    """Return uninitialised memory of this thread. The next call in the thread reuses it."""
     size = math.prod(shape) * dtype.itemsize
     if _scratch.memory.size < size:
         _scratch.memory = np.empty(size, np.uint8)
@@ -215,6 +215,6 @@ _scratch = _Scratch()
 
 @cache
 def _pool(_pid: int) -> ThreadPoolExecutor:
-    """Return the threads of this process: after a fork, the object exists in the child, but its threads do not."""
+    """Return the thread pool of this process. It is created per process, because threads do not survive a fork."""
     threads = 1 if multiprocessing.parent_process() is not None else min(8, count_cores())
     return ThreadPoolExecutor(threads, thread_name_prefix="carlasc-codec")

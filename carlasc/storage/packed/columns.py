@@ -1,6 +1,6 @@
-"""How a field's frames become columns of arrays, and come back; numbers in fewer bytes.
+"""Conversion of the frames of a field to columns of arrays and back, with numbers in fewer bytes.
 
-Every rule is lossless to the last bit, negative zeros and NaN payloads included, except for `scale_m`, which the user asks for.
+Every rule is lossless to the last bit, including negative zeros and NaN payloads, except for the option `scale_m`.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from carlasc.storage import field_files
 from carlasc.storage.packed.chunks import BITSHUFFLE, NO_SHUFFLE, SHUFFLE, Encoding
 from carlasc.storage.packed.stores import PackOptions
 
-# Points per chunk: PCodec's bins fit the scene better than in a whole scan, and padding takes bits.
+# Points per chunk: the bins of PCodec fit better than for a whole scan, and padding takes space.
 _PCODEC_STEP = 8192
-LEAST = 1 << 14  # elements per chunk, at least
-FEW = 256  # the same of boxes, and of the distinct vectors of a flow
-WIDE = "_wide"  # ending of the name of a second column
+LEAST = 1 << 14  # minimum number of elements per chunk
+FEW = 256  # minimum for boxes, and for the distinct vectors of a flow
+WIDE = "_wide"  # suffix of the name of a wide column
 _GEOMETRY = tuple(name for name in BOXES_DTYPE.names or () if BOXES_DTYPE[name].kind == "f")
-_WIDE_CELLS = {"<u4": ("u1", "<u4"), "<f4": ("<u2", "<f4")}  # labels and counts of grids, by their published type
+_WIDE_CELLS = {"<u4": ("u1", "<u4"), "<f4": ("<u2", "<f4")}  # narrow and wide type of grids, by the published type
 Columns = dict[str, NDArray[Any]]
 
 
@@ -36,13 +36,13 @@ class Column:
     Attributes:
         name: name of the array.
         dtype: type of its elements.
-        encoding: how its chunks are written.
+        encoding: how its chunks are encoded.
         unit: unit of its values.
-        rows: leading dimension of a (rows, N) column; None for a flat one.
-        scratch: whether a decoded frame is copied at once, so that the next frame may be decoded into the same memory.
+        rows: leading dimension of a (rows, N) column; None for a flat column.
+        scratch: whether decoded frames may share memory, because each is copied before the next one is decoded.
         step: elements per chunk; None chooses it so that a typical frame fills one chunk.
-        least: smallest value chosen for `step`: a first scan of three points must not lead to chunks of three.
-        wide: type of the column `<name>_wide`, which takes the frames that do not fit this one; None: there is no second column.
+        least: minimum of the chosen `step`, so that a very small first scan does not lead to tiny chunks.
+        wide: type of the column `<name>_wide` for frames whose values do not fit this column; None if it does not exist.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Column:
 
     @property
     def both(self) -> tuple[Column, ...]:
-        """This column, and the wide one if there is one."""
+        """This column, and its wide column if it exists."""
         if self.wide is None:
             return (self,)
         return self, replace(self, name=f"{self.name}{WIDE}", dtype=self.wide, least=LEAST, wide=None)
@@ -70,7 +70,7 @@ class Packing(ABC):
         kind: name of this kind in the store.
         entry: the field in the layout.
         columns: its arrays.
-        attributes: what a reader needs to know besides the arrays; written to the store.
+        attributes: further information for readers; written to the store.
     """
 
     kind: ClassVar[str]
@@ -86,26 +86,26 @@ class Packing(ABC):
 
     @abstractmethod
     def split(self, array: NDArray[Any]) -> Columns:
-        """Return a frame's columns, without those that it does not need."""
+        """Return the columns of a frame, without columns that it does not use."""
 
     @abstractmethod
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return a frame's array, written to `into` if that is given; columns that the frame did not need are empty."""
+        """Return the array of a frame, written to `into` if given. Columns that the frame does not use are empty."""
 
     def published_bytes(self, counts: Mapping[str, int]) -> int:
-        """Return the bytes of the published files that have these numbers of elements in the columns, the wide ones included."""
+        """Return the size of the published files, from the number of elements by column, including wide columns."""
         main = self.columns[0].name
         elements = counts.get(main, 0) + counts.get(f"{main}{WIDE}", 0)
         row = np.dtype(self.entry.dtype or BOXES_DTYPE).itemsize * (self.entry.columns or 1)
         return elements * row
 
     def allocate(self, counts: list[int]) -> list[NDArray[Any] | None]:
-        """Return an array for each frame of `counts` elements, for `join` to write to; None where `join` allocates it."""
+        """Return one array per frame, of `counts` elements, for `join` to write to; None if `join` allocates it."""
         return [None] * len(counts)
 
 
 class PointsPacking(Packing):
-    """(N, 4) points: `xyz` as (3, N), and `fourth` only in frames where a bit of the 4th column is set."""
+    """(N, 4) points: `xyz` as (3, N), and `fourth` only in frames where the 4th column has a non-zero bit."""
 
     kind = "points"
 
@@ -119,7 +119,7 @@ class PointsPacking(Packing):
         )
 
     def split(self, array: NDArray[Any]) -> Columns:
-        """Return the coordinates as planes, and the 4th column where a bit of it is set."""
+        """Return the coordinates as planes, and the 4th column if it has a non-zero bit."""
         xyz = array[:, :3].T
         if scale := self.attributes.get("scale_m"):
             xyz = quantise(xyz, scale)
@@ -127,10 +127,12 @@ class PointsPacking(Packing):
         return {"xyz": xyz} | ({"fourth": fourth} if fourth.view(np.uint32).any() else {})
 
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return (N, 4) float32 rows, as the published file has them."""
+        """Return (N, 4) float32 rows, as in the published file."""
         xyz, fourth = columns["xyz"], columns["fourth"]
         points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
-        points[:, 0], points[:, 1], points[:, 2] = self.to_metres(xyz)  # all three at once take five times as long
+        points[:, 0], points[:, 1], points[:, 2] = self.to_metres(
+            xyz
+        )  # one assignment of all three takes five times as long
         points[:, 3] = fourth if fourth.size else 0
         return points
 
@@ -142,8 +144,8 @@ class PointsPacking(Packing):
     def allocate(self, counts: list[int]) -> list[NDArray[Any] | None]:
         """Return the scans of a stack as parts of one block of memory.
 
-        The operating system allocates large blocks in large pages. Touching the small pages of sixteen separate arrays for the first
-        time takes longer than decoding the scans.
+        The operating system uses large pages for large blocks. The first access to the small pages of sixteen separate arrays takes
+        longer than decoding the scans.
         """
         ends = np.cumsum(counts).tolist()
         block = np.empty((ends[-1] if ends else 0, 4), np.float32)
@@ -151,7 +153,7 @@ class PointsPacking(Packing):
 
 
 class ValuesPacking(Packing):
-    """A flat array of numbers, as `values`; classes as bytes where they fit."""
+    """A flat array of numbers, as `values`; classes as bytes if they fit."""
 
     kind = "values"
 
@@ -166,13 +168,13 @@ class ValuesPacking(Packing):
         return {"values": narrow(array)}
 
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return (N,) values in the field's type, or classes in the narrowest one."""
+        """Return (N,) values in the type of the field; classes in the narrowest type."""
         values = columns["values"]
         return values if self.entry.kind in ("class", "picture") else values.astype(self.entry.dtype, copy=False)
 
 
 class PairsPacking(Packing):
-    """(N, K) numbers as `values` (K, N): classes and probabilities, each column of which is much like itself."""
+    """(N, K) classes and probabilities, as `values` (K, N): values of one column are similar, and compress well together."""
 
     kind = "pairs"
 
@@ -190,7 +192,7 @@ class PairsPacking(Packing):
 
 
 class FlowPacking(Packing):
-    """(N, 3) vectors as a `palette` (3, K) of the frame's distinct vectors, compared bit by bit, and the `index` of each point's."""
+    """(N, 3) vectors as a `palette` (3, K) of distinct vectors, compared bit by bit, and an `index` (N,) into it."""
 
     kind = "flow"
 
@@ -201,7 +203,7 @@ class FlowPacking(Packing):
         )
 
     def split(self, array: NDArray[Any]) -> Columns:
-        """Find the distinct vectors; most repeat the one before, so only the first of each run is compared."""
+        """Find the distinct vectors. Most vectors repeat the previous one, so only the first of each run is compared."""
         bits = np.ascontiguousarray(array, "<f4").view(np.uint32).reshape(-1, 3)
         starts = np.flatnonzero((bits[1:] != bits[:-1]).any(axis=1)) + 1
         starts = np.concatenate([np.zeros(min(len(bits), 1), np.int64), starts])
@@ -213,7 +215,8 @@ class FlowPacking(Packing):
         """Return (N, 3) float32."""
         index, palette = columns["index"], columns["palette"]
         if index.size and int(index.max()) >= palette.shape[1]:
-            raise FormatError("its index", expected=f"indices below {palette.shape[1]}", found=str(int(index.max())))
+            found, advice = str(int(index.max())), "the store is damaged"
+            raise FormatError("its index", expected=f"indices below {palette.shape[1]}", found=found, advice=advice)
         return np.ascontiguousarray(palette.T)[index]
 
 
@@ -228,11 +231,11 @@ class GridPacking(Packing):
         return (Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit, wide=wide),)
 
     def split(self, array: NDArray[Any]) -> Columns:
-        """Narrow the values, except probabilities: they are whole numbers in few frames, and float32 would take more space."""
+        """Narrow the values, except probabilities: they are rarely integers, and float32 would take more space."""
         return {"values": array.astype(self.entry.dtype) if self.entry.kind == "probability" else narrow(array)}
 
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return (X, Y, Z) unsigned integers, float32 where counts are not whole numbers, or float16 for probabilities."""
+        """Return (X, Y, Z): unsigned integers, float32 if counts are not integers, or float16 for probabilities."""
         return columns["values"]
 
 
@@ -268,7 +271,7 @@ class VotesPacking(Packing):
 
 
 class VelocitiesPacking(Packing):
-    """Velocities of the voxels that move: the columns of the table, as `voxel`, and `velocity` as (3, N)."""
+    """Velocities of moving voxels: the columns of the table, as `voxel`, and `velocity` as (3, N)."""
 
     kind = "velocities"
 
@@ -292,7 +295,7 @@ class VelocitiesPacking(Packing):
 
 
 class BoxesPacking(Packing):
-    """Boxes: the numbers of the table as `geometry` (10, N), and its other columns as they are."""
+    """Boxes: the real numbers of the table as `geometry` (10, N), and its other columns unchanged."""
 
     kind = "boxes"
 
@@ -323,7 +326,7 @@ class BoxesPacking(Packing):
 def packing_of(
     entry: field_files.Field, options: PackOptions | None = None, attributes: Mapping[str, Any] | None = None
 ) -> Packing:
-    """Return how a field is packed: by `options` when it is written, by the store's `attributes` when it is read."""
+    """Return the packing of a field: from `options` for writing, from the `attributes` of the store for reading."""
     options = options or PackOptions()
     if attributes is None:
         attributes = {"scale_m": options.scale_m} if entry.kind == "position" and options.lossy_mm else {}
@@ -342,7 +345,7 @@ _BY_KIND: dict[field_files.Kind, Callable[..., Packing]] = {
 
 
 def quantise(metres: NDArray[Any], scale_m: float) -> NDArray[np.int32]:
-    """Return coordinates as whole steps of `scale_m`.
+    """Return coordinates as integer multiples of `scale_m`.
 
     Raises:
         FormatError: a coordinate is NaN, infinite, or too large for an int32.
@@ -352,14 +355,14 @@ def quantise(metres: NDArray[Any], scale_m: float) -> NDArray[np.int32]:
         raise FormatError(
             "points",
             expected=f"finite coordinates within {2**31 * scale_m:.0f} m to quantise",
-            found="others",
-            advice="pack them without `lossy_mm`",
+            found="NaN, infinity or larger values",
+            advice="pack without `lossy_mm`",
         )
     return steps.astype(np.int32)
 
 
 def narrow(array: NDArray[Any]) -> NDArray[Any]:
-    """Return whole numbers in the smallest unsigned type that holds them, and other numbers as float32, bit for bit."""
+    """Return integers in the smallest unsigned type that holds them, and other numbers as float32, bit for bit."""
     if array.dtype.kind == "f":
         values = np.ascontiguousarray(array, "<f4")
         with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""The place of a packed store: what may be overwritten, and how a finished store gets its name."""
+"""The output path of a packed store: check for existing files, and rename the finished store into place."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageErr
 from carlasc.storage.files import make_folder, remove_file, rename, replaced, storage_error, sync_all, write_at
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
-UNFINISHED_MARK = "unfinished.json"  # in its place until the store is whole
+UNFINISHED_MARK = "unfinished.json"  # its name until the store is complete
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Refuse to write over something that exists, and over anything but a packed store even with `overwrite`.
+    """Check that an output path is new, or is a packed store and `overwrite` is given.
 
     Raises:
         ArgumentError: the path has no name.
-        ConflictError: something exists there that may not be overwritten.
+        ConflictError: existing data may not be overwritten.
     """
     if not path.name:
         raise ArgumentError("out", expected="the name of a store", found=f"{str(path)!r}")
@@ -31,9 +31,9 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
     if not overwrite:
         raise ConflictError(
             path,
-            expected="nothing there",
+            expected="a new path",
             found=f"a {kind}",
-            advice="choose another name, remove it, or give `overwrite=True` where there is such an option",
+            advice="choose another name, remove it, or give `overwrite=True` if the command has this option",
         )
     if not _is_store(path):
         raise ConflictError(
@@ -49,17 +49,17 @@ def _is_store(path: Path) -> bool:
 
 
 def unfinished_error(where: str | os.PathLike[str]) -> FormatError:
-    """Return the error of a store that is being written, or whose writing was interrupted: the same for every format."""
+    """Return the error for an unfinished store of any format: it is being written, or the run was interrupted."""
     return FormatError(
         where,
         expected="a finished store",
-        found="one that is being written, or was interrupted",
-        advice="run the same command again to finish it (`carlasc finish` for a .zarr store whose parts are all written)",
+        found="an unfinished one: a run is writing it, or was interrupted",
+        advice="run the same command again to finish it (`carlasc finish` if all parts of a .zarr store are written)",
     )
 
 
 def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
-    """Rename a finished store, which is on the disk, to its name; an older one is removed only then.
+    """Rename a finished store to its final path. An older store is removed after that.
 
     Raises:
         ConflictError: something exists there that may not be overwritten.
@@ -73,16 +73,16 @@ def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
             path.rename(old)
         rename(finished, path)
         if overwrite:
-            remove(old)  # also what a run left that was ended here
+            remove(old)  # also removes what a run left that was killed here
     except OSError as error:
         raise StorageError(path, problem=f"cannot be put in place: {error.strerror or error}") from error
 
 
 class PatientFile(io.RawIOBase):
-    """A new file for a library that cannot go on after a failed write.
+    """A new file for libraries that do not handle failed writes.
 
-    h5py then crashes, pyarrow complains about its own destructor, and Foxglove says nothing. The file keeps the first error, drops all that is
-    written after it, and `check` raises it.
+    After a failed write, h5py crashes, pyarrow prints an error of its destructor, and Foxglove ignores it. This file keeps the first error and
+    drops all later writes; `check` raises the error.
     """
 
     def __init__(self, path: Path, place: Path | None) -> None:
@@ -90,7 +90,7 @@ class PatientFile(io.RawIOBase):
 
         Args:
             path: the file.
-            place: what it becomes when it is whole, for errors; None if who writes it says so: `check` then raises the error as it is.
+            place: final path of the file, for errors; None if the caller names it: `check` then raises the original error.
 
         Raises:
             StorageError: it cannot be created.
@@ -102,7 +102,7 @@ class PatientFile(io.RawIOBase):
         self._descriptor = -1  # until it is open
         try:
             make_folder(path.parent)
-            path.unlink(missing_ok=True)  # what an abandoned writer of this process still writes goes into its own file
+            path.unlink(missing_ok=True)  # an abandoned writer of this process may still write to the old file
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
             raise storage_error(place or path, error) from error
@@ -111,7 +111,7 @@ class PatientFile(io.RawIOBase):
         """Raise the error of the first write that failed.
 
         Raises:
-            StorageError: one did.
+            StorageError: a write failed.
         """
         if self._error is not None and self._place is None:
             raise self._error
@@ -119,15 +119,15 @@ class PatientFile(io.RawIOBase):
             raise storage_error(self._place, self._error) from self._error
 
     def readable(self) -> bool:
-        """It can be read."""
+        """Return True."""
         return True
 
     def writable(self) -> bool:
-        """It can be written."""
+        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """It has a position."""
+        """Return True."""
         return True
 
     def tell(self) -> int:
@@ -181,14 +181,14 @@ class PatientFile(io.RawIOBase):
         if not self.closed:
             super().close()
             try:
-                if self._descriptor >= 0:  # Python also closes a file that could not be created
+                if self._descriptor >= 0:  # Python also calls this if the file could not be created
                     os.close(self._descriptor)
-            except OSError as error:  # a network file system may report here what it could not write
+            except OSError as error:  # network file systems may report failed writes here
                 self._error = self._error or error
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder, if it exists, and wait until its name is gone from the disk."""
+    """Remove a file or a folder, if it exists, and wait until the removal is on the disk."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
         sync_all([path.parent])

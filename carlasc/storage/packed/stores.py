@@ -1,4 +1,4 @@
-"""What all packed stores have in common: the options, the check of a store's root, and reading and writing one sequence."""
+"""Base classes of all packed stores: options, the check of the root, and reading and writing one sequence."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class PackOptions:
     """How a store is packed.
 
     Attributes:
-        small: PCodec for the points: smaller, but only readers with numcodecs' `pcodec` extension open it.
-        lossy_mm: quantise points to this many millimetres; None keeps every bit.
-        block: number of frames in one file of a zarr store, which one task writes.
+        small: compress points with PCodec: smaller, but readers need the `pcodec` extension of numcodecs.
+        lossy_mm: quantise points to this many millimetres; None is lossless.
+        block: number of frames per file of a zarr store. One task writes a block.
 
     Raises:
         ArgumentError: `lossy_mm` is not above 0 and at most 1000, or `block` is not from 1 to 1024.
@@ -57,7 +57,7 @@ class PackedSource(Source):
 
     Attributes:
         nodes: the group (or folder) of each sequence in the store, by the sequence's path.
-        lossy_mm: step to which coordinates of points were rounded, millimetres; None if every bit was kept.
+        lossy_mm: rounding step of the coordinates of points, millimetres; None if they are lossless.
     """
 
     nodes: Mapping[str, str]
@@ -66,7 +66,7 @@ class PackedSource(Source):
         """Check the attributes of the store's root.
 
         Raises:
-            FormatError: it is something else, unfinished, or of another version, or a name in it leads out of the store.
+            FormatError: it is not a packed store, is unfinished, has another version, or has a name that leads out of the store.
         """
         self.location = location
         self.nodes = _check_root(root, location)
@@ -74,17 +74,17 @@ class PackedSource(Source):
         self.lossy_mm = float(lossy) if isinstance(lossy, int | float) and lossy else None
 
     def published_bytes(self) -> dict[str, int]:
-        """Return the bytes that the published files of each field have; empty where the store does not say it."""
+        """Return the size of the published files by field; empty if the store does not record it."""
         return {}
 
     @abstractmethod
     def stored_bytes(self) -> dict[str, int]:
-        """Return the bytes that each field takes in the store; "documents" for the text files, "index" for all the rest."""
+        """Return the stored bytes by field, with "documents" for the text files and "index" for everything else."""
 
 
 def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]:
     if root is None or root.get("type") != STORE:
-        raise FormatError(where, expected="a store packed by carlasc", found=f"one without the type {STORE}")
+        raise FormatError(where, expected="a store packed by carlasc", found=f"a store without the type {STORE}")
     version = root.get("version", 1)
     if isinstance(version, bool) or not isinstance(version, int | np.integer) or version < 1:
         raise FormatError(where, expected="a version above 0", found=repr(version), advice="the store is damaged")
@@ -117,7 +117,7 @@ _FieldReader = TypeVar("_FieldReader", bound=FieldReader)
 
 
 class PackedSequence(Sequence, Generic[_FieldReader]):
-    """One sequence of a packed store: each field is looked up when it is first read."""
+    """One sequence of a packed store. Each field is opened on its first read."""
 
     def __init__(self, path: str, location: str, about: Mapping[str, Any]) -> None:
         """Take the sequence's split, name, coordinates, fields and text files from its attributes.
@@ -143,7 +143,7 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
         names = (self.name, self.coordinates, self.split or "", *self._fields, *self._documents)
         if not all(isinstance(name, str) for name in names) or self.coordinates not in layout.COORDINATES:
             raise FormatError(
-                location, expected="names of the sequence, its fields and its text files", found="others",
+                location, expected="names of the sequence, its fields and its text files", found="other values",
                 advice="the store is damaged",
             )  # fmt: skip
         check_names([*self._fields, *self._documents], location)
@@ -180,23 +180,23 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
         return self._readers[field]
 
     def __getstate__(self) -> dict[str, Any]:
-        return super().__getstate__() | {"_readers": {}}  # a worker looks up what it needs
+        return super().__getstate__() | {"_readers": {}}  # a worker process opens fields again
 
 
 class PackedSink(Sink):
-    """Writes a packed store by appending: one writer, which writes one sequence after the other."""
+    """Writes a packed store by appending. One writer writes one sequence after the other."""
 
     @abstractmethod
     def finished(self, path: str) -> bool:
-        """Whether an earlier run that was interrupted has written this sequence whole."""
+        """Whether an interrupted run has completed this sequence."""
 
     @abstractmethod
     def sequence(self, path: str) -> PackedWriter:
-        """Start a sequence; what an interrupted run left of it is removed."""
+        """Start a sequence. An incomplete sequence of an interrupted run is removed."""
 
 
 class FieldWriter(ABC):
-    """Takes one field of a sequence, its frames in rising order.
+    """Writes one field of a sequence, with frames in ascending order.
 
     Attributes:
         entry: the field in the layout.
@@ -226,14 +226,14 @@ class FieldWriter(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Write what is held back."""
+        """Write buffered data."""
 
 
 class PackedWriter(SequenceWriter):
-    """Takes one sequence of a packed store, each field's frames in rising order.
+    """Writes one sequence of a packed store, with the frames of each field in ascending order.
 
     Attributes:
-        identity: split, name and coordinates, from the path unless they are known better.
+        identity: split, name and coordinates; by default those of the path.
         writers: the fields written so far.
         contents: the text files written so far.
     """
@@ -249,18 +249,19 @@ class PackedWriter(SequenceWriter):
     def _start_field(self, field: str) -> FieldWriter: ...
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy in another process knows its name only: one process writes the store."""
+        """Keep only the name, because only one process writes the store."""
         return {"location": self.location, "path": self.path, "identity": self.identity, "writers": {}, "contents": {}}
 
     def has(self, field: str, frame: int) -> bool:
-        """Whether this run has written it."""
+        """Whether this run has written the frame."""
         return field in self.writers and frame in self.writers[field].frames
 
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
         """Append one frame to a field.
 
         Raises:
-            FormatError: it does not fit the field, or an earlier frame, or the field's name leads out of the store.
+            FormatError: the array does not fit the field, `frame` is not above the previous one, or the name of the field leads out of the
+                store.
         """
         if field not in self.writers:
             check_names([field], self.location)
@@ -276,18 +277,18 @@ class PackedWriter(SequenceWriter):
         self.contents[name] = data
 
     def read_document(self, name: str) -> bytes | None:
-        """Return a text file's bytes, None if it was not written."""
+        """Return the bytes of a text file; None if it was not written."""
         return self.contents.get(name)
 
     def about(self) -> dict[str, Any]:
-        """Return what the store says of the sequence."""
+        """Return the attributes of the sequence in the store."""
         split, name, coordinates = self.identity
         about = {"path": self.path, "split": split, "name": name, "coordinates": coordinates}
         return about | {"fields": sorted(self.writers), "documents": sorted(self.contents)}
 
 
 def node_of(path: str, where: str) -> str:
-    """Return the group (or folder) of a sequence in a store: its path, or "sequence" where that is empty.
+    """Return the group (or folder) of a sequence in a store: its path, or "sequence" if the path is empty.
 
     Raises:
         FormatError: the path leads out of the store.
@@ -297,11 +298,16 @@ def node_of(path: str, where: str) -> str:
 
 
 def check_names(names: list[str], where: str) -> None:
-    """Refuse names that lead out of a store: anybody may have made it.
+    """Check that names from an untrusted store do not lead out of it.
 
     Raises:
-        FormatError: names the first of them.
+        FormatError: a name does; the message has the first one.
     """
     for name in names:
         if leads_outside(name):
-            raise FormatError(where, expected="names inside the store", found=repr(name), advice="it leads elsewhere")
+            raise FormatError(
+                where,
+                expected="names inside the store",
+                found=repr(name),
+                advice="the name leads out of the store: do not use this store",
+            )

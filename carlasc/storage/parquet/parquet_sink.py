@@ -33,20 +33,20 @@ from carlasc.storage.packed.stores import (
 from carlasc.storage.parquet.parquet_source import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE, footer_checksums
 from carlasc.storage.parquet.table_columns import AXES, column_types, describe, split_columns, statistics
 
-_LEVEL = 12  # of Zstandard: from 11 on, points take 2 % less; above 12, it takes several times as long
-_PAGE = 8 << 20  # bytes: one page holds a scan's column
+_LEVEL = 12  # level of Zstandard: from 11, points take 2 % less space; above 12, it takes several times as long
+_PAGE = 8 << 20  # bytes: one page holds one column of a scan
 
 
 class ParquetSink(PackedSink):
-    """Writes a folder of packed Parquet tables, which gets its name when the sink is closed, and not before."""
+    """Writes a folder of packed Parquet tables. It gets its final name only when the sink is finished."""
 
     def __init__(
         self, path: str | os.PathLike[str], options: PackOptions | None = None, overwrite: bool = False
     ) -> None:
-        """Start a store, or continue one whose packing was interrupted: its finished sequences are kept.
+        """Start a store, or continue an interrupted run. Its completed sequences are kept.
 
         Raises:
-            ArgumentError: `small` is given, for which Parquet has no encoding.
+            ArgumentError: `small` is given, but Parquet has no PCodec encoding.
             ConflictError: something exists at `path`, and `overwrite` is not given.
             DependencyError: pyarrow is not installed.
         """
@@ -73,20 +73,20 @@ class ParquetSink(PackedSink):
         self._numbers = {str(about["path"]): int(about[NUMBER]) for about in done.values()}
 
     def finished(self, path: str) -> bool:
-        """Whether an earlier run that was interrupted has written this sequence whole."""
+        """Whether an interrupted run has completed this sequence."""
         return path in self._sequences
 
     def sequence(self, path: str) -> ParquetWriter:
-        """Start a sequence; what an interrupted run left of it is removed."""
+        """Start a sequence. An incomplete sequence of an interrupted run is removed."""
         folder = node_of(path, self.location)
         self._sequences.pop(path, None)
         remove(self._part / folder)
-        # One that is written again keeps its number, so that an interrupted run leaves the bytes of one that was not.
+        # A sequence that is written again keeps its number, so that the store has the same bytes as without an interruption.
         number = self._numbers.setdefault(path, 1 + max(self._numbers.values(), default=-1))
         return ParquetWriter(self._part, path, folder, number, self.options, self._sequences)
 
     def finish(self, *, incomplete: bool = False) -> None:
-        """Mark the store as finished and give it its name."""
+        """Mark the store as finished and rename it."""
         root = {
             "type": STORE,
             "version": VERSION,
@@ -120,18 +120,18 @@ class ParquetWriter(PackedWriter):
         """Append one frame as a row group.
 
         Raises:
-            FormatError: it does not fit the field, or an earlier frame.
+            FormatError: the array does not fit the field, or `frame` is not above the previous one.
         """
         super().write(field, frame, array)
         self._statistics.setdefault(frame, {}).update(statistics(field, array))
 
     def close(self) -> None:
-        """Finish the tables and mark the sequence as whole."""
+        """Finish the tables and mark the sequence as complete."""
         for table in self.writers.values():
             table.close()
         self._write_frames()
         self._write_documents()
-        sync_tree(self._folder)  # before the mark that says so
+        sync_tree(self._folder)  # before the mark is written
         about = {NUMBER: self._number, FOOTERS: footer_checksums(self._folder)}
         write_atomic(self._folder / SEQUENCE, to_json(self.about() | about))
         self._finished[self.path] = self._name
@@ -160,7 +160,7 @@ class ParquetWriter(PackedWriter):
                 lines = decode(self.contents[document], document)
                 rows = [lines[frame if frames[-1] < len(lines) else frames.index(frame)] for frame in frames]
             except (KeyError, FormatError, IndexError):
-                continue  # no such file, or not numbers: the text is kept as it is, and its reader reports the error
+                continue  # missing, or not numbers: the text is kept unchanged, and its reader reports the error
             values = np.array(rows, np.float64).reshape(len(frames), 1 if name == "time_s" else 16)
             columns[name] = (
                 pa.array(values[:, 0])
@@ -187,12 +187,12 @@ class TableWriter(FieldWriter):
         self._number = number
         self.path = path
         self.scale_m = options.scale_m if field == "points" else None
-        self.rows: list[int] = []  # of each frame
+        self.rows: list[int] = []  # number of rows of each frame
         self.attributes: dict[str, Any] = {}
         self._writer: Any = None
 
     def write(self, frame: int, array: NDArray[Any]) -> None:
-        """Append one row group; an empty frame has none."""
+        """Append one row group. An empty frame has no row group."""
         pa = import_extra("pyarrow", "parquet")
         if self._writer is None:
             self._start(pa, array)

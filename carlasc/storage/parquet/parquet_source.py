@@ -1,7 +1,7 @@
 """Reading packed stores of Parquet tables: one file per field, one row group per frame.
 
-Parquet has checksums of pages and none of its footer, and one wrong bit there makes pyarrow 26 end the process: an exception of C++ that
-nothing catches. So a store says the checksums of its footers, and a footer is compared before pyarrow sees it.
+Parquet has checksums of pages, but not of the footer. With one wrong bit in a footer, pyarrow 26 terminates the process by an uncaught C++
+exception. A store therefore records the checksums of its footers, and a footer is verified before pyarrow reads it.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
-NUMBER = "number"  # its key with the number of the sequence in the column `sequence` of its tables
-FOOTERS = "footers"  # its key with the checksums of the footers of the tables
+NUMBER = "number"  # key for the number of the sequence, the value of the column `sequence` in the tables
+FOOTERS = "footers"  # key for the checksums of the footers of the tables
 FRAMES = "frames.parquet"  # one row per frame
 DOCUMENTS = "documents.parquet"  # one row per text file
 _END = 8  # bytes: the length of the footer, and "PAR1"
 _MARK = b"PAR1"
-_LONGEST = 1 << 28  # bytes; a sequence of ten thousand frames has some megabytes
+_LONGEST = 1 << 28  # bytes; the footer of ten thousand frames has a few megabytes
 
 
 class ParquetSource(PackedSource):
     """A folder of packed Parquet tables."""
 
     def __init__(self, tree: Tree) -> None:
-        """Read the file that marks the store.
+        """Read the mark file of the store.
 
         Raises:
             DependencyError: pyarrow is not installed.
-            FormatError: the store is unfinished, or of another version.
+            FormatError: the store is unfinished, or has another version.
         """
         import_extra("pyarrow.parquet", "parquet")
         super().__init__(tree.location, parse_json(bytes(tree.read(TABLES_MARK)), tree.where(TABLES_MARK)))
@@ -59,7 +59,7 @@ class ParquetSource(PackedSource):
         return {path: ParquetSequence(self.tree, path, folder) for path, folder in self.nodes.items()}
 
     def stored_bytes(self) -> dict[str, int]:
-        """Return the bytes of each field's file; for a local folder only."""
+        """Return the stored bytes by field; empty unless the store is a local folder."""
         sizes: Counter[str] = Counter()
         for path, sequence in self.sequences().items():
             folder = Path(self.location) / self.nodes[path]
@@ -123,7 +123,7 @@ class ParquetSequence(PackedSequence["FieldTable"]):
 
 
 class FieldTable:
-    """One field's file: its footer is read once, a row group when its frame is read."""
+    """The file of one field. Its footer is read once, and a row group per frame."""
 
     def __init__(self, tree: Tree, path: str, field: str) -> None:
         self.tree = tree
@@ -140,8 +140,8 @@ class FieldTable:
         if not frames or len(frames) != len(rows) or not _rise(frames):
             raise FormatError(
                 self.where,
-                expected="rising frames, and the number of rows of each",
-                found="others",
+                expected="ascending frame numbers, and the number of rows of each",
+                found="other values",
                 advice="the store is damaged",
             )
         self.frames = np.array(frames, np.int64)
@@ -149,14 +149,14 @@ class FieldTable:
         self._groups = dict(zip(frames, zip(groups.tolist(), rows, strict=True), strict=True))
 
     def read(self, frame: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
-        """Read one frame; its values have `shape` if that is given."""
+        """Read one frame; reshaped to `shape` if given."""
         if frame not in self._groups:
             raise MissingDataError(self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it")
         rows = self._groups[frame][1]
         where = f"{self.where}: field {self.field}, frame {frame}"
         most = None if shape is None else math.prod(shape)
         if most is not None and rows != most:
-            raise FormatError(where, expected=f"{most} voxels", found=str(rows))
+            raise FormatError(where, expected=f"{most} voxels", found=str(rows), advice="the store is damaged")
         if rows:
             columns = self._read_group(frame, most is None)
         else:
@@ -166,16 +166,16 @@ class FieldTable:
             return array if shape is None else array.reshape(shape)
 
     def _read_group(self, frame: int, bounded: bool) -> dict[str, NDArray[Any]]:
-        """Return the columns of a frame. Its numbers of rows and bytes are compared with the footer before they are unpacked.
+        """Return the columns of a frame. The numbers of rows and bytes are checked before decompressing.
 
-        `bounded` says that nothing but the size of the largest scan bounds them.
+        With `bounded`, the only limit is the size of the largest possible scan.
         """
         (group, rows), where = self._groups[frame], f"{self.where}: field {self.field}, frame {frame}"
-        with reading(where, "the rows of a frame", "is it truncated or corrupted?"):
+        with reading(where, "the rows of a frame", "the file may be truncated or corrupted"):
             about = self._metadata.row_group(group) if group < self._metadata.num_row_groups else None
             if about is None or about.num_rows != rows:
                 found = "none" if about is None else str(about.num_rows)
-                raise FormatError(where, expected=f"{rows} rows", found=found)
+                raise FormatError(where, expected=f"{rows} rows", found=found, advice="the store is damaged")
             if bounded:
                 for type_ in self._types.values():
                     check_size((rows,), np.dtype("u1" if type_ == "binary" else type_), where)
@@ -200,7 +200,7 @@ class FieldTable:
 
 @contextmanager
 def opened(tree: Tree, path: str, metadata: Any = None) -> Iterator[Any]:
-    """Open a Parquet file; its footer is not read again where `metadata` is given.
+    """Open a Parquet file. If `metadata` is given, the footer is not read again.
 
     Raises:
         FormatError: it does not exist, is truncated, or the checksum of a page does not match.
@@ -210,7 +210,7 @@ def opened(tree: Tree, path: str, metadata: Any = None) -> Iterator[Any]:
     try:
         place = tree.open(path) if isinstance(tree, RemoteTree) else where
         with (
-            reading(where, "a Parquet file", "is it truncated or corrupted?"),
+            reading(where, "a Parquet file", "the file may be truncated or corrupted"),
             parquet.ParquetFile(place, metadata=metadata, page_checksum_verification=True) as file,
         ):
             yield file
@@ -223,10 +223,10 @@ def opened(tree: Tree, path: str, metadata: Any = None) -> Iterator[Any]:
 
 
 def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
-    """Return what the footer of a table says of its values.
+    """Return the checked attributes in the footer of a table.
 
     Raises:
-        FormatError: it does not say it, or the step of coordinates is not a length, or labels do not have one or two bytes.
+        FormatError: they are missing, the step of coordinates is not a valid length, or labels do not have one or two bytes.
     """
     scale, label_bytes = about.get("scale_m"), about.get("label_bytes", 1)
     if ("scale_m" in about and not (type(scale) in (int, float) and 0 < scale <= 1)) or label_bytes not in (1, 2):
@@ -240,15 +240,17 @@ def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
 
 
 def footer_checksum(tree: Tree, path: str) -> int:
-    """Return the CRC-32 of a table's footer, with its length and the mark behind it.
+    """Return the CRC-32 of the footer of a table, including its length and the mark at the end.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it does not end as a Parquet file does.
+        FormatError: the end of the file is not that of a Parquet file.
     """
     end = bytes(tree.read_range(path, -_END, 0))
     if len(end) != _END or not end.endswith(_MARK):
-        raise FormatError(tree.where(path), expected="a Parquet file", found="another end", advice="is it truncated?")
+        raise FormatError(
+            tree.where(path), expected="a Parquet file", found="another end of the file", advice="it may be truncated"
+        )
     length = int.from_bytes(end[:4], "little")
     if length > _LONGEST:
         raise FormatError(tree.where(path), expected=f"a footer of at most {_LONGEST} bytes", found=str(length))
@@ -256,17 +258,17 @@ def footer_checksum(tree: Tree, path: str) -> int:
 
 
 def footer_checksums(folder: Path) -> dict[str, int]:
-    """Return the checksum of each table below a folder on this machine, by its path there."""
+    """Return the checksum of the footer of each table below a local folder, by relative path."""
     tree = LocalTree(folder, mapped=False)
     paths = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.parquet"))
     return {path: footer_checksum(tree, path) for path in paths}
 
 
 def check_footer(tree: Tree, path: str, expected: object) -> None:
-    """Compare a table's footer with its checksum.
+    """Verify the footer of a table.
 
     Raises:
-        FormatError: it is another one.
+        FormatError: its checksum does not match, or the table does not exist.
     """
     try:
         found = footer_checksum(tree, path)
@@ -295,7 +297,7 @@ def _check_types(schema: Any, types: Mapping[str, str], where: str) -> None:
 
 
 def _counts(values: object) -> list[int]:
-    """Return a list of numbers from JSON; an empty one where it is something else."""
+    """Return a list of numbers from JSON; empty if it is anything else."""
     right = isinstance(values, list) and all(type(value) is int and 0 <= value < 2**48 for value in values)
     return values if right else []  # type: ignore[return-value]
 
@@ -305,5 +307,5 @@ def _rise(values: list[int]) -> bool:
 
 
 def _to_numpy(column: Any) -> NDArray[Any]:
-    """Return a row group's column, without a copy where it has one chunk and no missing values."""
+    """Return a column of a row group, without a copy if it has one chunk and no missing values."""
     return np.asarray(column.chunk(0).to_numpy(zero_copy_only=False) if column.num_chunks == 1 else column.to_numpy())

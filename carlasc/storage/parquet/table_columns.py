@@ -1,6 +1,6 @@
-"""How a field's frames become columns of a Parquet table, and come back.
+"""Conversion of the frames of a field to columns of a Parquet table and back.
 
-Parquet's own dictionaries and byte-stream split make them small: values keep their published types.
+Values keep their published types. Dictionaries and byte-stream split of Parquet make them small.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from carlasc.storage.field_files import VELOCITY_DTYPE, VOTES_DTYPE, WIDE_VOTES_
 from carlasc.storage.packed.columns import narrow, quantise
 
 AXES = frozenset("xyz")
-"""Columns of points that are quantised; not quantised, they have Parquet's byte-stream split, for numbers that seldom repeat."""
+"""Columns of points that can be quantised. Otherwise they use byte-stream split, because their values rarely repeat."""
 
 _VELOCITY = ("vx", "vy", "vz")
 
 
 def describe(entry: Field, array: NDArray[Any], scale_m: float | None) -> dict[str, Any]:
-    """Return what a reader needs to know besides the columns.
+    """Return the attributes that a reader needs in addition to the columns.
 
     Args:
         entry: the field.
-        array: its first frame.
-        scale_m: step to which coordinates are rounded; None keeps them.
+        array: the first frame.
+        scale_m: rounding step of coordinates, metres; None does not round.
     """
     if entry.kind == "position" and scale_m:
         return {"scale_m": scale_m}
@@ -36,7 +36,7 @@ def describe(entry: Field, array: NDArray[Any], scale_m: float | None) -> dict[s
 
 
 def column_types(entry: Field, attributes: Mapping[str, Any]) -> dict[str, str]:
-    """Return the name of each column's type in pyarrow, from what `describe` returned."""
+    """Return the pyarrow type name of each column. `attributes` is the result of `describe`."""
     match entry.kind:
         case "position":
             return {name: "int32" if "scale_m" in attributes and name in AXES else "float32" for name in entry.names}
@@ -53,7 +53,7 @@ def column_types(entry: Field, attributes: Mapping[str, Any]) -> dict[str, str]:
 
 
 def split_columns(entry: Field, array: NDArray[Any], attributes: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Return a frame's columns: those of a table, the columns of (N, K) rows, the values of a grid in C order, or one picture.
+    """Return the columns of a frame: of a table, of (N, K) rows, of the values of a grid in C order, or of one picture.
 
     Raises:
         FormatError: labels of votes are wider than those of the first frame, or coordinates cannot be quantised.
@@ -84,7 +84,7 @@ def split_columns(entry: Field, array: NDArray[Any], attributes: Mapping[str, An
 
 
 def join_columns(entry: Field, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> NDArray[Any]:
-    """Return a frame's array: a table, (N, K) rows, (N,) values (classes in the narrowest type that holds them), or a picture's bytes."""
+    """Return the array of a frame: a table, (N, K) rows, (N,) values (classes in the narrowest type), or the bytes of a picture."""
     first = next(iter(columns.values()))
     if entry.kind == "picture":
         return np.frombuffer(first[0], np.uint8)
@@ -114,7 +114,7 @@ def join_columns(entry: Field, columns: Mapping[str, NDArray[Any]], attributes: 
 
 
 def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:
-    """Return what frames.parquet tells about one frame of a field."""
+    """Return the columns of frames.parquet for one frame of a field."""
     if field == "points":
         finite = array[np.isfinite(array).all(axis=1), :3]
         reach = float(np.sqrt((finite.astype(np.float64) ** 2).sum(axis=1).max())) if len(finite) else None

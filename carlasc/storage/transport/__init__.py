@@ -1,1 +1,1 @@
-"""The only place that opens or sends files: trees that are read, targets that are written, requests, a cache, zips."""
+"""All access to files and servers: trees to read, targets to write, requests, a cache, zips. No other package opens or sends files."""

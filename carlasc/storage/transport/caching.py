@@ -1,8 +1,7 @@
-"""Files of a remote store, kept in a folder of this machine: each file is fetched once, whatever number of processes read it.
+"""A local cache for the files of remote stores. Each file is fetched once for all processes.
 
-A file in the folder is named after its URL and its version, which is made of its size and of what the server says of its content
-(ETag, time of the last change). Its time of modification is when it was last compared with the remote file, its time of access is
-when it was last used. Both are set by this module.
+The name of a cached file contains its URL and its version: its size, and its ETag or modification time on the server. The modification
+time of a cached file is the time of the last comparison with the remote file, its access time that of its last use. This module sets both.
 """
 
 from __future__ import annotations
@@ -25,24 +24,23 @@ from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree
 
 _PIECE = 4 << 20  # bytes of a range that is requested
-_AT_ONCE = 4  # ranges of a file that are requested side by side: they are in memory together
-_LARGEST_SHARE = 4  # a file of more than this part of the cache is read without it
+_AT_ONCE = 4  # ranges of a file that are requested in parallel; all of them are in memory
+_LARGEST_SHARE = 4  # files above 1/4 of the cache size are read without the cache
 _PART, _LOCK = ".part", ".lock"
-_TOUCH_S = 0.5  # how exactly the time of the last use is known
-_FULL_S = 60.0  # how long nothing is fetched after the disk was full
+_TOUCH_S = 0.5  # precision of the time of the last use
+_FULL_S = 60.0  # pause of fetching after the disk was full
 
 
 @dataclass(frozen=True)
 class Cache:
-    """A folder for files of remote stores. Several stores, and all processes of a machine, may share it.
+    """A cache folder for files of remote stores. Several stores and processes may share it.
 
-    Files are removed when the folder would become larger than `max_bytes`: those that were not used for the longest time first. A
-    process that is killed leaves nothing that is taken for a whole file. Locks are those of the operating system (`flock`), so the
-    folder should be on a local disk.
+    When the folder would become larger than `max_bytes`, the least recently used files are removed. An incomplete file of a killed process
+    is never read. Locks are those of the operating system (`flock`), so the folder should be on a local disk.
 
     Attributes:
         folder: the folder; it is created when a store is opened.
-        max_bytes: largest size of all files in it together.
+        max_bytes: maximum total size of its files, bytes.
 
     Raises:
         ArgumentError: `max_bytes` is not positive.
@@ -73,11 +71,11 @@ class Cache:
             ) from error
 
     def path(self, name: str) -> Path:
-        """Return where a file is kept."""
+        """Return the path of a cached file."""
         return Path(self.folder) / name[:2] / name
 
     def find(self, key: str, since: float) -> str | None:
-        """Return the name of the file with a key that was compared with the remote file after a time; None if there is none."""
+        """Return the name of the cached file with a key, if it was compared with the remote file after `since`; otherwise None."""
         with suppress(FileNotFoundError), os.scandir(Path(self.folder) / key[:2]) as entries:
             for entry in entries:
                 if entry.name.startswith(f"{key}-") and not entry.name.endswith(_PART):
@@ -88,16 +86,16 @@ class Cache:
         return None
 
     def add(self, name: str, fill: Callable[[int], None], *, wait: bool = True) -> bool:
-        """Add a file unless it exists. One process fills it, the others wait for it.
+        """Add a file unless it exists. One process writes it, other processes wait.
 
         Args:
             name: name of the file, which ends in its size.
-            fill: writes the content to a descriptor.
-            wait: wait for a process that is filling it.
+            fill: writes the content to a file descriptor.
+            wait: wait for another process that is writing the file.
 
         Returns:
-            Whether the file is there. It is not if another process is filling it and `wait` is not given, or if files that are being
-            filled leave no room for it.
+            Whether the file exists. It does not if another process is writing it and `wait` is False, or if files that are being
+            written leave no room for it.
 
         Raises:
             OSError: the disk is full.
@@ -106,17 +104,17 @@ class Cache:
         part = path.with_name(f"{name}{_PART}")
         path.parent.mkdir(parents=True, exist_ok=True)
         while not _is_whole(path):
-            with _locked(part, wait) as descriptor:  # the file being filled is its own lock
+            with _locked(part, wait) as descriptor:  # the unfinished file is also the lock
                 if descriptor is None:
                     return False
                 if not _is_at(part, descriptor):
-                    continue  # the process before has renamed it, or removed it
+                    continue  # the previous process has renamed or removed it
                 try:
                     if not _is_whole(path):
                         if not self._make_room(descriptor, _size_of(name)):
                             return False
                         fill(descriptor)
-                        sync_file(descriptor)  # it has its full size already: after a power failure it would hold zeros
+                        sync_file(descriptor)  # its full size is already set: after a power failure it could hold zeros
                         part.rename(path)
                 finally:
                     if _is_at(part, descriptor):
@@ -124,21 +122,21 @@ class Cache:
         return True
 
     def touch(self, name: str, *, compared: bool = False) -> bool:
-        """Note that a file is used, and that it was `compared` with the remote file; return whether it is still there."""
+        """Record that a file is used, and whether it was `compared` with the remote file. Return whether it still exists."""
         path, now = self.path(name), time.time_ns()
         try:
             os.utime(path, ns=(now, now if compared else path.stat().st_mtime_ns))
         except FileNotFoundError:
             return False  # removed to make room
-        except OSError:  # written by another user: its times stay as they are
+        except OSError:  # it belongs to another user: its times cannot be set
             return True
         return True
 
     def _make_room(self, descriptor: int, size: int) -> bool:
-        """Give an empty file its size, after as many of the oldest files were removed as needed; return whether there is room."""
+        """Remove the oldest files as needed, and set the size of a new file. Return whether there is room for it."""
         folder = Path(self.folder)
         with _locked(folder / _LOCK):
-            os.truncate(descriptor, 0)  # what a killed process left
+            os.truncate(descriptor, 0)  # discard the bytes of a killed process
             files = sorted(_files(folder))
             excess = sum(length for _, length, _ in files) + size - self.max_bytes
             for _, length, path in files:
@@ -147,19 +145,19 @@ class Cache:
                 if _remove(path):
                     excess -= length
             if excess <= 0:
-                os.truncate(descriptor, size)  # other processes count it from now on
+                os.truncate(descriptor, size)  # from now on, other processes count its size
             return excess <= 0
 
 
 class CachedTree(Tree):
-    """A remote tree whose files are read from a cache, whole files at a time.
+    """A remote tree whose files are read through a cache, as whole files.
 
-    A file is compared with the remote one once after the store was opened, by one process of the machine: changes after that are
-    not noticed. Where a file is too large for the cache, or the disk is full, its ranges are read from the server.
+    One process compares a file with the remote file, once after the store was opened. Later changes are not detected. If a file is too
+    large for the cache, or the disk is full, its ranges are read from the server.
     """
 
     def __init__(self, remote: RemoteTree, cache: Cache) -> None:
-        """Create the folder of the cache; nothing is requested yet.
+        """Create the folder of the cache. No request is sent yet.
 
         Raises:
             StorageError: the folder cannot be created or written to.
@@ -173,7 +171,7 @@ class CachedTree(Tree):
 
     def _forget(self) -> None:
         self._names: dict[str, str] = {}  # path -> name in the cache
-        self._used: dict[str, float] = {}  # name -> when this process last said that it uses it
+        self._used: dict[str, float] = {}  # name -> time when this process last recorded its use
         self._too_large: set[str] = set()
         self._full_until = 0.0
 
@@ -196,7 +194,7 @@ class CachedTree(Tree):
         return self.remote.read_range(path, start, end) if cached is None else cached
 
     def fetch(self, path: str, *, wait: bool = True) -> bool:
-        """Bring a file into the cache, or say that it will be used.
+        """Fetch a file into the cache, or record that it will be used.
 
         Args:
             path: the file.
@@ -233,7 +231,7 @@ class CachedTree(Tree):
         return None
 
     def _find(self, path: str, wait: bool = True) -> str | None:
-        """Return the name of a file in the cache, where it is put if need be; None if it must be read without the cache."""
+        """Return the name of a file in the cache, fetching it if necessary; None if it must be read without the cache."""
         if (name := self._names.get(path)) is not None:
             return name
         if path in self._too_large:
@@ -257,7 +255,7 @@ class CachedTree(Tree):
             return _is_whole(self.cache.path(name))
         try:
             return self.cache.add(name, partial(self._fill, path, _size_of(name)), wait=wait)
-        except OSError:  # the disk is full: what is asked for is read from the server
+        except OSError:  # the disk is full: the file is read from the server
             self._full_until = time.monotonic() + _FULL_S
             return False
 
@@ -295,9 +293,9 @@ class _CacheFolder(LocalTree):
 
 @contextmanager
 def _locked(path: Path, wait: bool = True) -> Iterator[int | None]:
-    """Open a file, which is created, and hold its lock; None if it is held by another and `wait` is not given.
+    """Create and open a file, and hold its lock. Yields None if another process holds the lock and `wait` is False.
 
-    The operating system releases the lock of a process that ends in any way. The lock is released before the file is closed, because
+    The operating system releases the lock when a process ends for any reason. The lock is released before the file is closed, because
     a forked process may have inherited the descriptor.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -316,12 +314,12 @@ def _locked(path: Path, wait: bool = True) -> Iterator[int | None]:
 
 
 def _size_of(name: str) -> int:
-    """Return the size of a whole file, which its name ends in."""
+    """Return the size of a complete file, which is the end of its name."""
     return int(name.rpartition("-")[2])
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a file exists and has the size that its name says: a machine that loses power may leave a shorter one."""
+    """Whether a file exists and has the size in its name. A power failure can leave a shorter file."""
     try:
         return path.stat().st_size == _size_of(path.name)
     except FileNotFoundError:
@@ -329,7 +327,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def _is_at(path: Path, descriptor: int) -> bool:
-    """Whether an open file is still the one at a path."""
+    """Whether a path still refers to an open file."""
     try:
         return os.path.samestat(path.stat(), os.fstat(descriptor))
     except FileNotFoundError:
@@ -348,7 +346,7 @@ def _files(folder: Path) -> Iterator[tuple[int, int, Path]]:
 
 
 def _remove(path: Path) -> bool:
-    """Remove a file, but not one that a process is filling; return whether it is gone."""
+    """Remove a file, unless a process is writing it. Return whether it was removed."""
     if path.suffix != _PART:
         path.unlink(missing_ok=True)
         return True

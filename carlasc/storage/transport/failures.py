@@ -1,6 +1,6 @@
-"""What the errors of requests mean: whether a request may succeed later, and what is said of it where it does not.
+"""Classification of failed requests: whether a request may succeed later, and the error message for the user.
 
-fsspec passes on the errors of the libraries below it, which share no type. `TEMPORARY` names the public classes of those by which a connection failed.
+fsspec passes on the errors of other libraries, which share no base class. `TEMPORARY` lists their public classes for failed connections.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ TEMPORARY: Mapping[str, tuple[str, ...]] = {
     "httpx": ("TransportError",),
     "httpx2": ("TransportError",),
 }
-"""Errors of the connection by module. Those of a module that no code has imported cannot have been raised."""
+"""Connection errors by module. Only modules that are already imported can have raised an error."""
 
-_BUSY = frozenset({408, 409, 425, 429})  # of the statuses below 500, those of requests that may succeed later
+_BUSY = frozenset({408, 409, 425, 429})  # statuses below 500 after which a request may succeed later
 _BUSY_CODES = frozenset({"SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "OperationAborted"})
 
 
 class WrongAnswerError(Exception):
-    """A server sent something other than what was asked for: it is asked again."""
+    """The answer of a server does not fit the request. The request is sent again."""
 
 
 def is_temporary(error: BaseException) -> bool:
@@ -46,7 +46,7 @@ def is_temporary(error: BaseException) -> bool:
 
 
 def is_offline(error: BaseException) -> bool:
-    """Whether the Hub was not asked, because the environment variable HF_HUB_OFFLINE forbids it."""
+    """Whether no request was sent to the Hub, because the environment variable HF_HUB_OFFLINE is set."""
     return type(error).__name__ == "OfflineModeIsEnabled"
 
 
@@ -58,7 +58,7 @@ def exists_error(error: object) -> bool:
 
 
 def ends_before(error: BaseException) -> bool:
-    """Whether a request failed because its range starts behind the end of the file."""
+    """Whether a request failed because its range starts after the end of the file."""
     return _status_and_code(error)[0] == 416
 
 
@@ -68,18 +68,18 @@ def bucket_is_missing(error: BaseException) -> bool:
 
 
 def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn:
-    """Raise the error of a request as one line that holds no credentials.
+    """Raise the error of a request with a message of one line without credentials.
 
-    The messages of other libraries are left out: they may hold a URL's signature or a key. For the same reason, the error has no cause.
+    Messages of other libraries are left out, because they may contain a signature or a key. For the same reason, the error has no cause.
 
     Args:
         where: the file, without credentials.
-        error: what the request raised.
-        writing: whether the file was to be written.
+        error: the error of the request.
+        writing: whether it was a request to write the file.
 
     Raises:
         MissingDataError: the file or the bucket does not exist.
-        StorageError: it cannot be written (where `writing`).
+        StorageError: the file cannot be written (if `writing`).
         CarlascError: anything else.
     """
     if isinstance(error, CarlascError):
@@ -89,7 +89,10 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
     verb = "cannot be written" if writing else "cannot be read"
     if code == "NoSuchBucket":
         raise (StorageError if writing else MissingDataError)(
-            where, expected="a bucket that exists", found="no such bucket", advice="check its name, or create it"
+            where,
+            expected="a bucket that exists",
+            found="no such bucket",
+            advice="check the name of the bucket, or create it",
         ) from None
     if isinstance(error, FileNotFoundError) and not writing:
         raise MissingDataError(where, expected="a file", found="nothing") from None
@@ -97,7 +100,7 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
         raise kind(
             where,
             problem=f"{verb}: access was refused ({code or status or 'no permission'})",
-            advice="check the credentials and what they are permitted to do",
+            advice="check the credentials and their permissions",
         ) from None
     if "Credential" in type(error).__name__:
         raise kind(
@@ -117,7 +120,7 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
 
 
 def describe_failure(error: BaseException) -> str:
-    """Return what an error of a request says without credentials: a status, a code or the name of its class."""
+    """Describe an error of a request without credentials: its status, its code or the name of its class."""
     status, code = _status_and_code(error)
     if isinstance(error, WrongAnswerError):
         return str(error)
@@ -130,7 +133,7 @@ def describe_failure(error: BaseException) -> str:
 
 
 def _is_of_connection(error: BaseException) -> bool:
-    """Whether an error, or one that it was raised from, is of the connection: aiohttp gives an answer that is no HTTP a status of its own."""
+    """Whether an error, or one of its causes, is a connection error. aiohttp gives answers that are not HTTP an artificial status."""
     kinds = [
         getattr(sys.modules[module], name, ())
         for module, names in TEMPORARY.items()
@@ -150,10 +153,8 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def _status_and_code(error: BaseException) -> tuple[int | None, str]:
-    """Return the HTTP status of an error, and the code of an S3 error ("NoSuchBucket"), where it has them."""
-    for cause in (
-        () if _is_of_connection(error) else _causes(error)
-    ):  # aiohttp's errors of payloads have a "code" of their own
+    """Return the HTTP status of an error, and the code of an S3 error ("NoSuchBucket"), if it has them."""
+    for cause in () if _is_of_connection(error) else _causes(error):  # payload errors of aiohttp have another "code"
         answer = getattr(cause, "response", None)
         if isinstance(answer, Mapping):  # botocore
             status = answer.get("ResponseMetadata", {}).get("HTTPStatusCode")

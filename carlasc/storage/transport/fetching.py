@@ -1,6 +1,6 @@
-"""Fetching one large file of a web server: in blocks, over several connections, continued where an earlier run stopped.
+"""Fetching one large file from a web server, in blocks over several connections. An interrupted run can be continued.
 
-Bytes are written to `<name>.part`, and the list of the blocks in it to `<name>.part.json`. The file gets its name when it is whole.
+Bytes are written to `<name>.part`, and the list of its blocks to `<name>.part.json`. The file gets its final name when it is complete.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from carlasc.storage.transport.requests import HttpAnswer, Requests
 _ZIP = b"PK"
 _GONE = (401, 403, 404, 410)
 _PARTIAL = 206
-_BLOCK = 16 << 20  # bytes that one request asks for
+_BLOCK = 16 << 20  # bytes per request
 _RESTARTS = 3  # after the file has changed
 
 _Result = TypeVar("_Result")
@@ -49,11 +49,11 @@ class _RangeIgnoredError(Exception):
 
 @dataclass(frozen=True)
 class ServedFile:
-    """What a server says of a file.
+    """Properties of a file on a server.
 
     Attributes:
-        size: its bytes; None if the server does not say.
-        validator: its ETag, or else its date, which tell whether it has changed; None if the server sends neither.
+        size: size in bytes; None if the server does not report it.
+        validator: its ETag, otherwise its date, to detect changes; None if the server sends neither.
         ranges: whether the server supports range requests.
     """
 
@@ -64,7 +64,7 @@ class ServedFile:
 
 @dataclass
 class _Arrived:
-    """Which bytes of a file are in the .part file: for each block, how many from its start."""
+    """The number of fetched bytes of each block in the .part file, counted from the start of the block."""
 
     block: int
     got: dict[int, int] = field(default_factory=dict)
@@ -78,16 +78,16 @@ class FileFetch:
     """The transfer of a zip to this machine.
 
     Attributes:
-        file: what the server says of it.
+        file: properties of the file on the server.
     """
 
     def __init__(self, url: str, path: Path, connections: int) -> None:
-        """Ask the server for the zip's first bytes, several times if necessary.
+        """Request the first bytes of the zip, several times if necessary.
 
         Args:
-            url: the zip.
-            path: where it is written; it exists only when it is whole.
-            connections: number of blocks that are fetched at once.
+            url: URL of the zip.
+            path: output path. The file exists only when it is complete.
+            connections: number of blocks that are fetched at the same time.
 
         Raises:
             CarlascError: the server cannot be reached, or the file does not exist or is not a zip.
@@ -95,7 +95,7 @@ class FileFetch:
         self._url, self._where, self._path, self._connections = url, without_credentials(url), path, connections
         self._part, self._record = (path.with_name(f"{path.name}{end}") for end in (".part", ".part.json"))
         if not url.startswith(("http://", "https://")):
-            raise CarlascError(self._where, expected="the URL of a web server", found="another address")
+            raise CarlascError(self._where, expected="a URL that begins with http:// or https://", found="another URL")
         self._requests = Requests(url)
         self.file = self._persist(self._probe)
 
@@ -104,17 +104,17 @@ class FileFetch:
         return (self.file.size or 0) - self._load().total
 
     def run(self, advance: Callable[[int], None], most: float) -> int:
-        """Fetch the file, continuing what an earlier run has left.
+        """Fetch the file, continuing an earlier run.
 
         Args:
-            advance: called with the number of bytes that arrived, from one thread at a time; negative where bytes are discarded.
-            most: bytes that the file may have, where the server does not say how many there are.
+            advance: called with the number of new bytes, from one thread at a time; negative if bytes are discarded.
+            most: maximum size in bytes, if the server does not report the size.
 
         Returns:
             The number of bytes that an earlier run had fetched.
 
         Raises:
-            CarlascError: the server cannot be reached, or the file keeps changing. What was fetched stays for the next run.
+            CarlascError: the server cannot be reached, or the file keeps changing. The next run continues with the fetched bytes.
             StorageError: the disk is full or fails.
         """
         for _ in range(_RESTARTS):
@@ -134,17 +134,20 @@ class FileFetch:
                 advance(-arrived.total)
                 self._part.unlink(missing_ok=True)
                 self._record.unlink(missing_ok=True)
-                changed = isinstance(error, _ChangedError)  # else the server had announced range requests
+                changed = isinstance(error, _ChangedError)  # otherwise the server wrongly announced range requests
                 self.file = self._persist(self._probe) if changed else replace(self.file, ranges=False)
         raise FormatError(
-            self._where, expected="a file that stays the same", found=f"a changed one at each of {_RESTARTS} tries"
+            self._where,
+            expected="a file that does not change",
+            found=f"a changed file in each of {_RESTARTS} attempts",
+            advice="try again later",
         )
 
     def discard_record(self) -> None:
-        """Remove what is recorded of the transfer of a file that is whole.
+        """Remove the record of the transfer of a complete file.
 
         Raises:
-            StorageError: it cannot be removed.
+            StorageError: the record cannot be removed.
         """
         with writing(self._record):
             remove_file(self._record)
@@ -183,7 +186,7 @@ class FileFetch:
             for future in done:
                 future.result()
         finally:
-            stop.set()  # after Ctrl-C or a failed block, the others stop at their next piece; their bytes count
+            stop.set()  # after Ctrl-C or a failed block, the other blocks stop at their next piece and keep their bytes
             executor.shutdown(wait=True, cancel_futures=True)
             try:
                 self._save(arrived, descriptor)
@@ -191,7 +194,7 @@ class FileFetch:
                 os.close(descriptor)
 
     def _fetch_stream(self, arrived: _Arrived, advance: Callable[[int], None], most: float) -> None:
-        """Fetch from a server without range requests: each try begins again at the start."""
+        """Fetch from a server without range requests. Each attempt starts at the first byte."""
 
         def one_try() -> None:
             advance(-arrived.total)
@@ -209,21 +212,21 @@ class FileFetch:
         self._persist(one_try)
 
     def _probe(self) -> ServedFile:
-        """Request the first bytes, to learn the size, whether ranges are supported, and whether it is a zip."""
+        """Request the first bytes, to find the size, whether ranges are supported, and whether it is a zip."""
         with self._answer({"Range": f"bytes=0-{len(_ZIP) - 1}"}) as answer:
             ranges, start = answer.status == _PARTIAL, answer.first[: len(_ZIP)]
             if start != _ZIP:
-                content = answer.headers.get("Content-Type", "something unnamed")
+                content = answer.headers.get("Content-Type", "data of unknown type")
                 raise FormatError(
                     self._where,
                     expected="a zip",
                     found=f"{content} that begins with {start!r}",
-                    advice="has the link moved?",
+                    advice="check the URL: the file may have moved",
                 )
             return ServedFile(_total(answer) if ranges else _length(answer), _validator(answer), ranges)
 
     def _range(self, start: int, end: int) -> Iterator[bytes]:
-        """Yield the bytes [start, end) in pieces, if all headers of the answer agree with the request."""
+        """Yield the bytes [start, end) in pieces. Checks that all headers of the answer fit the request."""
         file, headers = self.file, {"Range": f"bytes={start}-{end - 1}"}
         if file.validator is not None and not file.validator.startswith("W/"):
             headers["If-Range"] = file.validator
@@ -255,7 +258,7 @@ class FileFetch:
     def _persist(
         self, work: Callable[[], _Result], count: Callable[[], int] = lambda: 0, stop: threading.Event | None = None
     ) -> _Result:
-        """Call `work`, again after failures that may be temporary; say in one line what the last one was."""
+        """Call `work`, again after temporary failures. If all attempts fail, raise a one-line error about the last failure."""
         try:
             return self._requests.persist(work, count, stop)
         except (CarlascError, _ChangedError, _RangeIgnoredError):
@@ -265,7 +268,7 @@ class FileFetch:
                 raise CarlascError(
                     self._where,
                     expected="data",
-                    found=f"none at {self._requests.settings.attempts} tries ({describe_failure(error)})",
+                    found=f"none in {self._requests.settings.attempts} attempts ({describe_failure(error)})",
                     advice="run the same command again to continue",
                 ) from None
             if isinstance(error, OSError):
@@ -273,7 +276,7 @@ class FileFetch:
             fail(self._where, error)
 
     def _load(self) -> _Arrived:
-        """Return what an earlier run has fetched of the same file, or nothing if the file has changed."""
+        """Return the blocks that an earlier run fetched of the same file; empty if the file has changed."""
         fresh, file = _Arrived(_BLOCK), self.file
         if not (self._part.is_file() and self._record.is_file() and file.ranges):
             return fresh
@@ -288,14 +291,14 @@ class FileFetch:
         return arrived if same and file.validator is not None and self._part.stat().st_size == file.size else fresh
 
     def _save(self, arrived: _Arrived, descriptor: int) -> None:
-        """Record which bytes were fetched, after they have reached the disk."""
+        """Record the fetched bytes, after syncing them to the disk."""
         sync_file(descriptor)
         got = {str(index): count for index, count in sorted(arrived.got.items())}
         about = {"url": self._where, "size": self.file.size, "validator": self.file.validator}
         write_json(self._record, {**about, "block": arrived.block, "got": got})
 
     def _finish(self, arrived: _Arrived) -> None:
-        """Give the file its name if it is whole: it has all its bytes, and the central directory at a zip's end."""
+        """Rename the file if it is complete: it has all bytes, and the central directory at the end of a zip."""
         size, expected = self._part.stat().st_size, self.file.size
         if expected is not None and (arrived.total != expected or size != expected):
             found = str(min(size, arrived.total))
@@ -312,7 +315,7 @@ class FileFetch:
 
 
 def _exactly(answer: HttpAnswer, count: int | None) -> Iterator[bytes]:
-    """Yield the body of an answer, which must have `count` bytes where that is known; more are not read."""
+    """Yield the body of an answer, and check that it has `count` bytes, if given. Further bytes are not read."""
     left = count
     for data in answer.pieces():
         yield data if left is None else data[:left]

@@ -1,4 +1,4 @@
-"""Folders and files behind a URL: the tree of them, and a remote file as a file object."""
+"""Remote folders and files: a tree of files at a URL, and a remote file as a file object."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from carlasc.storage.transport.requests import Request, Requests
 from carlasc.storage.transport.servers import check_size
 from carlasc.storage.transport.trees import LocalTree, Tree, check_length, is_url
 
-_BLOCK = 1 << 18  # bytes of a block that a remote file fetches
+_BLOCK = 1 << 18  # bytes per block of a remote file
 _KEPT = 64  # blocks
 
-# What file systems call a digest of a file's content, or the time of its last change.
+# Names that file systems use for a digest of the content, or the time of the last change.
 _CHANGES = (
     "ETag",
     "etag",
@@ -35,13 +35,13 @@ _CHANGES = (
 
 
 class RemoteTree(Tree):
-    """A folder, or a single file (path ""), at any URL that fsspec knows: http, s3, memory, ...
+    """A folder, or a single file (path ""), at any URL that fsspec supports: http, s3, memory, ...
 
-    A folder is listed once. `size`, `read` and `paths` ask the server each time.
+    A folder is listed once. `size`, `read` and `paths` send a request each time.
     """
 
     def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
-        """Remember the URL and fsspec's storage options; nothing is requested yet.
+        """Keep the URL and the fsspec storage options. No request is sent yet.
 
         Raises:
             DependencyError: the URL needs a package that is not installed.
@@ -51,10 +51,10 @@ class RemoteTree(Tree):
         self.location = without_credentials(self._base)
         self.requests = Requests(url.rstrip("/"), options)
         self._listed: dict[str, dict[str, bool]] = {}
-        self._sizes: dict[str, int] = {}  # of the files in the folders that were listed
+        self._sizes: dict[str, int] = {}  # sizes of files in listed folders
 
     def url(self, path: str = "") -> str:
-        """Return the URL of a file; it may hold credentials, so it must not be shown (see `where`)."""
+        """Return the URL of a file. It may contain credentials, so it must not be shown; use `where` for messages."""
         return f"{self._base}/{path}{self._query}" if path else self._base + self._query
 
     def below(self, folder: str) -> RemoteTree:
@@ -88,16 +88,16 @@ class RemoteTree(Tree):
         return self._listed[folder]
 
     def _own_name(self, folder: str) -> str:
-        """Return how listings name the folder itself: object stores list it among its files."""
+        """Return the name of the folder itself in its listing: object stores list it among its files."""
         place = f"{self._base}/{folder}" if folder else self._base
         return (place if place.startswith("http") else self.requests.path_of(place)).strip("/")
 
     def refresh(self) -> None:
-        """Forget listings: other processes may have written files since."""
+        """Discard cached listings, because other processes may have written files."""
         self._listed, self._sizes = {}, {}
 
     def note(self, path: str, size: int | None) -> None:
-        """Remember that this process wrote a file of `size` bytes, or removed it (None), where its folder has been listed."""
+        """Update the listing of a folder after this process wrote a file of `size` bytes, or removed it (None)."""
         self._sizes.pop(path, None)
         if size is not None:
             self._sizes[path] = size
@@ -112,15 +112,15 @@ class RemoteTree(Tree):
             name, is_folder = folder, True
 
     def is_file(self, path: str) -> bool:
-        """Whether the file exists: asked of the server where folders cannot be listed (http), else of the folder's listing."""
+        """Whether the file exists, from the listing of its folder, or from the server if folders cannot be listed (http)."""
         return self.size(path) is not None if self._base.startswith("http") else super().is_file(path)
 
     def paths(self, folder: str = "") -> Iterator[str]:
-        """Yield the paths of all files below a folder, or that of the file of this name, in any order."""
+        """Yield the paths of all files below a folder, or the path itself if it is a file, in any order."""
         yield from self.sizes(folder)
 
     def sizes(self, folder: str = "") -> dict[str, int]:
-        """Return the bytes of all files below a folder, or of the file of this name, by path."""
+        """Return the sizes of all files below a folder, or of the file itself, by path."""
         (found,) = self.requests.send([Request("find", self.url(folder), {"detail": True})])
         if isinstance(found, FileNotFoundError) and not bucket_is_missing(found):
             return {}
@@ -143,11 +143,11 @@ class RemoteTree(Tree):
         return self.read_ranges([(path, start, end)])[0]
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Fetch the files, several at a time. Their lengths are compared with the listing, where their folder has been listed."""
+        """Fetch the files, several at a time. Their lengths are checked if their folder has been listed."""
         requests = [Request("get", self.url(path), {}, self._length_check(path)) for path in paths]
         answers = self.requests.send(requests)
         for place, (path, answer) in enumerate(zip(paths, answers, strict=True)):
-            if isinstance(answer, WrongAnswerError):  # replaced since it was listed?
+            if isinstance(answer, WrongAnswerError):  # the file may have been replaced since the listing
                 self._sizes[path] = self._size(path)
                 (answers[place],) = self.requests.send([Request("get", self.url(path), {}, self._length_check(path))])
             if isinstance(answers[place], Exception):
@@ -167,7 +167,7 @@ class RemoteTree(Tree):
         return [self._checked(part, next(answers)) if part[1] < part[2] else b"" for part in wanted]
 
     def _checked(self, part: tuple[str, int, int], answer: Any) -> bytes:
-        """Return an answer of the right length. A short one is asked for again, unless the file ends there."""
+        """Return an answer of the right length. After a short answer the request is sent again, unless the file ends there."""
         path, start, end = part
         if isinstance(answer, Exception):
             fail(self.where(path), answer)
@@ -179,7 +179,7 @@ class RemoteTree(Tree):
         return check_length(bytes(answer), end - start, self.where(path))
 
     def open(self, path: str) -> Any:
-        """Open a file, for libraries that take file objects: it fetches blocks as they are needed."""
+        """Open a file as a file object, which fetches blocks on demand. For libraries that take file objects."""
         return RemoteFile(partial(self.read_range, path), self._size(path))
 
     def size(self, path: str = "") -> int | None:
@@ -188,9 +188,9 @@ class RemoteTree(Tree):
         return None if found is None else found["size"]
 
     def version(self, path: str) -> tuple[int, str]:
-        """Return a file's size in bytes, and a text that changes when the file does, if the server knows of its changes.
+        """Return the size of a file in bytes, and a text that changes with the file, if the server reports changes.
 
-        The server is asked each time, whatever was listed before.
+        A request is sent each time, regardless of listings.
 
         Raises:
             MissingDataError: the file does not exist.
@@ -202,7 +202,7 @@ class RemoteTree(Tree):
         return found["size"], " ".join(str(found[name]) for name in _CHANGES if found.get(name))
 
     def _about(self, path: str) -> dict[str, Any] | None:
-        """Return what the file system says of a file; None if it does not exist or is a folder (or a page that lists one)."""
+        """Return the fsspec info of a file; None if it does not exist or is a folder (or a page that lists one)."""
         (found,) = self.requests.send([Request("info", self.url(path))])
         if isinstance(found, FileNotFoundError | IsADirectoryError) and not bucket_is_missing(found):
             return None
@@ -218,7 +218,7 @@ class RemoteTree(Tree):
         return size
 
     def check_ranges(self, path: str = "") -> None:
-        """Request one byte: a server without range requests would send the whole file for each of them.
+        """Request one byte to check for range requests: without them, each read would transfer the whole file.
 
         Raises:
             CarlascError: the server does not support range requests.
@@ -230,18 +230,18 @@ class RemoteTree(Tree):
             raise CarlascError(
                 self.where(path),
                 expected="a server that supports range requests",
-                found="one that does not",
+                found="a server without them",
                 advice="download the file first",
             )
         if isinstance(answer, Exception):
             fail(self.where(path), answer)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_listed": {}, "_sizes": {}}  # a worker lists what it needs
+        return self.__dict__ | {"_listed": {}, "_sizes": {}}  # a worker process lists folders again
 
 
 def tree_of(place: str | os.PathLike[str], *, mapped: bool = True, **storage_options: Any) -> LocalTree | RemoteTree:
-    """Return the tree of files at a path or a URL; nothing is read yet.
+    """Return the tree of files at a path or a URL. Nothing is read yet.
 
     Args:
         place: a folder, or its URL.
@@ -255,13 +255,13 @@ def tree_of(place: str | os.PathLike[str], *, mapped: bool = True, **storage_opt
 class RemoteFile(io.RawIOBase):
     """A remote file as a file object, for libraries that read one: h5py and pyarrow.
 
-    It reads the file block by block, and keeps the blocks that were used last.
+    It reads the file block by block, and caches the most recently used blocks.
     """
 
     def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
-        """Remember how to fetch the bytes [start, end) of the file, and its size in bytes; nothing is fetched yet."""
+        """Create a file of `size` bytes. `fetch` returns the bytes [start, end). Nothing is fetched yet."""
         self._fetch, self._size, self._place = fetch, size, 0
-        self._blocks: dict[int, bytes] = {}  # the one that was used last is the last one
+        self._blocks: dict[int, bytes] = {}  # ordered by last use, the latest at the end
 
     def readable(self) -> bool:
         """Return True."""
@@ -272,16 +272,16 @@ class RemoteFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Move to a place, which is returned."""
+        """Move to a position and return it."""
         self._place = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._size}[whence])
         return self._place
 
     def tell(self) -> int:
-        """Return the place in the file."""
+        """Return the position in the file."""
         return self._place
 
     def readinto(self, buffer: bytearray | memoryview) -> int:  # type: ignore[override]
-        """Read bytes into a buffer, and return how many there were."""
+        """Read bytes into a buffer, and return their number."""
         view = memoryview(buffer).cast("B")
         start, end = self._place, min(self._place + len(view), self._size)
         if start >= end:
@@ -298,7 +298,7 @@ class RemoteFile(io.RawIOBase):
         return end - start
 
     def _load(self, first: int, last: int) -> None:
-        """Fetch the blocks from `first` to `last` that are not kept, each run of them in one request."""
+        """Fetch the blocks from `first` to `last` that are not cached. Adjacent blocks are fetched in one request."""
         number = first
         while number <= last:
             if number in self._blocks:

@@ -1,9 +1,9 @@
-"""Requests to object stores and web servers, through fsspec: many side by side, and tried again when a server fails.
+"""Parallel requests to object stores and web servers through fsspec, with retries.
 
 Object stores answer some requests with "503 Slow Down", close connections, or send less than they announced. Such requests are sent
-again, after a random time that doubles at each attempt. s3fs and botocore retry too, each by rules of its own, which would multiply:
-their retries are turned off, so that this module alone decides how often and how long. `carlasc.storage.transport.servers` does what differs
-between servers, `carlasc.storage.transport.failures` says which failures are temporary.
+again, after a random time whose limit doubles at each attempt. The retries of s3fs and botocore are turned off, because they would
+multiply with these. `carlasc.storage.transport.servers` has the code for each kind of server, `carlasc.storage.transport.failures`
+decides which failures are temporary.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ _EXTRAS = {  # the package that a scheme needs, and the extra that installs it
     "s3a": ("s3fs", "remote"),
     HUB: ("huggingface_hub", "hub"),
 }
-_RANDOM = random.SystemRandom()  # of its own: a failure must not change what a program draws, nor two forks wait alike
-_PIECE = 256 << 10  # bytes of a body that is read in pieces
+_RANDOM = random.SystemRandom()  # independent of `random.seed`, and different in forked processes
+_PIECE = 256 << 10  # bytes per piece of a body
 
 _Answer = TypeVar("_Answer")
 
 
 @dataclass(frozen=True)
 class RemoteSettings:
-    """How requests are sent. Each field is read from an environment variable: `requests` from CARLASC_REMOTE_REQUESTS.
+    """Settings of requests. Each field is read from an environment variable: `requests` from CARLASC_REMOTE_REQUESTS.
 
     Attributes:
-        requests: greatest number of requests that one call has open at the same time.
-        attempts: how often a request is sent before its error is reported.
-        backoff_s: the wait before attempt n + 1 is random, up to this time by 2 ** (n - 1), and at most `longest_wait_s`.
-        longest_wait_s: greatest wait between two attempts.
-        timeout_s: longest silence of a server.
+        requests: maximum number of parallel requests of one call.
+        attempts: number of attempts before the error is raised.
+        backoff_s: attempt n + 1 follows after a random time of at most `backoff_s` * 2 ** (n - 1) and at most `longest_wait_s`.
+        longest_wait_s: maximum time between two attempts, seconds.
+        timeout_s: maximum time without data from a server, seconds.
     """
 
     requests: int = 32
@@ -71,7 +71,7 @@ class RemoteSettings:
         """Return the settings of this process.
 
         Raises:
-            ArgumentError: a variable holds something other than a positive number.
+            ArgumentError: a variable is not a positive number.
         """
         given: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
@@ -84,12 +84,12 @@ class RemoteSettings:
             except ValueError:
                 given[field.name] = 0
             if not 0 < given[field.name] < 1e6:
-                expected = "a positive whole number" if kind is int else "a positive number"
+                expected = "a positive integer" if kind is int else "a positive number"
                 raise ArgumentError(name, expected=expected, found=repr(text))
         return cls(**given)
 
     def draw_wait_s(self, attempts: int) -> float:
-        """Return the wait after so many attempts: at random, so that many clients do not come back at once."""
+        """Return the time to wait after a number of attempts. It is random, so that many clients do not retry at the same moment."""
         return _RANDOM.uniform(0, min(self.backoff_s * 2.0 ** (attempts - 1), self.longest_wait_s))
 
 
@@ -98,11 +98,11 @@ class Request:
     """One request.
 
     Attributes:
-        name: method of fsspec's file systems, such as "info" or "pipe_file", or "get" for this module's own.
-        url: what it is about; several, where the method takes several.
-        data: what is sent, as the method's second argument; None if it takes none.
-        options: further arguments of the method.
-        check: called with the answer; an error that it raises counts as that of the request.
+        name: method of fsspec file systems, such as "info" or "pipe_file", or "get" for the function of `servers`.
+        url: URL of the file; several URLs if the method takes several.
+        data: bytes to send, the second argument of the method; None if it has no second argument.
+        options: further keyword arguments of the method.
+        check: called with the answer. If it raises an error, the request counts as failed.
     """
 
     name: str
@@ -112,7 +112,7 @@ class Request:
     data: bytes | None = None
 
     def arguments(self) -> tuple[Any, ...]:
-        """Return the positional arguments of the method; file systems name the data differently."""
+        """Return the positional arguments of the method. They are positional because file systems name the data differently."""
         return (self.url,) if self.data is None else (self.url, self.data)
 
 
@@ -120,7 +120,7 @@ class Requests:
     """Sends requests to the file system of one URL. It can be pickled; each process opens its own connections."""
 
     def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
-        """Remember the URL and fsspec's storage options; nothing is requested yet.
+        """Keep the URL and the fsspec storage options. No request is sent yet.
 
         Raises:
             DependencyError: the URL needs a package that is not installed.
@@ -136,7 +136,7 @@ class Requests:
 
     @property
     def fs(self) -> Any:
-        """The file system of this process. It is shared by the process's threads; after a fork there is a new one."""
+        """The file system of this process. All threads share it; a forked process creates a new one."""
         from fsspec.core import url_to_fs
 
         if self._opened is None or self._opened[0] != os.getpid():
@@ -150,20 +150,20 @@ class Requests:
         return self._opened[1]
 
     def path_of(self, url: str) -> str:
-        """Return how the file system names a URL in its listings."""
+        """Return the name of a URL in the listings of the file system."""
         from fsspec.core import url_to_fs
 
         return str(url_to_fs(url, **self._fsspec_options())[1])
 
     def _fsspec_options(self) -> dict[str, Any]:
-        """Return the storage options, with the settings of s3fs and aiohttp that leave retries and listings to this package."""
+        """Return the storage options, with retries and listing caches of s3fs and aiohttp turned off."""
         timeout, options = self.settings.timeout_s, dict(self.options)
         if self.is_s3:
             config = {"connect_timeout": timeout, "read_timeout": timeout, "retries": {"total_max_attempts": 1}}
             config["max_pool_connections"] = self.settings.requests
             options["config_kwargs"] = config | options.get("config_kwargs", {})
         if self.scheme in (*S3, "gs", "gcs"):
-            options.setdefault("use_listings_cache", False)  # trees keep listings, and know what was written
+            options.setdefault("use_listings_cache", False)  # trees cache listings, and update them after writing
         if self.scheme in HTTP:
             from aiohttp import ClientTimeout
 
@@ -173,10 +173,10 @@ class Requests:
         return options
 
     def send(self, requests: Sequence[Request], attempts: int | None = None) -> list[Any]:
-        """Send requests, several at a time, and those that failed again.
+        """Send requests, several at a time. Requests with temporary failures are sent again.
 
         Returns:
-            The answers, in the order of the requests: what the server sent, or the exception of a request that failed.
+            One answer per request, in their order: the data of the server, or the exception of a failed request.
         """
         attempts = attempts or self.settings.attempts
         answers: list[Any] = [None] * len(requests)
@@ -197,15 +197,15 @@ class Requests:
     def persist(
         self, work: Callable[[], _Answer], count: Callable[[], int] = lambda: 0, stop: threading.Event | None = None
     ) -> _Answer:
-        """Call a function that sends a request, and again after failures that may be temporary, as `send` does.
+        """Call a function that sends a request, again after temporary failures, as `send` does.
 
         Args:
             work: the function.
-            count: returns how many bytes have arrived: attempts count anew where there are more than before.
+            count: returns the number of bytes received so far. After progress, attempts are counted from one again.
             stop: ends the waiting when it is set.
 
         Returns:
-            What `work` returns.
+            The result of `work`.
 
         Raises:
             Exception: the error of the last attempt.
@@ -224,13 +224,13 @@ class Requests:
 
     @contextmanager
     def answer(self, headers: Mapping[str, str]) -> Iterator[HttpAnswer]:
-        """Ask a web server for the file once, and yield its answer, of which the body is read in pieces.
+        """Send one request for the file to a web server, and yield its answer. Its body can be read in pieces.
 
         Args:
-            headers: those of the request.
+            headers: headers of the request.
 
         Raises:
-            CarlascError: the request was redirected in a circle, to no web server, or from https to http.
+            CarlascError: the request was redirected in a loop, to a URL that is not http(s), or from https to http.
             Exception: the server cannot be reached (an error of aiohttp).
         """
         from fsspec.asyn import sync
@@ -255,9 +255,7 @@ class Requests:
 
     def _send_once(self, requests: Sequence[Request]) -> list[Any]:
         fs = self.fs
-        if (
-            self.scheme == HUB and len(requests) > 1
-        ):  # a file system that knows no asyncio, and may be used by several threads
+        if self.scheme == HUB and len(requests) > 1:  # a file system without asyncio, which several threads may use
             with ThreadPoolExecutor(min(self.settings.requests, len(requests))) as threads:
                 return list(threads.map(partial(_plain_call, fs, self.settings), requests))
         if not fs.async_impl:
@@ -275,12 +273,12 @@ class HttpAnswer:
     """The answer of a web server.
 
     Attributes:
-        status: its status.
-        reason: what the server calls it.
-        headers: its headers; case does not matter.
+        status: HTTP status.
+        reason: reason phrase of the status.
+        headers: headers; names are case-insensitive.
         first: the first bytes of the body.
-        more: returns the next bytes, none at the end of the body.
-        error: that of aiohttp, where the status is 400 or more.
+        more: returns the next bytes; empty at the end of the body.
+        error: error of aiohttp if the status is 400 or more.
     """
 
     status: int
@@ -299,7 +297,7 @@ class HttpAnswer:
 
 
 class _Collecting:
-    """Whether garbage is collected: off while anybody needs it off."""
+    """Turns garbage collection off while at least one thread needs it off."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -325,10 +323,10 @@ _COLLECTING = _Collecting()
 
 @contextmanager
 def holding_a_lock() -> Iterator[None]:
-    """Let a library that holds a lock of its own wait for requests, as h5py does when it reads a file object.
+    """Turn garbage collection off while a library with a global lock, such as h5py, reads a file object with requests.
 
-    A collection of garbage on fsspec's thread could free an object of that library, which needs the same lock: each would wait for the
-    other for ever. So nothing is collected meanwhile, nor does that thread begin in the middle of a collection.
+    Garbage collection on the thread of fsspec could free an object of that library, which needs the same lock: a deadlock. Before the block
+    starts, a collection in progress on that thread is finished.
     """
     import asyncio
 
@@ -336,14 +334,14 @@ def holding_a_lock() -> Iterator[None]:
 
     _COLLECTING.stop()
     try:
-        sync(get_loop(), asyncio.sleep, 0)  # when this has run, no collection is under way on that thread
+        sync(get_loop(), asyncio.sleep, 0)  # after this, no collection is in progress on that thread
         yield
     finally:
         _COLLECTING.resume()
 
 
 async def _gather(fs: Any, requests: Sequence[Request], settings: RemoteSettings, scheme: str) -> list[Any]:
-    import asyncio  # here, because it takes a twentieth of a second, which commands on local files need not wait
+    import asyncio  # imported here, because it takes 50 ms, and commands on local files do not need it
 
     gate = asyncio.Semaphore(settings.requests)
 

@@ -1,8 +1,8 @@
-"""How bytes are fetched from each kind of server: one request each, its answer compared with what was asked for.
+"""Fetching bytes from each kind of server with one checked request.
 
-fsspec's file systems list and describe files. The bytes of files are fetched here, so that answers are checked, and that failed requests are sent
-again by one rule: s3fs, botocore and huggingface_hub have rules of their own. `PRIVATE` lists the names of other packages without which this cannot be
-done and that these packages do not document; a test names the version of a package that has none of that name.
+fsspec file systems list and describe files. This module fetches the bytes, so that answers are checked, and that one rule for retries
+holds for s3fs, botocore and huggingface_hub. `PRIVATE` lists undocumented names of other packages that this needs; a test fails with the
+version of the package if one of them is removed.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ PRIVATE: Mapping[str, tuple[str, ...]] = {
     "fsspec.asyn.AsyncFileSystem": ("_cat_file", "_find", "_info", "_ls", "_pipe_file", "_rm", "_rm_file"),
     "s3fs.S3FileSystem": ("_call_s3", "_metadata"),
 }
-"""Methods by class. Those of fsspec are the coroutines by which its documentation describes asynchronous file systems."""
+"""Undocumented methods by class. For fsspec, they are the coroutines of asynchronous file systems."""
 
 HUB = "hf"
 """The scheme of the URLs of the Hugging Face Hub (`hf://datasets/ORG/NAME/...`)."""
 S3, HTTP = ("s3", "s3a"), ("http", "https")
-_MOST_BYTES = 1 << 30  # of a file that is read whole: larger ones are read in ranges
-_MOST_OF_PAGE = 1 << 26  # bytes of a page that lists a folder
+_MOST_BYTES = 1 << 30  # limit for files that are read whole; larger files are read in ranges
+_MOST_OF_PAGE = 1 << 26  # maximum bytes of a page that lists a folder
 _SLOWEST = 1000  # bytes per second
-_LONGEST_PIECE_S = 0.5  # how long the bytes of one piece of a body are collected
+_LONGEST_PIECE_S = 0.5  # maximum time to collect the bytes of one piece
 
 
 async def get(
@@ -36,16 +36,16 @@ async def get(
     """Return the bytes [start, end) of a file, or the whole file.
 
     Args:
-        fs: the file system of fsspec, one that knows asyncio.
-        scheme: that of the URL.
-        url: the file.
-        patience_s: how long a web server may send less than a kilobyte a second.
+        fs: the fsspec file system, with asyncio.
+        scheme: scheme of the URL.
+        url: URL of the file.
+        patience_s: maximum time during which a web server may send less than a kilobyte per second.
         start: first byte; None for the whole file.
-        end: the byte after the last one; None for the whole file.
+        end: end of the range, exclusive; None for the whole file.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        WrongAnswerError: the server sent something else.
+        WrongAnswerError: the answer does not fit the request.
         Exception: the request failed, with an error of the package that sent it.
     """
     if scheme in S3:
@@ -91,15 +91,15 @@ async def _get_http(fs: Any, url: str, start: int | None, end: int | None, patie
 
 
 async def http_answer(fs: Any, url: str, headers: Mapping[str, str]) -> Any:
-    """Send a request for a file of a web server; return aiohttp's answer, of which the body has not been read.
+    """Send a request for a file to a web server, and return the answer of aiohttp. The body is not read yet.
 
     Args:
-        fs: fsspec's file system for web servers.
-        url: the file.
-        headers: added to those of the file system's options.
+        fs: the fsspec file system for web servers.
+        url: URL of the file.
+        headers: headers in addition to those in the options of the file system.
 
     Raises:
-        CarlascError: it was redirected in a circle, to no web server, or from https to http.
+        CarlascError: the request was redirected in a loop, to a URL that is not http(s), or from https to http.
         aiohttp.ClientError: the request failed.
     """
     session = await fs.set_session()
@@ -108,7 +108,7 @@ async def http_answer(fs: Any, url: str, headers: Mapping[str, str]) -> Any:
     try:
         answer = await session.get(fs.encode_url(url), headers=together, **settings)
     except Exception as error:
-        # aiohttp has an error of its own for an address of another kind since 3.10.
+        # Since 3.10, aiohttp has a separate error for other schemes.
         if "Redirect" in type(error).__name__ or type(error) is ValueError:
             raise _leads_nowhere(url) from None
         raise
@@ -121,12 +121,15 @@ async def http_answer(fs: Any, url: str, headers: Mapping[str, str]) -> Any:
 
 def _leads_nowhere(url: str) -> CarlascError:
     return CarlascError(
-        without_credentials(url), expected="a file", found="a redirection that leads nowhere, or to no secure place"
+        without_credentials(url),
+        expected="a file",
+        found="a redirection in a loop, to another scheme, or from https to http",
+        advice="check the URL",
     )
 
 
 def status_error(answer: Any) -> Exception | None:
-    """Return the error of an answer of aiohttp whose status is 400 or more; None if it is a good one."""
+    """Return the error of an answer of aiohttp with a status of 400 or more; otherwise None."""
     try:
         answer.raise_for_status()
     except Exception as error:  # noqa: BLE001 (aiohttp is imported where it is used)
@@ -135,9 +138,9 @@ def status_error(answer: Any) -> Exception | None:
 
 
 async def read_piece(content: Any, most: int) -> bytes:
-    """Return the next bytes of a body, at most `most`, and fewer where they arrive slowly; none at its end.
+    """Return the next bytes of a body: at most `most`, fewer if they arrive slowly, empty at the end.
 
-    aiohttp drops what it has received when a connection breaks. What has arrived here by then is returned, and the next call raises the error.
+    When a connection breaks, aiohttp drops received bytes. This function returns them, and the next call raises the error.
 
     Args:
         content: the body of an answer of aiohttp.
@@ -161,13 +164,13 @@ def get_from_hub(fs: Any, url: str, timeout_s: float, start: int | None = None, 
     Args:
         fs: the file system of huggingface_hub.
         url: the file.
-        timeout_s: longest silence of the server.
+        timeout_s: maximum time without data from the server, seconds.
         start: first byte; None for the whole file.
-        end: the byte after the last one; None for the whole file.
+        end: end of the range, exclusive; None for the whole file.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        WrongAnswerError: the server sent something else.
+        WrongAnswerError: the answer does not fit the request.
         OSError: the request failed (an error of huggingface_hub).
     """
     hub = import_extra("huggingface_hub.utils", "hub")
@@ -175,7 +178,7 @@ def get_from_hub(fs: Any, url: str, timeout_s: float, start: int | None = None, 
     if start is not None and end is not None:
         headers["Range"] = f"bytes={start}-{end - 1}"
     answer = hub.get_session().get(fs.url(url), headers=headers, timeout=timeout_s)
-    if answer.status_code == 416:  # the range starts behind the end of the file
+    if answer.status_code == 416:  # the range starts after the end of the file
         return b""
     if answer.status_code == 404:
         raise FileNotFoundError(url)
@@ -189,7 +192,7 @@ def get_from_hub(fs: Any, url: str, timeout_s: float, start: int | None = None, 
 
 @cache
 def bounded_response(patience_s: float) -> Any:
-    """Return aiohttp's class of answers, which fsspec reads whole where it lists a page, with bodies of bounded length and time."""
+    """Return a subclass of the response of aiohttp that limits the size and time of bodies. fsspec reads listings with it."""
     from aiohttp import ClientResponse
 
     class BoundedResponse(ClientResponse):
@@ -203,16 +206,16 @@ def bounded_response(patience_s: float) -> Any:
 
 
 async def read_body(content: Any, most: int, patience_s: float) -> bytes:
-    """Read a body of at most `most` bytes. A server can send more than it says, and without end.
+    """Read a body of at most `most` bytes. A server may send more than it announced, even an endless body.
 
     Args:
         content: the body of an answer of aiohttp.
         most: largest number of bytes.
-        patience_s: how long the server may send less than a kilobyte a second.
+        patience_s: maximum time during which the server may send less than a kilobyte per second.
 
     Raises:
-        WrongAnswerError: there are more.
-        TimeoutError: after `patience_s`, less than a kilobyte a second has arrived.
+        WrongAnswerError: the body has more bytes.
+        TimeoutError: after `patience_s`, less than a kilobyte per second has arrived.
     """
     data, began = bytearray(), time.monotonic()
     async for piece in content.iter_any():
@@ -226,15 +229,15 @@ async def read_body(content: Any, most: int, patience_s: float) -> bytes:
 
 
 def check_range(found: str | None, start: int, end: int | None) -> None:
-    """Compare the header Content-Range, "bytes 0-99/1000", with the range that was asked for; the file may end before it.
+    """Compare the header Content-Range, "bytes 0-99/1000", with the requested range. The file may end before the range does.
 
     Args:
-        found: the header; None where the server sent none.
-        start: first byte that was asked for.
-        end: the byte after the last one; None for all.
+        found: the header; None if the server sent none.
+        start: first requested byte.
+        end: end of the requested range, exclusive; None for the end of the file.
 
     Raises:
-        WrongAnswerError: it is another range.
+        WrongAnswerError: the header has another range.
     """
     first, _, last = (found or "").removeprefix("bytes ").partition("/")[0].partition("-")
     if found is not None and not (first == str(start) and last.isdigit() and (end is None or int(last) < end)):
@@ -242,6 +245,6 @@ def check_range(found: str | None, start: int, end: int | None) -> None:
 
 
 def check_size(expected: int, data: bytes) -> None:
-    """Raise a WrongAnswerError if a server sent other than `expected` bytes."""
+    """Raise a WrongAnswerError if the number of received bytes is not `expected`."""
     if len(data) != expected:
         raise WrongAnswerError(f"{len(data)} bytes instead of {expected}")

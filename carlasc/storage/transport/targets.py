@@ -1,4 +1,4 @@
-"""Where stores are written: a folder on this machine or in an object store. Every file is written whole, or not at all."""
+"""Output folders of stores, on this machine or in an object store. Every file is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -20,19 +20,17 @@ from carlasc.storage.transport.requests import Request
 from carlasc.storage.transport.servers import HUB
 from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 
-_EXCLUSIVE = frozenset(
-    {"s3", "s3a", "gs", "gcs", "memory"}
-)  # schemes whose file systems put an object only if it is new
+_EXCLUSIVE = frozenset({"s3", "s3a", "gs", "gcs", "memory"})  # schemes of file systems with a create-only put
 _MARK = "carlasc-writer"
 _MOST_REMOVED = 1000  # objects in one request: the limit of S3
 
 
 class Target(ABC):
-    """A folder of files that is written to. Paths in it are relative, their parts joined by "/". It can be pickled.
+    """A folder to write files to. Paths in it are relative, with "/" between parts. It can be pickled.
 
     Attributes:
         location: its name in errors: a folder or a URL.
-        tree: reads what was written.
+        tree: reads the written files.
     """
 
     location: str
@@ -55,37 +53,37 @@ class Target(ABC):
 
     @abstractmethod
     def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
-        """Write a whole file, with the folders that it needs.
+        """Write a whole file, and create missing folders.
 
         Args:
             path: the file; an existing one is replaced unless `create` is given.
             data: its bytes.
-            create: write only if the file does not exist. Of several processes that do so at once, exactly one succeeds.
+            create: write only if the file does not exist. If several processes do this at once, exactly one succeeds.
 
         Returns:
             False if `create` is given and the file exists; True otherwise.
 
         Raises:
             FormatError: the path leads out of the folder.
-            StorageError: it cannot be written; nothing is left behind.
+            StorageError: the file cannot be written; no temporary file remains.
         """
 
     def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
-        """Write several files: those of a group side by side, and each group after those before it."""
+        """Write several groups of files, one group after the other. Files of a group are written in parallel."""
         for group in groups:
             for path, data in group.items():
                 self.put(path, data)
 
     @abstractmethod
     def paths(self, folder: str = "") -> Iterator[str]:
-        """Yield the paths of all files below a folder, in any order; none if it does not exist."""
+        """Yield the paths of all files below a folder, in any order; nothing if the folder does not exist."""
 
     @abstractmethod
     def remove(self, path: str) -> None:
         """Remove a file, or a folder with all files below it, if it exists."""
 
     def remove_many(self, paths: Iterable[str]) -> None:
-        """Remove several files, if they exist; object stores do so with few requests."""
+        """Remove several files, if they exist. Object stores need few requests for this."""
         for path in paths:
             self.remove(path)
 
@@ -103,7 +101,7 @@ class LocalTarget(Target):
         return LocalTarget(self._inside(folder))
 
     def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
-        """Write a file under a temporary name, then rename it, or link it where only a new file is wanted."""
+        """Write a file under a temporary name, then rename it, or link it if `create` is given."""
         return write_atomic(self._inside(path), data, create=create)
 
     def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
@@ -111,7 +109,7 @@ class LocalTarget(Target):
         write_many(*({self._inside(path): data for path, data in group.items()} for group in groups))
 
     def paths(self, folder: str = "") -> Iterator[str]:
-        """Walk the folders; the temporary files of writers are left out."""
+        """Yield the paths of all files, without temporary files of writers."""
         for root, _, names in os.walk(self._inside(folder) if folder else self.folder):
             for name in names:
                 if not name.startswith("."):
@@ -127,27 +125,27 @@ class LocalTarget(Target):
 
     def _inside(self, path: str) -> Path:
         if leads_outside(path):
-            raise FormatError(path, expected=f"a path inside {self.folder}", found="one that leads elsewhere")
+            raise FormatError(path, expected=f"a path inside {self.folder}", found="a path that leads out of it")
         return self.folder / path
 
 
 class RemoteTarget(Target):
     """A folder in an object store: a prefix of the keys of a bucket.
 
-    An object store shows an object only when all its bytes have arrived, so an upload is whole or absent. Folders need not be made.
+    An object exists only after all its bytes have arrived, so an upload is complete or absent. Folders need not be created.
 
     Attributes:
-        exclusive: whether the store has a create-only put. S3 has one ("If-None-Match: *") and so has Google Cloud Storage. In other
-            stores, `put` with `create` first asks whether the file exists: two processes that do so at once may both succeed.
+        exclusive: whether the store has a create-only put, as S3 ("If-None-Match: *") and Google Cloud Storage do. In other stores, `put`
+            with `create` first checks whether the file exists, so that two processes may both succeed.
     """
 
     tree: RemoteTree
 
     def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
-        """Take a folder's URL, and fsspec's storage options; nothing is requested yet.
+        """Keep the URL of a folder and the fsspec storage options. No request is sent yet.
 
         Raises:
-            ArgumentError: nothing can be written there, as with http and the Hugging Face Hub.
+            ArgumentError: the URL cannot be written to, such as http and the Hugging Face Hub.
             DependencyError: the URL needs a package that is not installed.
         """
         self.tree = RemoteTree(url, options)
@@ -156,14 +154,15 @@ class RemoteTarget(Target):
             raise ArgumentError(
                 self.location,
                 expected="a folder, or a URL of an object store",
-                found="a web server, which is only read",
+                found="a web server, which can only be read",
+                advice="write to a local folder, then upload it",
             )
         if self.tree.requests.scheme == HUB:
             raise ArgumentError(
                 self.location,
                 expected="a folder, or a URL of an object store",
                 found="the Hugging Face Hub, where each file would be a commit",
-                advice="write it here, then upload it with `hf upload-large-folder`",
+                advice="write to a local folder, then upload it with `hf upload-large-folder`",
             )
         self.exclusive = url.partition("://")[0] in _EXCLUSIVE
 
@@ -177,8 +176,8 @@ class RemoteTarget(Target):
     def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
         """Write an object with one request.
 
-        A create-only put whose answer is lost is sent again, and then finds the object that it made itself. In S3, each object made
-        so has a mark by which its writer recognises it; in other stores, such a put is reported as one that came too late.
+        If the answer to a create-only put is lost, the put is sent again and finds its own object. In S3, a mark in the object identifies
+        its writer; in other stores, such a put is reported as if the file had existed.
         """
         request = self._request(path, data)
         if create and not self.exclusive and self.tree.size(path) is not None:
@@ -208,12 +207,12 @@ class RemoteTarget(Target):
         return found.get(_MARK) == mark
 
     def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
-        """Write the objects of each group side by side."""
+        """Write the objects of each group in parallel."""
         for group in groups:
             self._send(group, [self._request(path, data) for path, data in group.items()])
 
     def paths(self, folder: str = "") -> Iterator[str]:
-        """List all objects below the folder: 1000 with each request."""
+        """List all objects below the folder, 1000 per request."""
         return self.tree.paths(self._checked(folder))
 
     def remove(self, path: str) -> None:
@@ -221,7 +220,7 @@ class RemoteTarget(Target):
         self.remove_many(self.paths(path))
 
     def remove_many(self, paths: Iterable[str]) -> None:
-        """Remove objects, in S3 1000 with each request; those that do not exist are left out."""
+        """Remove objects, in S3 1000 per request. Missing objects are ignored."""
         found = [self._checked(path) for path in paths]
         urls = [self.tree.url(name) for name in found]
         if self.tree.requests.is_s3:
@@ -248,12 +247,12 @@ class RemoteTarget(Target):
 
     def _checked(self, path: str) -> str:
         if leads_outside(path):
-            raise FormatError(path, expected=f"a path inside {self.location}", found="one that leads elsewhere")
+            raise FormatError(path, expected=f"a path inside {self.location}", found="a path that leads out of it")
         return path
 
 
 def target_of(out: str | os.PathLike[str] | Target, **storage_options: Any) -> Target:
-    """Return the folder to write to at a path or a URL; a Target is returned unchanged. Nothing is written yet.
+    """Return the Target for a path or a URL. A Target is returned unchanged. Nothing is written yet.
 
     Args:
         out: a folder, or the URL of one in an object store.
@@ -270,10 +269,10 @@ def target_of(out: str | os.PathLike[str] | Target, **storage_options: Any) -> T
 
 
 def check_shared(location: str, run: Run) -> None:
-    """Check that all processes of a run can use a place: `memory://` exists in one process only.
+    """Check that all processes of a run can access the output: `memory://` exists in one process only.
 
     Raises:
-        ArgumentError: they cannot.
+        ArgumentError: the output is in memory, and the run has several processes.
     """
     if location.startswith("memory://") and not run.is_alone:
         found = "an executor" if run.executor is not None else str(run.processes)

@@ -1,6 +1,6 @@
-"""Trees of files: a local folder, or one elsewhere. They list folders and read ranges of bytes.
+"""Trees of files, local or remote. They list folders and read ranges of bytes.
 
-No tree keeps a handle open, so that all of them can be pickled, and used on both sides of a fork.
+Trees keep no handles open, so they can be pickled, and used on both sides of a fork.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from pathlib import Path
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 
-# Bytes from which on a range is mapped. Reading the megabyte of a scan is faster than touching its mapped pages.
+# Minimum size of mapped ranges. Reading the megabyte of a scan is faster than mapping its pages.
 _MAPPED = 1 << 22
 
 
 class Tree(ABC):
-    """A folder of files. Paths in it are relative, their parts joined by "/"; "" is the folder itself.
+    """A folder of files. Paths in it are relative, with "/" between parts; "" is the folder itself.
 
     Attributes:
         location: its name in errors: a folder, a zip, a URL.
@@ -30,7 +30,7 @@ class Tree(ABC):
 
     @abstractmethod
     def entries(self, folder: str = "") -> Mapping[str, bool]:
-        """Return the names in a folder, each with whether it is a folder; empty if the folder does not exist."""
+        """Return the names in a folder, mapped to whether they are folders; empty if the folder does not exist."""
 
     @abstractmethod
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
@@ -38,17 +38,16 @@ class Tree(ABC):
 
         Args:
             path: the file.
-            size: the bytes that it has if it is what it should be; None where nothing says it. A packed file of another size is not
-                unpacked.
+            size: expected size in bytes; None if it is not known. A compressed file of another size is not decompressed.
 
         Raises:
             MissingDataError: the file does not exist.
-            FormatError: it cannot be read, or is damaged.
+            FormatError: the file cannot be read, or is damaged.
         """
 
     @abstractmethod
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Return the bytes [start, end) of a file; if start is negative, both are counted from the file's end.
+        """Return the bytes [start, end) of a file. If start is negative, both are counted from the end of the file.
 
         Raises:
             MissingDataError: the file does not exist.
@@ -61,7 +60,7 @@ class Tree(ABC):
         return self.entries(folder).get(name) is False
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Return several files' bytes, each of `size` (see `read`); remote trees request all of them at once."""
+        """Return the bytes of several files, each of `size` (see `read`). Remote trees request all of them at once."""
         return [self.read(path, size) for path in paths]
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
@@ -69,7 +68,7 @@ class Tree(ABC):
         return [self.read_range(*part) for part in ranges]
 
     def refresh(self) -> None:  # noqa: B027 (most trees remember nothing)
-        """Forget listings: other processes may have written files since."""
+        """Discard cached listings, because other processes may have written files."""
 
     def where(self, path: str) -> str:
         """Return the name of a file of the tree in errors."""
@@ -80,11 +79,11 @@ class LocalTree(Tree):
     """A folder on this machine."""
 
     def __init__(self, root: str | os.PathLike[str], *, mapped: bool = True) -> None:
-        """Take a folder.
+        """Create the tree of a folder.
 
         Args:
             root: the folder.
-            mapped: whether `read` maps files into memory, so that only what is used is read. A file must not be changed in place then.
+            mapped: whether `read` maps files into memory, so that only the used parts are read. Files must then not be changed in place.
         """
         self.root, self.mapped = Path(root), mapped
         self.location = str(self.root)
@@ -108,7 +107,7 @@ class LocalTree(Tree):
         return (self.root / path).is_file()
 
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
-        """Read the file, or map it into memory: its bytes are read when they are used."""
+        """Read the file, or map it into memory."""
         with self._opened(path) as descriptor:
             found = os.fstat(descriptor).st_size
             if not self.mapped:
@@ -123,7 +122,7 @@ class LocalTree(Tree):
             size = os.fstat(descriptor).st_size
             if start < 0:
                 start, end = max(0, size + start), size + end
-            if end > size:  # what a damaged table says may be more than fits into memory
+            if end > size:  # the range may come from a damaged table, and be larger than the memory
                 raise _shorter(end - start, max(0, size - start), self.where(path))
             if end - start >= _MAPPED:
                 return _map_range(descriptor, start, end)
@@ -134,7 +133,7 @@ class LocalTree(Tree):
     def _opened(self, path: str) -> Iterator[int]:
         path = f"{self.location}/{path}" if path else self.location
         try:
-            # Opening a pipe would wait for a writer, which may never come.
+            # Opening a pipe would hang without a writer.
             descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
             try:
                 if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -149,7 +148,7 @@ class LocalTree(Tree):
 
 
 def _map_range(descriptor: int, start: int, end: int) -> memoryview:
-    """Map the bytes [start, end) of an open file, which has as many, into memory."""
+    """Map the bytes [start, end) of an open file into memory. The file must be long enough."""
     skipped = start % mmap.ALLOCATIONGRANULARITY
     flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)  # read all pages at once (Linux only)
     mapped = mmap.mmap(descriptor, end - start + skipped, flags, mmap.PROT_READ, offset=start - skipped)
@@ -157,15 +156,15 @@ def _map_range(descriptor: int, start: int, end: int) -> memoryview:
 
 
 def check_length(data: bytes, expected: int, where: str) -> bytes:
-    """Return `data` if it has the expected length; else the file is truncated, or a server sent another range.
+    """Return `data` if it has the expected length.
 
     Args:
         data: bytes of a range.
-        expected: number of bytes that the range has.
+        expected: number of bytes of the range.
         where: the file, for errors.
 
     Raises:
-        FormatError: there are more or fewer bytes.
+        FormatError: the length is different: the file is truncated, or a server sent another range.
     """
     if len(data) != expected:
         raise _shorter(expected, len(data), where)
@@ -174,10 +173,10 @@ def check_length(data: bytes, expected: int, where: str) -> bytes:
 
 def _shorter(expected: int, found: int, where: str) -> FormatError:
     return FormatError(
-        where, expected=f"{expected} bytes in this range", found=str(found), advice="is the file truncated?"
+        where, expected=f"{expected} bytes in this range", found=str(found), advice="the file may be truncated"
     )
 
 
 def is_url(place: object) -> bool:
-    """Whether a place is a URL of another machine or of fsspec, rather than a path; `file://` is a path."""
+    """Whether a place is a URL rather than a local path. `file://` URLs count as paths."""
     return isinstance(place, str) and "://" in place and not place.startswith("file://")

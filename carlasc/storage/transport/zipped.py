@@ -1,7 +1,7 @@
-"""The files inside a zip, read in place, whether the zip is local or behind a URL.
+"""Reading the files in a local or remote zip in place.
 
-The published zips have a million members. `zipfile` creates an object for each, which takes ten seconds and a gigabyte. Here, the
-central directory is parsed once (PKWARE's APPNOTE, sections 4.3 and 4.4) and kept as a few NumPy columns.
+The published zips have a million members. `zipfile` creates an object for each, which takes ten seconds and a gigabyte. This module
+parses the central directory once (PKWARE's APPNOTE, sections 4.3 and 4.4) into a few NumPy columns.
 """
 
 from __future__ import annotations
@@ -28,14 +28,16 @@ _CENTRAL_SIZE, _LOCAL = 46, struct.Struct("<4s5H3L2H")
 _TAIL = _END.size + 65535 + _END64_LOCATOR.size  # the end record, its longest comment, and the locator before it
 _STORED, _DEFLATED = 0, 8  # methods
 _ENCRYPTED, _UTF8 = 1, 0x800  # flags
-_SLACK = 64  # bytes that are fetched in addition: the local header's extra field may be longer than the central one's
+_SLACK = (
+    64  # additional bytes to fetch: the extra field of the local header may be longer than in the central directory
+)
 
 
 class ZipTree(Tree):
     """The members of a zip in another tree."""
 
     def __init__(self, tree: Tree, path: str) -> None:
-        """Remember the zip's place; its central directory is read when it is first needed, once per process."""
+        """Keep the path of the zip. Its central directory is read on first use, once per process."""
         self.tree = tree
         self.path = path
         self.location = tree.where(path)
@@ -45,7 +47,7 @@ class ZipTree(Tree):
         return read_index(self.tree, self.path)
 
     def entries(self, folder: str = "") -> Mapping[str, bool]:
-        """Return the names that the central directory has in a folder."""
+        """Return the names in a folder, from the central directory."""
         found = self._index.folders.get(folder, {})
         return {name: number < 0 for name, number in found.items()}
 
@@ -59,7 +61,7 @@ class ZipTree(Tree):
         return self.read_many([path], size)[0]
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Read several members; all at once from a remote zip. None is unpacked to more than `size`, or than its ratio may be."""
+        """Read several members; all at once from a remote zip. The size and the compression ratio are checked before decompressing."""
         members = [self._member(path) for path in paths]
         for path, member in zip(paths, members, strict=True):
             unpacked, packed = (int(self._index.columns[name][member]) for name in ("size", "packed"))
@@ -70,12 +72,12 @@ class ZipTree(Tree):
         return [self._extract(path, member, memoryview(data)) for path, member, data in found]
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Return a part of a member, which is read as a whole because it may be compressed."""
+        """Return a part of a member. The whole member is read, because it may be compressed."""
         data = self.read(path)
         start, end = (max(0, len(data) + start), len(data) + end) if start < 0 else (start, end)
         if end > len(data):
             raise FormatError(
-                self.where(path), expected=f"at least {end} bytes", found=str(len(data)), advice="is it truncated?"
+                self.where(path), expected=f"at least {end} bytes", found=str(len(data)), advice="it may be truncated"
             )
         return data[start:end]
 
@@ -87,7 +89,7 @@ class ZipTree(Tree):
         return member
 
     def _extract(self, path: str, member: int, data: memoryview) -> bytes | memoryview:
-        """Return a member's bytes from a range that starts with its local header and may end after the member."""
+        """Return the bytes of a member from a range that starts with its local header and may end after the member."""
         where = self.where(path)
         columns = {name: int(column[member]) for name, column in self._index.columns.items()}
         if columns["flags"] & _ENCRYPTED or columns["method"] not in (_STORED, _DEFLATED):
@@ -107,7 +109,7 @@ class ZipTree(Tree):
             )
         first = _LOCAL.size + header[9] + header[10]
         last = first + columns["packed"]
-        if last > len(data):  # the local header has a longer extra field
+        if last > len(data):  # the extra field of the local header is longer than expected
             data = memoryview(self.tree.read_range(self.path, columns["offset"], columns["offset"] + last))
         packed = data[first:last]
         content: bytes | memoryview = packed
@@ -116,8 +118,8 @@ class ZipTree(Tree):
         if len(content) != columns["size"] or zlib.crc32(content) != columns["crc"]:
             raise FormatError(
                 where,
-                expected=f"{columns['size']} bytes with the zip's checksum",
-                found="others",
+                expected=f"{columns['size']} bytes with the checksum in the zip",
+                found="different bytes",
                 advice="the zip is damaged: fetch it again",
             )
         return content
@@ -131,9 +133,9 @@ class _Index:
     """The central directory of a zip.
 
     Attributes:
-        columns: offset, packed, size, crc, method, flags and others: (M,) each, for M members.
+        columns: offset, packed, size, crc, method, flags and further fields, each (M,) for M members.
         folders: by folder, the names in it and the member of each; -1 for a folder.
-        limit: offset of the central directory; no member reaches beyond it.
+        limit: offset of the central directory; all members end before it.
     """
 
     columns: dict[str, NDArray[np.int64]]
@@ -141,7 +143,7 @@ class _Index:
     limit: int
 
     def end_of(self, member: int) -> int:
-        """Return an offset that a member, in nearly all zips, does not reach beyond."""
+        """Return an upper bound for the end of a member, valid in nearly all zips."""
         columns = self.columns
         reach = columns["offset"][member] + _LOCAL.size + columns["header"][member] + columns["packed"][member] + _SLACK
         return min(int(reach), self.limit)
@@ -188,7 +190,7 @@ def _find_directory(tree: Tree, path: str) -> tuple[int, int, int]:
             where,
             expected="a zip's end record",
             found="none",
-            advice="is it truncated? Fetch the rest, or all of it again",
+            advice="the zip may be truncated: fetch it again",
         )
     _, disk, _, _, count, size, start, _ = _END.unpack_from(tail, found)
     locator = found - _END64_LOCATOR.size
@@ -202,12 +204,12 @@ def _find_directory(tree: Tree, path: str) -> tuple[int, int, int]:
             raise _damaged(where, "no 64-bit end record where its locator points")
         _, _, _, _, disk, _, _, count, size, start = record
     if disk:
-        raise FormatError(where, expected="one zip", found="a part of several", advice="join them first")
+        raise FormatError(where, expected="one zip", found="a part of a split zip", advice="join the parts first")
     return count, start, size
 
 
 def _walk(data: bytes, count: int, where: str) -> NDArray[np.int64]:
-    """Return the start of each record of the central directory; their lengths differ, so each is found from the one before."""
+    """Return the start of each record of the central directory. Records have different lengths, so each start follows from the previous one."""
     positions = np.empty(count, np.int64) if count <= len(data) // _CENTRAL_SIZE else np.empty(0, np.int64)
     lengths = struct.Struct("<3H").unpack_from
     position = 0
@@ -223,7 +225,7 @@ def _walk(data: bytes, count: int, where: str) -> NDArray[np.int64]:
 
 
 def _columns(data: bytes, positions: NDArray[np.int64], where: str) -> dict[str, NDArray[np.int64]]:
-    """Return the fixed fields of all records, with the values of the 64-bit extra field where there is one."""
+    """Return the fixed fields of all records, with values from the 64-bit extra field if it exists."""
     raw = np.frombuffer(data, np.uint8)
 
     def column(offset: int, width: int) -> NDArray[np.int64]:
@@ -267,7 +269,7 @@ def _widen(columns: dict[str, NDArray[np.int64]], member: int, extra: bytes, whe
 
 
 def _add_folder(folders: dict[str, dict[str, int]], folder: str) -> None:
-    """Add a folder and those above it."""
+    """Add a folder and its parents."""
     folders[folder] = {}
     while folder:
         folder, _, name = folder.rpartition("/")
@@ -278,7 +280,7 @@ def _add_folder(folders: dict[str, dict[str, int]], folder: str) -> None:
 
 
 def _names(data: bytes, begins: NDArray[np.int64], columns: dict[str, NDArray[np.int64]]) -> list[str]:
-    """Return the members' names; the whole directory is decoded at once, and single names again if one is not ASCII."""
+    """Return the names of the members. The whole directory is decoded at once; if it is not ASCII, each name separately."""
     text = data.decode("latin-1")
     names = [text[a:b] for a, b in zip(begins.tolist(), (begins + columns["name"]).tolist(), strict=True)]
     if not "".join(names).isascii():
@@ -290,7 +292,7 @@ def _names(data: bytes, begins: NDArray[np.int64], columns: dict[str, NDArray[np
 
 
 def _check_names(names: list[str], where: str) -> None:
-    """Refuse names that lead out of the folder; one search in all of them is enough for nearly every zip."""
+    """Check that no name leads out of the folder. For nearly every zip, one search in the joined names is enough."""
     together = "\n" + "\n".join(names)
     if not any(sign in together for sign in ("..", "\\", "\0", ":", "\n/")):
         return
@@ -300,13 +302,13 @@ def _check_names(names: list[str], where: str) -> None:
                 where,
                 expected="names inside the zip",
                 found=repr(name),
-                advice="it leads elsewhere: do not unpack this zip",
+                advice="the name leads out of the folder: do not unpack this zip",
             )
 
 
 def _inflate(content: memoryview, size: int, where: str) -> bytes:
     try:
-        # At most one byte more than the directory says, to detect members that are longer.
+        # At most one byte more than the size in the directory, to detect longer members.
         return zlib.decompressobj(-15).decompress(content, size + 1)
     except zlib.error as error:
         raise FormatError(

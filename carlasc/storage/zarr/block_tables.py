@@ -1,7 +1,7 @@
-"""Writing blocks of frames of a field to a zarr store, by any number of processes at a time.
+"""Writing blocks of frames of a field to a zarr store, from any number of processes.
 
-A block has one object per column, and last a table of its frames. An object that exists already is merged with: nothing that another
-process wrote is lost.
+A block has one object per column and a table of its frames, which is written last. New frames are merged with an existing object, so
+frames of other processes are not lost.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from carlasc.storage.zarr.shards import (
 )
 
 BLOCKS = "blocks"  # folder of the tables
-_ASKED_ONE_BY_ONE = 4  # blocks; a caller that asks for more is going to ask for all
-_FRESH_S = 1.0  # "does not exist" is not answered from a listing older than this
+_ASKED_ONE_BY_ONE = 4  # up to this many blocks are looked up singly; after that, all blocks are listed
+_FRESH_S = 1.0  # maximum age of a listing that is used for the answer "does not exist"
 
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """A frame of a field as it is stored: its chunks in each column that it needs, and their number of elements."""
+    """An encoded frame of a field: its chunks and its number of elements, both by column."""
 
     counts: dict[str, int]
     chunks: dict[str, list[bytes]]
 
 
 def encode_frame(field_layout: FieldLayout, array: NDArray[np.generic]) -> EncodedFrame:
-    """Return a frame as it is stored.
+    """Encode a frame for the store.
 
     Raises:
-        FormatError: it does not fit the field.
+        FormatError: the array does not fit the field.
     """
     counts, chunks = field_layout.divide(array)
     encodings = {name: field_layout.columns[name].encoding for name in chunks}
@@ -56,11 +56,11 @@ def encode_frame(field_layout: FieldLayout, array: NDArray[np.generic]) -> Encod
 
 
 class StoredField:
-    """A field in a store that is being written.
+    """A field of a store that is being written.
 
     Attributes:
-        node: its group.
-        field: its name.
+        node: group of the field.
+        field: name of the field.
     """
 
     def __init__(self, target: Target, node: str, field: str, options: PackOptions) -> None:
@@ -76,7 +76,7 @@ class StoredField:
         self._asked = 0
 
     def layout(self) -> FieldLayout | None:
-        """Return where its frames are; None if the field does not exist."""
+        """Return the layout of the field; None if the field does not exist."""
         if self._layout is None:
             path = f"{self.node}/{METADATA}"
             if (data := self.target.read(path)) is None:
@@ -86,7 +86,7 @@ class StoredField:
         return self._layout
 
     def create(self, typical: Callable[[], tuple[int, ...]]) -> FieldLayout:
-        """Return where its frames are; a new field is created, and the first of several processes decides where its frames are.
+        """Return the layout of the field. A new field is created; if several processes create it, the first one decides the layout.
 
         Args:
             typical: returns the shape of a grid, or (number of elements of a typical frame,).
@@ -105,8 +105,8 @@ class StoredField:
     def has(self, frame: int) -> bool:
         """Whether a frame exists.
 
-        The first few blocks that are asked for are looked up, then all blocks are listed. "No" is answered from a listing at most once
-        per frame, and not after a second: other processes write meanwhile.
+        The first few blocks are looked up singly, then all blocks are listed. A listing is used for "no" at most once per frame and for
+        at most a second, because other processes write meanwhile.
         """
         block = frame // self.options.block
         if self._exists(frame):
@@ -126,7 +126,7 @@ class StoredField:
         return False
 
     def refresh(self) -> None:
-        """Forget which frames were missing."""
+        """Discard the cached lists of missing frames."""
         whole = {block: table for block, table in self._tables.items() if len(table or {}) == self.options.block}
         self._tables, self._listed_s, self._denied, self._asked = dict(whole), None, set(), 0
 
@@ -145,13 +145,13 @@ class StoredField:
         self._denied = set()
 
     def table(self, block: int) -> FrameTable | None:
-        """Return what the table of a block says now; None if the block does not exist."""
+        """Read the table of a block; None if the block does not exist."""
         path = table_path(self.node, block)
         data = self.target.read(path)
         return None if data is None else self._parse(data, path)
 
     def _parse(self, data: bytes | memoryview, path: str) -> FrameTable | None:
-        """Return a table; None for an empty file, which a power failure can leave: the block is then made again."""
+        """Return a table; None for an empty file, which a power failure can leave. The block is then written again."""
         return parse_table(bytes(data), self.target.tree.where(path)) if data else None
 
     def read(self, frame: int) -> NDArray[np.generic] | None:
@@ -178,13 +178,13 @@ class StoredField:
         return ZarrArray.from_metadata(self.target.tree, f"{self.node}/{name}", metadata)
 
     def columns(self, block: int, frames: Mapping[int, EncodedFrame]) -> list[str]:
-        """Return the columns whose object changes when frames are written to a block: those that they need, or needed before."""
+        """Return the columns whose object changes when frames are written to a block: columns that they use, or used before."""
         before = self._tables.get(block) or {}
         needed = {name for frame, encoded in frames.items() for name in (*encoded.chunks, *before.get(frame, {}))}
         return sorted(needed)
 
     def put_column(self, name: str, block: int, frames: Mapping[int, EncodedFrame]) -> None:
-        """Write the object of one column of a block: frames that it has already are kept, or replaced by those given."""
+        """Write the object of one column of a block. Existing frames are kept, unless `frames` replaces them."""
         found = self._known_layout()
         array = self._array(found, name, block)
         slots = array.slots
@@ -198,10 +198,10 @@ class StoredField:
         there = bytes(self.target.tree.read(path))
         while (merged := _merge(there, new, taken, room, self.target.tree.where(path))) != there:
             self.target.put(path, merged)
-            there = bytes(self.target.tree.read(path))  # another process may have replaced it meanwhile
+            there = bytes(self.target.tree.read(path))  # read again, because another process may have replaced it
 
     def put_table(self, block: int, frames: Mapping[int, EncodedFrame]) -> None:
-        """Write the table of a block, once its objects are whole: with the frames that it has already."""
+        """Write the table of a block, including its existing frames. Its objects must be complete."""
         path, ours = table_path(self.node, block), {frame: encoded.counts for frame, encoded in frames.items()}
         if not self.target.put(path, format_table(ours), create=True):
             there = self.table(block) or {}
@@ -213,7 +213,7 @@ class StoredField:
 
 
 def _merge(there: bytes, new: Mapping[int, bytes], taken: set[int], room: int, where: str) -> bytes:
-    """Return the file of a shard with new chunks, and with those of the present file that are not in slots that are taken."""
+    """Return the bytes of a shard with new chunks, and with the existing chunks whose slots are not in `taken`."""
     there_now = split_shard(there, room, where) if there else {}  # a power failure can leave an empty file
     kept = {slot: chunk for slot, chunk in there_now.items() if slot not in taken}
     return join_shard({**kept, **new}, room)
@@ -225,7 +225,7 @@ def table_path(node: str, block: int) -> str:
 
 
 def block_of(path: str) -> int | None:
-    """Return the block whose table is at a path; None if no table is."""
+    """Return the number of the block whose table is at a path; None if the path is not that of a table."""
     folder, _, name = path.rpartition("/")
     stem = name.removesuffix(".json")
     is_table = folder.rpartition("/")[2] == BLOCKS and name != stem and stem.isascii() and stem.isdigit()
@@ -233,7 +233,7 @@ def block_of(path: str) -> int | None:
 
 
 def format_table(table: FrameTable) -> bytes:
-    """Return the bytes of a table: {"frames": {"17": {"xyz": 120800}, ...}}, frames and columns in order."""
+    """Return the bytes of a table: {"frames": {"17": {"xyz": 120800}, ...}}, with sorted frames and columns."""
     return to_json({"frames": {str(frame): dict(sorted(table[frame].items())) for frame in sorted(table)}})
 
 

@@ -1,4 +1,4 @@
-"""The root of a zarr store: it says how the store is packed, and whether it is finished. Exactly one of several processes creates it."""
+"""The root of a zarr store, with its options and whether it is finished. Exactly one of several processes creates it."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from carlasc.storage.packed.stores import STORE, VERSION, PackOptions
 from carlasc.storage.transport.targets import LocalTarget, Target
 from carlasc.storage.zarr.shards import METADATA, group_metadata
 
-_TRIES = 5  # other processes may begin, finish and replace the same store meanwhile
+_TRIES = 5  # other processes may create, finish and replace the same store meanwhile
 _OPTIONS = ("block", "lossy_mm", "small")
 
 
 class StoreRoot:
-    """The root of a store that is written to, shared by its writers. A new one is created with the first thing that is written.
+    """The root of a store that is being written, shared by its writers. A new root is created before the first write.
 
     Attributes:
-        is_finished: whether a finished store with the same options exists, to which more is added.
+        is_finished: whether a finished store with the same options exists, and frames are added to it.
     """
 
     def __init__(self, target: Target, options: PackOptions, overwrite: bool) -> None:
-        """Check that the store may be written. Nothing is written yet, but a store that is replaced is moved away.
+        """Check that the store may be written. Nothing is written yet, but a store to replace is moved away.
 
         Raises:
             ArgumentError: the target has no name.
-            ConflictError: something else exists there, or a store with other options.
+            ConflictError: other data, or a store with other options, exist at the target.
         """
         if isinstance(target, LocalTarget) and not target.folder.name:
             raise ArgumentError("out", expected="the name of a store", found=f"{target.location!r}")
@@ -36,15 +36,15 @@ class StoreRoot:
         if root is None:
             _refuse_other(target)
         elif not self._joins(root):
-            self.begin()  # what is replaced must not be taken for what was written
+            self.begin()  # otherwise the old store could be mistaken for the new one
             root = None
         self.is_finished = root is not None and root.get("complete") is True
 
     def begin(self) -> None:
-        """Create the root unless it exists: exactly one of several processes does, and the others join it.
+        """Create the root unless it exists. Exactly one of several processes creates it, and the others use it.
 
         Raises:
-            ConflictError: something else exists there, or a store with other options.
+            ConflictError: other data, or a store with other options, exist at the target.
         """
         if self._begun:
             return
@@ -59,18 +59,20 @@ class StoreRoot:
                 _move_away(self._target, finished=root.get("complete") is True)
             if self._begun:
                 return
-        raise ConflictError(self._target.location, problem="other processes keep replacing it", advice="wait for them")
+        raise ConflictError(
+            self._target.location, problem="other processes keep replacing it", advice="wait until they have ended"
+        )
 
     @property
     def _wanted(self) -> dict[str, Any]:
-        """The attributes of the root of a store that is begun."""
+        """The attributes of the root of a new store."""
         return {"type": STORE, "version": VERSION, "complete": False, **options_of(self._options)}
 
     def _joins(self, root: dict[str, Any]) -> bool:
-        """Whether a store that exists is written to; if not, it is replaced.
+        """Whether to write to an existing store; if not, it is replaced.
 
         Raises:
-            ConflictError: neither may be done.
+            ConflictError: neither is allowed.
         """
         wanted = self._wanted
         differs = [name for name in ("type", "version", *_OPTIONS) if root.get(name) != wanted[name]]
@@ -84,23 +86,23 @@ class StoreRoot:
         if not self._overwrite:
             raise ConflictError(
                 self._target.location,
-                expected="nothing there, or a store with the same options",
+                expected="a new path, or a store with the same options",
                 found=f"one with {', '.join(f'{name} {root.get(name)}' for name in differs if name != 'type')}",
-                advice="choose another name, remove it, or give `overwrite=True` where there is such an option",
+                advice="choose another name, remove it, or give `overwrite=True` if the command has this option",
             )
         return False
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_overwrite": False}  # only the process that was told to replaces a store
+        return self.__dict__ | {"_overwrite": False}  # only the original process replaces a store
 
 
 def options_of(options: PackOptions) -> dict[str, Any]:
-    """Return the options of a store as its root records them."""
+    """Return the options as they are recorded in the root."""
     return {name: getattr(options, name) for name in _OPTIONS}
 
 
 def existing_options(target: Target) -> PackOptions | None:
-    """Return how a store of this version is packed; None if there is none."""
+    """Return the options of an existing store of this version; None if it does not exist."""
     root = read_root(target)
     if root is None or root.get("type") != STORE or root.get("version") != VERSION:
         return None
@@ -108,7 +110,7 @@ def existing_options(target: Target) -> PackOptions | None:
 
 
 def read_root(target: Target) -> dict[str, Any] | None:
-    """Return the attributes of a zarr store's root, None if there is none."""
+    """Return the attributes of the root of a zarr store; None if it does not exist."""
     if (data := target.read(METADATA)) is None:
         return None
     found = parse_json(data, target.tree.where(METADATA)).get("attributes")
@@ -116,25 +118,25 @@ def read_root(target: Target) -> dict[str, Any] | None:
 
 
 def remove_replaced(target: Target) -> None:
-    """Remove the older store that a finished one replaces, if there is one: also one that was moved away by a run that ended right after that."""
+    """Remove the older store that a finished store replaces, if it exists, even if an interrupted run has moved it away."""
     if isinstance(target, LocalTarget):
         remove(replaced(target.folder))
 
 
 def _refuse_other(target: Target) -> None:
-    """Refuse a place where something is that is no zarr store."""
+    """Raise ConflictError if the target exists and is not a zarr store."""
     if isinstance(target, LocalTarget) and target.folder.exists() and not target.folder.is_dir():
         found: str | None = "a file"
     else:
         found = next(iter(target.paths()), None)
     if found is not None and read_root(target) is None:
         raise ConflictError(
-            target.location, expected="nothing there, or a packed store", found=found, advice="choose another name"
+            target.location, expected="a new path, or a packed store", found=found, advice="choose another name"
         )
 
 
 def _move_away(target: Target, *, finished: bool) -> None:
-    """Move a finished local store away until the new one is finished; remove any other one, root first."""
+    """Move a finished local store away until the new one is finished. Remove any other store, root first."""
     if not (isinstance(target, LocalTarget) and finished):
         target.remove(METADATA)
         target.remove("")

@@ -1,4 +1,4 @@
-"""The objects of a zarr store: shards of chunks, each with an index of its own, and the metadata that describe them.
+"""The objects of a zarr store: shards of chunks, each with an index, and their metadata.
 
 See the zarr specification v3, "sharding_indexed" and "crc32c".
 """
@@ -24,8 +24,8 @@ _SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFF
 _LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
 _CRC = {"name": "crc32c"}
 _CHECKSUM = 4  # bytes
-_RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their own crc32c
-_ABSENT = 2**64 - 1  # offset and length of a chunk that does not exist
+_RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their crc32c
+_ABSENT = 2**64 - 1  # offset and length of a missing chunk
 
 
 class ZarrArray(StoredArray):
@@ -42,7 +42,7 @@ class ZarrArray(StoredArray):
         """Read the metadata of an array.
 
         Raises:
-            FormatError: its codecs or its chunks are not those that carlasc writes.
+            FormatError: carlasc does not write such codecs or chunks.
         """
         with reading(tree.where(node), "the codecs and chunks that carlasc writes"):
             shape, dtype = _numbers(metadata["shape"], 0), np.dtype(metadata["data_type"]).newbyteorder("<")
@@ -68,7 +68,7 @@ class ZarrArray(StoredArray):
     _indices: dict[int, ShardIndex]
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
-        """Look up chunks in the indices of their shards, which are read once, those of one call together."""
+        """Look up chunks in the indices of their shards. Each index is read once; all indices of one call are read together."""
         per_shard = self.per_shard
         if per_shard is None:
             return [(self.file(number), 0, -1) for number in numbers]
@@ -89,7 +89,7 @@ class ZarrArray(StoredArray):
         return places
 
     def fetch(self, numbers: Sequence[int]) -> list[memoryview]:
-        """Read chunks as they are stored."""
+        """Read encoded chunks."""
         try:
             if self.per_shard is None:
                 return [memoryview(data) for data in self.tree.read_many([self.file(number) for number in numbers])]
@@ -124,18 +124,18 @@ class ZarrArray(StoredArray):
 
 
 class ShardIndex:
-    """Where the chunks of a shard are in its file. Only those that exist take memory."""
+    """The positions of the existing chunks of a shard in its file."""
 
     def __init__(self, data: memoryview, per_shard: int, what: str) -> None:
         """Read an index.
 
         Args:
             data: the bytes of the index, with its checksum.
-            per_shard: number of chunks that the shard has room for.
-            what: its name in errors.
+            per_shard: maximum number of chunks of the shard.
+            what: name of the index in errors.
 
         Raises:
-            FormatError: it is cut short, or the checksum does not match.
+            FormatError: the index is cut short, or its checksum does not match.
         """
         if len(data) != index_bytes(per_shard):
             raise FormatError(
@@ -143,7 +143,7 @@ class ShardIndex:
             )
         table = np.frombuffer(without_checksum(data, what), "<u8").reshape(-1, 2)
         slots = np.flatnonzero(table[:, 0] != _ABSENT)
-        self.slots = array("q", slots.astype("=i8").tobytes())  # looking up one number is faster than in NumPy's arrays
+        self.slots = array("q", slots.astype("=i8").tobytes())  # access to one number is faster than in a NumPy array
         self._offsets, self._lengths = (array("Q", column.astype("=u8").tobytes()) for column in table[slots].T)
 
     def place(self, slot: int) -> tuple[int, int] | None:
@@ -156,16 +156,16 @@ class ShardIndex:
 
 
 def encode_chunk(chunk: NDArray[Any], encoding: Encoding) -> bytes:
-    """Return a chunk as it is in a shard, with its checksum."""
+    """Return the encoded bytes of a chunk, with its checksum."""
     return _with_checksum(encoding.encode(chunk, "zarr"))
 
 
 def join_shard(chunks: Mapping[int, bytes | memoryview], per_shard: int) -> bytes:
-    """Return the file of a shard: its index, then its chunks.
+    """Return the bytes of a shard: its index, then its chunks.
 
     Args:
-        chunks: the chunks that exist, as `encode_chunk` returns them, by their number in the shard.
-        per_shard: number of chunks that the shard has room for.
+        chunks: results of `encode_chunk` by their number in the shard.
+        per_shard: maximum number of chunks of the shard.
     """
     table = np.full((per_shard, 2), _ABSENT, "<u8")
     offset = index_bytes(per_shard)
@@ -176,7 +176,7 @@ def join_shard(chunks: Mapping[int, bytes | memoryview], per_shard: int) -> byte
 
 
 def split_shard(data: bytes | memoryview, per_shard: int, what: str) -> dict[int, memoryview]:
-    """Return the chunks of a shard, as they are in its file, by their number in it.
+    """Return the encoded chunks of a shard by their number in it.
 
     Raises:
         FormatError: the index is damaged.
@@ -185,7 +185,9 @@ def split_shard(data: bytes | memoryview, per_shard: int, what: str) -> dict[int
     index = ShardIndex(view[: index_bytes(per_shard)], per_shard, what)
     found = {slot: place for slot in index.slots if (place := index.place(slot)) is not None}
     if any(end > len(view) for _, end in found.values()):
-        raise FormatError(what, expected="chunks inside the file", found="others", advice="the store is damaged")
+        raise FormatError(
+            what, expected="chunks inside the file", found="a chunk outside of it", advice="the store is damaged"
+        )
     return {slot: view[start:end] for slot, (start, end) in found.items()}
 
 
@@ -195,7 +197,7 @@ def index_bytes(per_shard: int) -> int:
 
 
 def without_checksum(data: memoryview, what: str) -> memoryview:
-    """Return bytes without the checksum at their end.
+    """Verify the checksum at the end of some bytes, and return the bytes without it.
 
     Raises:
         FormatError: the checksum does not match.
@@ -208,10 +210,10 @@ def without_checksum(data: memoryview, what: str) -> memoryview:
 
 
 def _numbers(values: Any, least: int) -> tuple[int, ...]:
-    """Return a list of whole numbers from JSON.
+    """Return a list of integers from JSON.
 
     Raises:
-        ValueError: it is something else, or a number is below `least`, or does not fit into an int64.
+        ValueError: it is not a list of integers, or a number is below `least` or does not fit into an int64.
     """
     if not isinstance(values, list) or not all(type(value) is int and least <= value < 2**63 for value in values):
         raise ValueError(f"{values!r} for a shape")
@@ -227,7 +229,7 @@ def group_metadata(attributes: Mapping[str, Any], nodes: Mapping[str, Any] | Non
 
     Args:
         attributes: the group's attributes.
-        nodes: the metadata of all nodes below it, by path, which are then consolidated in it.
+        nodes: the metadata of all nodes below it by path, to consolidate in this group; None does not consolidate.
     """
     metadata: dict[str, Any] = {"attributes": dict(attributes), "zarr_format": 3, "node_type": "group"}
     if nodes is not None:
@@ -246,11 +248,11 @@ def array_metadata(
     """Return the metadata of an array.
 
     Args:
-        dtype: type of its elements.
-        shape: its shape.
+        dtype: type of the elements.
+        shape: shape of the array.
         chunk: shape of a chunk.
-        encoding: how a chunk becomes bytes; its crc32c follows.
-        attributes: the array's attributes.
+        encoding: encoding of a chunk; its crc32c is appended.
+        attributes: attributes of the array.
         shard: shape of a shard; None for an array without shards.
     """
     codecs = codecs_of(encoding, dtype)
@@ -277,7 +279,7 @@ def array_metadata(
 
 
 def codecs_of(encoding: Encoding, dtype: np.dtype[Any]) -> list[dict[str, Any]]:
-    """Return the codecs of a chunk: those of its encoding, and crc32c."""
+    """Return the codecs of a chunk: the codecs of its encoding, and crc32c."""
     if encoding.codec == "pcodec":
         return [{"name": "numcodecs.pcodec", "configuration": {"level": encoding.level}}, _CRC]
     shuffle = next(name for name, number in _SHUFFLES.items() if number == encoding.shuffle)
@@ -295,7 +297,7 @@ def encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
     """Return the encoding that the (inner) codecs in an array's metadata describe.
 
     Raises:
-        ValueError: they are not those of an `Encoding`.
+        ValueError: no `Encoding` has these codecs.
     """
     names = [codec["name"] for codec in codecs]
     if names == ["numcodecs.pcodec", "crc32c"]:
@@ -312,8 +314,8 @@ def column_metadata(field_layout: FieldLayout, column: Column, block: int, frame
     Args:
         field_layout: the layout of its field.
         column: the column.
-        block: number of frames of a shard.
-        frames: number of frames that the array has room for, a multiple of `block`.
+        block: number of frames per shard.
+        frames: length of the array in frames, a multiple of `block`.
     """
     shape = field_layout.frame_shape(column)
     return array_metadata(

@@ -1,6 +1,6 @@
-"""Finishing a zarr store: its tables become one table per sequence, and its metadata are written, the root's last.
+"""Finishing a zarr store: block tables are joined to one table per sequence, and the metadata are written, the root last.
 
-Everything is derived from the objects that exist, so that finishing may be interrupted and repeated, and any process can do it.
+The result depends only on the existing objects, so any process can finish a store, and finishing can be interrupted and repeated.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ _SMALL = Encoding(shuffle=SHUFFLE)
 
 @dataclass
 class FinishedStore:
-    """What a store holds.
+    """The content of a finished store.
 
     Attributes:
         location: the store.
-        sequences: number of frames of each field, by the path of the sequence.
-        missing: number of announced frames that are not there, likewise.
+        sequences: number of frames by field, by the path of the sequence.
+        missing: number of missing announced frames by field, by the path of the sequence.
     """
 
     location: str
@@ -52,13 +52,13 @@ class FinishedStore:
 
 @dataclass
 class StoreNodes:
-    """The metadata of nodes, and the files to write."""
+    """Collects the metadata of nodes and the files to write."""
 
     metadata: dict[str, Any] = field(default_factory=dict)
     files: dict[str, bytes] = field(default_factory=dict)
 
     def group(self, node: str, attributes: Mapping[str, Any]) -> None:
-        """Add a group, and the groups above it that are not there."""
+        """Add a group and its missing parents."""
         parts = node.split("/")
         for end in range(1, len(parts)):
             self.metadata.setdefault("/".join(parts[:end]), group_metadata({}))
@@ -75,23 +75,23 @@ class StoreNodes:
 
 
 def finish(out: str | os.PathLike[str] | Target, *, incomplete: bool = False, **storage_options: Any) -> FinishedStore:
-    """Write the metadata of a zarr store by which it can be opened: of what several commands have written to it.
+    """Write the metadata of a zarr store, so that it can be opened.
 
-    The last part of a run does so by itself. This is for stores of which a part failed, or was never run. A finished store is brought up
-    to date.
+    The last part of a run does this automatically. Use this function if a part failed or was never run. A finished store is updated with
+    the frames that were added to it.
 
     Args:
         out: the store: a path, or a URL of an object store.
-        incomplete: finish it although frames are missing that a run has announced.
+        incomplete: finish the store even if announced frames are missing.
         **storage_options: options of fsspec for a URL.
 
     Returns:
-        What the store holds, and what is missing.
+        The number of frames in the store, and of missing frames.
 
     Raises:
         ConflictError: announced frames are missing, and `incomplete` is not given.
-        FormatError: something in it is damaged.
-        MissingDataError: there is no zarr store of the present version.
+        FormatError: a file of the store is damaged.
+        MissingDataError: `out` is not a zarr store of the present version.
     """
     target = target_of(out, **storage_options)
     if isinstance(target, LocalTarget):
@@ -102,7 +102,7 @@ def finish(out: str | os.PathLike[str] | Target, *, incomplete: bool = False, **
         before, paths = paths, sorted(target.paths())
         if _tables_of(before) == _tables_of(paths):
             return result
-        # another process has added something meanwhile, and may have written its metadata before ours
+        # another process has added frames meanwhile, and may have written older metadata after it
 
 
 def _tables_of(paths: list[str]) -> list[str]:
@@ -123,7 +123,10 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
         if attributes.get("type") == SEQUENCE:
             if not {"path", "split", "name", "coordinates"} <= attributes.keys():
                 raise FormatError(
-                    f"{target.location}/{node}", expected="a sequence", found="less", advice="the store is damaged"
+                    f"{target.location}/{node}",
+                    expected="the attributes of a sequence",
+                    found="some missing",
+                    advice="the store is damaged",
                 )
             sequences[attributes["path"]] = node
             inside = [path for path in paths if path.startswith(f"{node}/")]
@@ -140,7 +143,7 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
     sequences = dict(sorted(sequences.items()))
     if (
         root.get("complete") is True
-    ):  # a store that is brought up to date cannot be opened while its tables and its root disagree
+    ):  # a store that is updated cannot be opened while its tables and its root do not fit
         target.put(METADATA, to_json(group_metadata(root | {"complete": False})))
     target.put_many(nodes.files | {f"{node}/{METADATA}": to_json(found) for node, found in nodes.metadata.items()})
     all_nodes = dict(sorted(nodes.metadata.items()))
@@ -177,21 +180,23 @@ def _finish_sequence(
         if tables.get(group):
             fields[name] = FieldLayout.read(f"{target.location}/{group}", name, about)
             nodes.group(group, about)
-    found = {name: tables[f"{node}/{field_node(name)}"] for name in sorted(fields)}
-    _count(target, node, attributes["path"], paths, found, result)
-    frames, counts, columns = count_elements(fields, found)
-    for place, most in zip(columns, counts.max(axis=0, initial=0).tolist(), strict=True):
-        kind, _, column = place.rpartition("/")
+    frames_by_field = {name: tables[f"{node}/{field_node(name)}"] for name in sorted(fields)}
+    _count(target, node, attributes["path"], paths, frames_by_field, result)
+    frames, counts, columns = count_elements(fields, frames_by_field)
+    for column_path, most in zip(columns, counts.max(axis=0, initial=0).tolist(), strict=True):
+        kind, _, column = column_path.rpartition("/")
         name = kind.partition("/")[2]
         if most > 0:
-            room = -(-(max(found[name]) + 1) // block) * block
-            nodes.metadata[f"{node}/{place}"] = column_metadata(fields[name], fields[name].columns[column], block, room)
+            room = -(-(max(frames_by_field[name]) + 1) // block) * block
+            nodes.metadata[f"{node}/{column_path}"] = column_metadata(
+                fields[name], fields[name].columns[column], block, room
+            )
     documents = sorted(
         path.removeprefix(f"{node}/{document_node('')}")
         for path in paths
         if path.startswith(f"{node}/{document_node('')}")
     )
-    nodes.group(node, {**attributes, "fields": sorted(found), "documents": documents})
+    nodes.group(node, {**attributes, "fields": sorted(frames_by_field), "documents": documents})
     nodes.small(f"{node}/frames", frames, {"type": "carlasc.frames", "unit": "frame"})
     nodes.small(f"{node}/counts", counts, {"type": "carlasc.counts", "unit": "element", "columns": columns})
 
@@ -215,7 +220,7 @@ def _read_tables(target: Target, paths: Iterable[str]) -> dict[str, FrameTable]:
 def _count(
     target: Target, node: str, path: str, paths: list[str], tables: Mapping[str, FrameTable], result: FinishedStore
 ) -> None:
-    """Count the frames of a sequence, and those that were announced and are missing."""
+    """Count the frames of a sequence, and its missing announced frames."""
     result.sequences[path] = {name: len(table) for name, table in tables.items()}
     announced = f"{node}/{EXPECTED}"
     if announced not in paths:
@@ -227,7 +232,7 @@ def _count(
 
 
 def format_expected(frames: Mapping[str, set[int]]) -> bytes:
-    """Return the bytes of the announced frames: ranges [first, end) of each field."""
+    """Return the announced frames as bytes: ranges [first, end) by field."""
     ranges: dict[str, list[list[int]]] = {}
     for name in sorted(frames):
         found = ranges.setdefault(name, [])

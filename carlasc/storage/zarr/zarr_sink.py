@@ -1,4 +1,4 @@
-"""Writing packed zarr stores: in place, block by block, by any number of processes at a time."""
+"""Writing packed zarr stores in place, block by block, from any number of processes."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from carlasc.storage.zarr.shards import METADATA, group_metadata
 from carlasc.storage.zarr.zarr_finish import EXPECTED, finish, format_expected, parse_expected
 from carlasc.storage.zarr.zarr_source import ZarrSource
 
-_PUTS = 16  # objects that are written side by side
+_PUTS = 16  # objects that are written in parallel
 _T = TypeVar("_T")
 
 
 class ZarrSink(Sink):
-    """Writes a packed zarr store, in place: on a local disk and in an object store alike.
+    """Writes a packed zarr store in place, on a local disk or in an object store.
 
-    Several processes may write one store at the same time, each with a sink of its own, or with pickled copies of one writer. The store
-    cannot be opened until `finish` has written its metadata.
+    Several processes may write one store at the same time, each with its own sink, or with pickled copies of one writer. The store cannot
+    be opened until `finish` has written its metadata.
     """
 
     is_readable = True
@@ -44,18 +44,18 @@ class ZarrSink(Sink):
     def __init__(
         self, out: str | os.PathLike[str] | Target, options: PackOptions | None = None, overwrite: bool = False
     ) -> None:
-        """Start a store, or join one that is being written, or was interrupted, with the same options.
+        """Start a store, or continue an unfinished store with the same options.
 
-        More may be added to a finished store: it can be read meanwhile, and what is added is seen after `finish`.
+        Frames may be added to a finished store. It can be read meanwhile, and shows the new frames after `finish`.
 
         Args:
             out: the store.
-            options: how it is packed; None: as the store is packed that exists.
-            overwrite: start again where a finished store exists, or one with other options. A finished local store is kept as `<name>.replaced`
-                until the new one is finished; in an object store it is removed first.
+            options: options of the store; None takes those of an existing store unless `overwrite` is given, otherwise the defaults.
+            overwrite: replace a finished store, or a store with other options. A finished local store is kept as `<name>.replaced` until
+                the new store is finished; in an object store it is removed first.
 
         Raises:
-            ConflictError: something else exists there.
+            ConflictError: other data exist at `out`.
             DependencyError: zarr's codecs are not installed.
         """
         for module in ("numcodecs", "google_crc32c"):
@@ -73,10 +73,10 @@ class ZarrSink(Sink):
         return ZarrWriter(self.target, node_of(path, self.location), path, self.options, self._root)
 
     def finish(self, *, incomplete: bool = False) -> None:
-        """Write the metadata by which the store can be opened.
+        """Write the metadata of the store, so that it can be opened.
 
         Raises:
-            ConflictError: frames that a run has announced (`SequenceWriter.expect`) are not there, and `incomplete` is not given.
+            ConflictError: announced frames (`SequenceWriter.expect`) are missing, and `incomplete` is not given.
         """
         self._root.begin()
         finish(self.target, incomplete=incomplete)
@@ -90,11 +90,11 @@ class ZarrSink(Sink):
 class ZarrWriter(SequenceWriter):
     """Writes one sequence of a zarr store.
 
-    `write_frames` writes blocks of frames at once. `write` keeps the frames of a block in memory until a frame of another block comes, or
-    the writer is closed; in a pickled copy, which nobody closes, it writes each frame at once.
+    `write_frames` writes blocks of frames at once. `write` keeps the frames of a block in memory until the first frame of another block, or
+    until the writer is closed. In a pickled copy, which is never closed, it writes each frame immediately.
 
     Attributes:
-        identity: split, name and coordinates, from the path unless they are known better.
+        identity: split, name and coordinates; by default those of the path.
     """
 
     concurrent = True
@@ -112,10 +112,10 @@ class ZarrWriter(SequenceWriter):
         self._begun = False
         self._keeps = True
         self._fields: dict[str, StoredField] = {}
-        self._held: dict[str, dict[int, EncodedFrame]] = {}  # of one block
+        self._held: dict[str, dict[int, EncodedFrame]] = {}  # frames of one block, by field
 
     def expect(self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None) -> None:
-        """Record what a run is going to write: the store cannot be finished without it by accident."""
+        """Record the announced frames, so that the store is not finished without them by accident."""
         self._rows.update(rows or {})
         path = f"{self.group}/{EXPECTED}"
         there = self.target.read(path)
@@ -126,23 +126,23 @@ class ZarrWriter(SequenceWriter):
             self.target.put(path, format_expected(merged))
 
     def has(self, field: str, frame: int) -> bool:
-        """Whether this process or another one has written it."""
+        """Whether this or another process has written the frame."""
         layout.field_named(field)
         return frame in self._held.get(field, {}) or self._field(field).has(frame)
 
     def refresh(self) -> None:
-        """Forget which frames were missing."""
+        """Discard the cached lists of missing frames."""
         for field in self._fields.values():
             field.refresh()
 
     def read(self, field: str, frame: int) -> NDArray[Any] | None:
-        """Return a frame that exists, None if it does not."""
+        """Return an existing frame; None if it does not exist."""
         if frame in self._held.get(field, {}):
             self._flush()
         return self._field(field).read(frame)
 
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
-        """Write one frame: it is stored with the others of its block."""
+        """Write one frame. It is stored together with the other frames of its block."""
         encoded = self._encode({frame: {field: array}})
         if not self._keeps:
             self._put(frame // self.block, encoded)
@@ -152,7 +152,7 @@ class ZarrWriter(SequenceWriter):
         self._held.setdefault(field, {}).update(encoded[field])
 
     def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
-        """Write the fields of several frames; those of one block together."""
+        """Write the fields of several frames, block by block."""
         self._flush()
         for block in sorted({frame // self.block for frame in frames}):
             self._put(block, self._encode({frame: frames[frame] for frame in frames if frame // self.block == block}))
@@ -190,7 +190,7 @@ class ZarrWriter(SequenceWriter):
         self._flush()
 
     def _start(self) -> None:
-        """Create the store and the sequence, with the first thing that is written."""
+        """Create the store and the sequence, before the first write."""
         if not self._begun:
             self._root.begin()
             split, name, coordinates = self.identity
@@ -206,7 +206,7 @@ class ZarrWriter(SequenceWriter):
         return self._fields[field]
 
     def _encode(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> dict[str, dict[int, EncodedFrame]]:
-        """Encode frames, in parallel in threads; new fields are created."""
+        """Encode frames in threads, and create new fields."""
         self._start()
         items = [(field, frame, array) for frame, fields in frames.items() for field, array in fields.items()]
         arrays: dict[str, list[NDArray[Any]]] = {}
@@ -232,7 +232,7 @@ class ZarrWriter(SequenceWriter):
         return result
 
     def _put(self, block: int, encoded: Mapping[str, Mapping[int, EncodedFrame]]) -> None:
-        """Write the objects of a block, then the tables which say that they are whole, that of the field that is given last at the end."""
+        """Write the objects of a block, then the tables that mark them as complete, in the order of the fields."""
         fields = {name: self._field(name) for name in encoded}
         objects = [(name, column) for name, field in fields.items() for column in field.columns(block, encoded[name])]
         self._each(lambda part: fields[part[0]].put_column(part[1], block, encoded[part[0]]), objects)
@@ -241,7 +241,7 @@ class ZarrWriter(SequenceWriter):
         fields[last].put_table(block, encoded[last])
 
     def _each(self, function: Callable[[_T], None], items: list[_T]) -> None:
-        """Call a function with several items side by side, as it waits for an object store or for a disk."""
+        """Call a function with several items in threads. The function mostly waits for an object store or a disk."""
         with ThreadPoolExecutor(_PUTS) as pool:
             list(pool.map(function, items))
 

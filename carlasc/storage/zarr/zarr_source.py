@@ -1,6 +1,6 @@
 """Reading packed stores in zarr v3: sharded arrays, consolidated metadata, codecs of the core specification.
 
-Any zarr v3 library reads them. Here, the shards' indices and chunks are read directly, which takes a tenth of zarr-python's time per chunk.
+Any zarr v3 library can read them. This module reads indices and chunks directly, which takes a tenth of the time of zarr-python per chunk.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ZarrSource(ArraySource):
 
         Raises:
             DependencyError: zarr's codecs are not installed.
-            FormatError: it is another zarr store, unfinished, or of another version.
+            FormatError: it is not a packed store, is unfinished, or has another version.
         """
         for module in ("numcodecs", "google_crc32c"):
             import_extra(module, "zarr")
@@ -37,7 +37,7 @@ class ZarrSource(ArraySource):
 
 
 class ZarrStore(ArrayStore):
-    """The nodes of a finished zarr store, whose metadata are all in its root."""
+    """The nodes of a finished zarr store. All metadata are in the root."""
 
     def __init__(self, tree: Tree) -> None:
         self.tree = tree
@@ -53,7 +53,7 @@ class ZarrStore(ArrayStore):
         return self.tree.sizes() if isinstance(self.tree, RemoteTree) else {}
 
     def forget(self) -> bool:
-        """Forget the metadata: they are read again."""
+        """Discard the metadata, so that they are read again."""
         vars(self).pop("_root", None)
         return True
 
@@ -76,7 +76,7 @@ class ZarrStore(ArrayStore):
             raise error.within(f"{self.location}/{node}") from error
 
     def read_document(self, node: str) -> bytes:
-        """Return the bytes of a text file, which is a file of the store."""
+        """Return the bytes of a text file, which is one file in the store."""
         try:
             return bytes(self.tree.read(node))
         except MissingDataError as error:

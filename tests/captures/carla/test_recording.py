@@ -168,7 +168,7 @@ def test_a_measurement_of_another_tick_is_skipped_or_refused():
         for tick in (4, 5, 7):
             arrived.put(SimpleNamespace(frame=tick))
         assert server.measurement(arrived, 5, "LiDAR 0").frame == 5
-        with pytest.raises(ServerError, match="expected tick 6 of LiDAR 0, found 7: check that no other client"):
+        with pytest.raises(ServerError, match="expected tick 6 of LiDAR 0, found tick 7: check that no other client"):
             server.measurement(arrived, 6, "LiDAR 0")
 
 
@@ -243,7 +243,7 @@ def test_a_replay_that_departs_from_the_drive_is_refused(tmp_path):
     call(tmp_path, FakeServer(), count=2)
     server = FakeServer()
     server.drift = 0.5
-    with pytest.raises(ConflictError, match="frame 0: expected the replay to follow"):
+    with pytest.raises(ConflictError, match="frame 0: expected a replay that follows"):
         call(tmp_path, server, count=4)
     assert Capture(tmp_path).frames.tolist() == [0, 1]
     assert_cleaned_up(server)
@@ -365,7 +365,7 @@ def test_a_town_without_room_has_fewer_vehicles_but_the_ego_vehicle(tmp_path):
     assert result.vehicles == 2
     server = FakeServer()
     server.places = 0
-    with pytest.raises(CarlascError, match="places"):
+    with pytest.raises(CarlascError, match="spawn point"):
         call(tmp_path / "none", server)
 
 

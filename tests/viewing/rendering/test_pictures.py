@@ -241,7 +241,7 @@ def test_a_comparison_is_drawn_side_by_side():
     truth, prediction = grid_with({(0, 0, -0.5): BLUE}, size_m=5.0), grid_with({(0, 0, -0.5): RED}, size_m=5.0)
     picture = render_comparison(prediction, truth, size=(800, 300), errors=False, ego=False, legend=False)
     assert middle_of(red_pixels(picture))[0] < 400 < middle_of(blue_pixels(picture))[0]
-    with pytest.raises(ArgumentError, match="prediction's grid"):
+    with pytest.raises(ArgumentError, match="predicted grid"):
         render_comparison(prediction, grid_with({(0, 0, -0.5): RED}, PUBLISHED[1]), size=SIZE)
 
 
