@@ -105,7 +105,7 @@ def render(
         style: size, legend, captions and type; for a screen or for a paper.
         fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit around one frame).
         overwrite: whether an existing file is replaced.
-        run: how the pictures are spread over processes, and who is told of the progress.
+        run: how the pictures are spread over processes, with a callback for progress.
 
     Returns:
         What was drawn, and the file that it is in.
