@@ -35,14 +35,8 @@ class GridFlags(Flags):
             " one of --res, --size and --preset."
         ),
     ] = None
-    size: Annotated[
-        str | None,
-        typer.Option(help="Number of voxels per axis: X,Y,Z. The bounds stay exact, whereas --res may move them."),
-    ] = None
-    preset: Annotated[
-        Preset | None,
-        typer.Option(help="A grid of the published data set: coarse is 128 x 128 x 8 voxels, fine 256 x 256 x 16."),
-    ] = None
+    size: Annotated[str | None, typer.Option(help="Number of voxels per axis: X,Y,Z. The bounds stay exact.")] = None
+    preset: Annotated[Preset | None, typer.Option(help="A grid of the published data set.")] = None
     coordinates: Annotated[Coordinates | None, typer.Option(help="Coordinates of the grid. Default: cartesian.")] = None
     bounds: Annotated[
         str | None,
@@ -90,12 +84,7 @@ class GridFlags(Flags):
                 "grid", expected="one of --res, --size and --preset", found=found, advice="try --res 0.2"
             )
         if self.preset == "cylindrical" and self.coordinates == "cartesian":
-            raise ArgumentError(
-                "coordinates",
-                expected="cylindrical with --preset cylindrical",
-                found="cartesian",
-                advice="leave one of them out",
-            )
+            raise ArgumentError("coordinates", expected="cylindrical with --preset cylindrical", found="cartesian")
         if self.preset is not None and self.bounds is not None:
             raise ArgumentError(
                 "bounds", expected="none, because --preset has bounds", found=repr(self.bounds), advice="use --size"
@@ -154,9 +143,7 @@ class VoteFlags(Flags):
             " scans).",
         ),
     ] = None
-    free_step_m: Annotated[
-        float, typer.Option(help="Distance between two samples of free space on a ray, in metres.")
-    ] = 1.5
+    free_step_m: Annotated[float, typer.Option(help="Distance between free-space samples on a ray, in metres.")] = 1.5
     keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of each class per voxel.")] = False
     keep_evidence: Annotated[
         bool,
@@ -263,8 +250,7 @@ class ScanFlags(WindowFlags):
     """How scans are merged."""
 
     window_m: Annotated[
-        float | None,
-        typer.Option(help="Merge only scans within this distance along the trajectory, in metres. Default: no limit."),
+        float | None, typer.Option(help="Merge only scans within this driven distance, in metres. Default: no limit.")
     ] = None
     stride: Annotated[
         int | None, typer.Option(help="Merge every N-th scan of the window. Default: 1.", metavar="N")
@@ -291,16 +277,10 @@ class ScanFlags(WindowFlags):
         ),
     ] = None
     min_range_m: Annotated[
-        float | None,
-        typer.Option(
-            help="Leave out points nearer to the sensor, in metres. Default: the range in carlasc.json, if any."
-        ),
+        float | None, typer.Option(help="Leave out nearer points, in metres. Default: the range in carlasc.json.")
     ] = None
     max_range_m: Annotated[
-        float | None,
-        typer.Option(
-            help="Leave out points farther from the sensor, in metres. Default: the range in carlasc.json, if any."
-        ),
+        float | None, typer.Option(help="Leave out farther points, in metres. Default: the range in carlasc.json.")
     ] = None
 
     def _given(self) -> dict[str, Any]:

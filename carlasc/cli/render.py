@@ -39,10 +39,7 @@ class CameraFlags(Flags):
         typer.Option(help="Draw only the grid, over the images of this camera of the recording."),
     ] = None
     still: Annotated[
-        bool,
-        typer.Option(
-            "--still", help="Keep the camera in place, instead of moving it with the ego vehicle (needs poses)."
-        ),
+        bool, typer.Option("--still", help="Do not move the camera with the ego vehicle (needs poses).")
     ] = False
 
     def options(self) -> carlasc.CameraOptions:
@@ -69,9 +66,7 @@ class StyleFlags(Flags):
     ] = None
     dpi: Annotated[
         float | None,
-        typer.Option(
-            help="Pixels per inch, written into PNG files. Default: 300 with --style paper or a --size with a unit, otherwise none."
-        ),
+        typer.Option(help="Pixels per inch, written into a PNG. Default: 300 for paper and for a size with a unit."),
     ] = None
     captions: Annotated[
         list[str] | None,
@@ -99,15 +94,11 @@ class ContentFlags(Flags):
 
     what: Annotated[
         str | None,
-        typer.Option(
-            help="grid, scan, flow, truth or errors. Several, separated by commas, are drawn side by side. Default: what the data have."
-        ),
+        typer.Option(help="grid, scan, flow, truth or errors. Several, separated by commas, are drawn side by side."),
     ] = None
     color: Annotated[
         GridColor,
-        typer.Option(
-            help="What the colours of the grid show: classes, a kind of evidence, actors, or what cameras see."
-        ),
+        typer.Option(help="What the colours of the grid show: classes, a kind of evidence, actors, or cameras."),
     ] = "class"
     boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes around actors.")] = False
 
@@ -124,9 +115,7 @@ class PanelFlags(Flags):
     ] = False
     palette: Annotated[
         PaletteName,
-        typer.Option(
-            help="class: colours of the class table. colorblind: colours for colour-blind readers. height: colours by height."
-        ),
+        typer.Option(help="Colours of the class table, colours for colour-blind readers, or colours by height."),
     ] = "class"
 
 
@@ -140,8 +129,7 @@ def render(
         ),
     ],
     out: Annotated[
-        Path | None,
-        file_option("-o", "--out", text="File to write: .png, .gif, .mp4 or .webp. Default: named after the sequence."),
+        Path | None, file_option("-o", "--out", text="A .png, .gif, .mp4 or .webp. Default: named after the sequence.")
     ] = None,
     scene: SceneFlags,
     fps: Annotated[

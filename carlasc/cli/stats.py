@@ -30,10 +30,7 @@ def stats(
         str, typer.Option(help="Grid whose voxels are counted. A sequence that has only one grid uses that one.")
     ] = "evaluation",
     remap: Annotated[
-        str,
-        typer.Option(
-            help="Classes of the second table: carlasc11, semantickitti19, ..., auto, or none for no second table."
-        ),
+        str, typer.Option(help="Classes of the second table: auto, none (no table), carlasc11, semantickitti19, ...")
     ] = "auto",
     every: Annotated[int, typer.Option(metavar="N", help="Count only every N-th frame.")] = 1,
     plot: Annotated[

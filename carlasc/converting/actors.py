@@ -157,9 +157,7 @@ class ActorMotion:
         return self._velocities
 
     def _run(self) -> None:
-        chains = sorted(
-            self._ended, key=_SightingChain.size, reverse=True
-        )  # longest first, so that no worker ends late
+        chains = sorted(self._ended, key=_SightingChain.size, reverse=True)  # longest first: no worker ends late
         self._ended = []
         with closing(run_all(self._estimate, chains, self._run_options)) as estimates:
             for chain, velocities in zip(chains, estimates, strict=True):

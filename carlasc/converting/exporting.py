@@ -81,9 +81,7 @@ def export(
     opened = storage.as_source(source)
     check_outside(root, opened.location)
     every = _by_name(opened)
-    folders = exporter.folders(
-        list(every)
-    )  # of all sequences, so that the name of a folder does not depend on the choice of sequences
+    folders = exporter.folders(list(every))  # of all sequences: names of folders do not depend on the choice
     chosen, notes = [], []
     for sequence in _choose(every, sequences, opened.location):
         notes += exporter.check(sequence)

@@ -24,11 +24,7 @@ from carlasc.core.scans import Scan
 from carlasc.motion import Segment, Track, ground_points, segment_by_boxes
 
 _FAR_M = 100.0  # objects farther away than this are not filled in
-_CELLS_M = (
-    0.25,
-    0.5,
-    1.0,
-)  # sizes of cells in which labelled points are searched: the smallest cell with labelled points decides
+_CELLS_M = (0.25, 0.5, 1.0)  # cells around labelled points: the smallest cell with labelled points decides
 _GROUND_CELLS_M = (0.5, 1.0, 2.0)  # in the plane: on the ground, the rings of two scans may be metres apart
 _HALF = 1 << 14  # cells to each side of the origin
 

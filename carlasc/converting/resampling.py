@@ -98,9 +98,7 @@ def resample_to(
     voxels, winners = most_frequent(np.ravel_multi_index(tuple(places), target.size), found)
     resampled[voxels] = winners.astype(labels.dtype)
     seen = known
-    for axis in sorted(
-        range(3), key=lambda axis: target.size[axis] / source.size[axis]
-    ):  # first, because it shrinks the array most
+    for axis in sorted(range(3), key=lambda axis: target.size[axis] / source.size[axis]):  # largest reduction first
         seen = _any_by_target(seen, pairs[axis], target.size[axis], axis)
     return resampled.reshape(target.size), seen
 

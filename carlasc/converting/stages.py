@@ -63,9 +63,7 @@ class Conversion:
         """Convert the recording, or the frames that an earlier run did not convert."""
         plan = self.plan
         begin(plan, self.target, metadata)
-        if (
-            plan.poses is None and plan.rig.needs_motion
-        ):  # each scan is read twice, because it is corrected by the poses
+        if plan.poses is None and plan.rig.needs_motion:  # the poses correct the scans: each scan is read twice
             self.steps.expect(len(plan.recording.frames))
             plan.take_estimate(estimate_poses(plan.recording, self.converter, plan.times, self.steps, self.run_options))
             write_poses(plan, self.target)
@@ -114,9 +112,7 @@ class Conversion:
             if follow:
                 actors.add(result.number, float(plan.times[result.number]), pose, result.actors)
                 self._unnumbered += result.unnumbered
-        if estimate and len(self._failed) < len(
-            plan.recording.frames
-        ):  # if all frames failed, the failures are reported
+        if estimate and len(self._failed) < len(plan.recording.frames):  # otherwise, the failures are reported
             plan.take_estimate(fill_gaps(list(found), np.array(list(found.values())), plan.recording))
         return actors.finish()
 

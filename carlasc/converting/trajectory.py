@@ -29,9 +29,7 @@ if TYPE_CHECKING:
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
 _ACCEPT = "accept them as they are with `force=True`"
-_SMOOTH = np.array(
-    [1.0, -4.0, 6.0, -4.0, 1.0]
-)  # fourth differences, which are nearly 0 for a vehicle at the rate of scans
+_SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # fourth differences, which are nearly 0 for a vehicle
 _JITTER_M = 0.05
 
 

@@ -33,9 +33,7 @@ _OFFSET_PAIRS = 12
 _OFFSET_SHARE = 0.3  # share of the pairs that must have an offset: the sensor may be at rest for most of a drive
 _GOOD = 0.75  # no offset is searched for poses with this share of overlap
 _STRIDE_M = 2.0  # the scans of a pair are this far apart, or
-_STRIDE_RAD = np.deg2rad(
-    10.0
-)  # turned by this angle: large enough to show a mistake, small enough for the scans to overlap
+_STRIDE_RAD = np.deg2rad(10.0)  # turned by this angle: it shows a mistake, and the scans still overlap
 _REACH = 10  # the scans of a pair are at most this number of frames apart
 _GAIN = 0.02  # a correction must raise the mean share of overlap by this,
 _CERTAIN = 4.0  # and by this number of standard errors

@@ -85,9 +85,7 @@ class Extra:
     @property
     def command(self) -> str:
         """The command that installs it."""
-        return without_names(install_command(self.name)).replace(
-            "'~/", "~/'"
-        )  # a shell expands ~ only outside of quotes
+        return without_names(install_command(self.name)).replace("'~/", "~/'")  # shells expand ~ only outside quotes
 
 
 @dataclass(frozen=True)
@@ -201,9 +199,7 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
     needed, extras = _read_requirements()
     problems = [package.problem for package in needed if package.problem]
     if not needed:
-        problems.append(
-            "carlasc is on the path, but not installed, so the packages that it needs are not known: install it with pip"
-        )
+        problems.append("carlasc is on the path, but not installed, so its needs are not known: install it with pip")
     for package in needed:
         if package.version is not None:
             problems += _problems_of_import(package.name)
@@ -256,10 +252,7 @@ def measure_disk(folder: str | os.PathLike[str] | None) -> Disk:
         raise ArgumentError("folder", expected="a folder", found=str(place))
     try:
         with tempfile.TemporaryDirectory(dir=place, prefix="carlasc-doctor-") as scratch:
-            large, noise = (
-                Path(scratch, "large"),
-                os.urandom(_MEGABYTE),
-            )  # random bytes, because some file systems compress
+            large, noise = Path(scratch, "large"), os.urandom(_MEGABYTE)  # random: some file systems compress
             write_s = _time_writing(large, noise, _MEGABYTES)
             read_s = _time_reading(large)
             syncs_s = sorted(_time_writing(Path(scratch, str(n)), noise[:4096], 1) for n in range(_SMALL_FILES))
