@@ -172,7 +172,7 @@ def test_times_are_found_in_points_and_in_names_and_it_is_said(tmp_path):
     np.testing.assert_allclose(clock.times(), DRIVE.times, atol=1e-9)
     np.testing.assert_allclose(names.times(), DRIVE.times, atol=1e-9)
     assert clock.frames[2].read()[0].seconds.min() == 0
-    assert "the times of points are in ns: that gives a scan of a usual length" in clock.notes()
+    assert "the times of points are in ns, because scans then have a usual duration" in clock.notes()
     assert "the times of scans are from the names of the files" in names.notes()
 
 
