@@ -76,6 +76,8 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
     if total.grids:
         out.print(line(f"{total.known_share:.1%} of voxels known ({count(total.grids, 'grid')})"))
         out.print(line("voxels % is of the known voxels; class 0 of points is unlabelled"))
+    else:
+        out.print(line("no voxels counted: choose a grid with --grid (`carlasc info` lists them)"))
     if total.actor_voxels:
         out.print(line(f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} of them move"))
 

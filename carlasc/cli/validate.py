@@ -130,8 +130,9 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
                 f"scans agree within {100 * report.disagreement_m:.1f} cm ({100 * report.refined_m:.1f} cm with refined poses)"
             )
         name = report.path or result.location
-        text = f"{name}: {count(report.frames, 'frame')}, {report.sampled} read{''.join('; ' + figure for figure in figures)}"
-        out.print(line(text), soft_wrap=True)
+        out.print(line(f"{name}: {count(report.frames, 'frame')}, {report.sampled} read"), soft_wrap=True)
+        for figure in figures:
+            out.print(line(f"  {figure}"), soft_wrap=True)
         if report.mounting:
             mounting = ", ".join(f"{axis} {value}" for axis, value in report.mounting.items())
             out.print(line(f"  sensor in the frame of the poses: {mounting}"), soft_wrap=True)
