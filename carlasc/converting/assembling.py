@@ -82,7 +82,8 @@ def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> As
     except (CarlascError, OSError, MemoryError):
         raise
     except Exception as error:
-        raise FormatError(handle.location, problem=f"the converter failed: {describe(error)}") from error
+        problem, advice = f"the converter failed: {describe(error)}", "check the file, or report the error"
+        raise FormatError(handle.location, problem=problem, advice=advice) from error
     return assemble(clouds, rig, motion, handle.location)
 
 

@@ -216,6 +216,7 @@ def fill_gaps(frames: list[int], poses: NDArray[np.float64], recording: Recordin
             recording.location,
             expected="scans to estimate poses from",
             found="none that can be read and has enough points",
+            advice="copy the scans again",
         )
     lines = np.searchsorted(frames, np.arange(recording.frames[-1].number + 1), side="right") - 1
     return poses[np.clip(lines, 0, None)]

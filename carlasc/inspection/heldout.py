@@ -176,9 +176,8 @@ class _HeldOutDrive:
         enough = _NEARLY_WHOLE * max(len(whole.window_of(int(frame))) for frame in whole.frames)
         chosen = [frame for frame in hidden if frame in inputs.plan.frames]
         if not chosen:
-            raise MissingDataError(
-                inputs.location, expected=f"frames to leave out in {inputs.plan.frames}", found=f"only {hidden}"
-            )
+            expected, advice = f"frames to leave out in {inputs.plan.frames}", "choose a smaller `every`"
+            raise MissingDataError(inputs.location, expected=expected, found=f"only {hidden}", advice=advice)
         measured = [frame for frame in chosen if len(whole.window_of(frame)) >= enough] or chosen
         return cls(inputs, whole.without(hidden), tuple(measured))
 

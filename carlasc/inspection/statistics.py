@@ -211,7 +211,8 @@ def stats(
     sequences = opened.sequences()
     tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
     if not tasks:
-        raise MissingDataError(opened.location, expected=f"labels of points or the grid {grid}", found="neither")
+        expected, advice = f"labels of points or the grid {grid}", "name another grid with `grid`"
+        raise MissingDataError(opened.location, expected=expected, found="neither", advice=advice)
     classes = _common_table(tasks, opened.location)
     chosen = _choose_remap(remap, classes)
     step = StepCounter(run.progress, sum(len(frames) for _, _, frames in tasks))

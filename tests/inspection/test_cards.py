@@ -389,7 +389,7 @@ def test_data_behind_a_url_have_their_card_in_a_folder_here(tmp_path: Path, capl
     fsspec = pytest.importorskip("fsspec")
     source = write_zip(files_of(write_dataset(tmp_path / "data")), tmp_path / "x.zip")
     fsspec.filesystem("memory").pipe("/cards/x.zip", source.read_bytes())
-    with pytest.raises(ArgumentError, match=r"out: expected a folder for the card of memory://cards/x\.zip"):
+    with pytest.raises(ArgumentError, match=r"out: expected a folder for the card, because memory://cards/x\.zip"):
         write_card("memory://cards/x.zip", **SAID, pictures=False)
     write_card("memory://cards/x.zip", tmp_path / "card", **SAID, pictures=False)
     (file,) = [file for file in croissant(tmp_path / "card")["distribution"] if file["@type"] == "cr:FileObject"]

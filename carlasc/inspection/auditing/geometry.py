@@ -106,7 +106,7 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
         together = fit.family.kind == winner.family.kind == "shift" and fit.gain >= _SAME * winner.gain
         if fit is winner or together:
             yield _fault(fit, found, one)
-    text = f"not judged: correct {winner.family.name} first"
+    text = f"not judged before the fault of {winner.family.name} is corrected"
     yield Verdict("other geometry", "undetermined", None, None, None, "", text, one.path)
 
 

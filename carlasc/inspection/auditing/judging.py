@@ -39,7 +39,7 @@ def judge_contents(
     """
     judge = _Judge(stretches, one, window)
     for verdict in judge.voxels():
-        text = f"not judged, correct {wrong} first: {verdict.text}"
+        text = f"not judged before the fault of {wrong} is corrected: {verdict.text}"
         hidden = wrong and verdict.state == "fault"
         yield replace(verdict, state="undetermined", text=text, advice="") if hidden else verdict
     yield from judge.gaps(wrong)

@@ -137,7 +137,8 @@ class MatchedGrids:
         labels, known = self.grids.labels(frame), self.grids.known(frame)
         where = f"{self.grids.location}: frame {self.grids.name_of(frame)}"
         if labels.size != self.spec.num_voxels:
-            raise FormatError(where, expected=f"{self.spec.num_voxels} voxels", found=str(labels.size))
+            expected, advice = f"{self.spec.num_voxels} voxels", "check the size in params.json"
+            raise FormatError(where, expected=expected, found=str(labels.size), advice=advice)
         labels = labels.reshape(self.spec.size)
         occupied = labels != (17 if self.grids.benchmark == "occ3d-lidar" else 0)
         if self.grids.benchmark in _FRAMES:
@@ -185,7 +186,9 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
     recordings = {s.path: s for s in source.sequences().values() if "points" in s.fields()}
     found = list(open_grids(grids, grid, "truth"))
     if not recordings:
-        raise MissingDataError(source.location, expected="sequences with scans (velodyne/)", found="none")
+        advice = "give the recording in the layout, such as `carlasc convert` writes it"
+        expected = "sequences with scans (velodyne/)"
+        raise MissingDataError(source.location, expected=expected, found="none", advice=advice)
     pairs = [(one, _recording_of(one, recordings, alone=len(found) == 1)) for one in found]
     matched = [_match_frames(one, own, FrameRange.of(frames)) for one, own in pairs if own is not None]
     if not matched:

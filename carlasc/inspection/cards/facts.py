@@ -186,7 +186,9 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
     """
     sequences = {path: one for path, one in source.sequences().items() if one.fields()}
     if not sequences:
-        raise MissingDataError(source.location, expected="sequences", found="none", advice="a raw capture has no card")
+        raise MissingDataError(
+            source.location, expected="sequences", found="none", advice="make them with `carlasc regrid`"
+        )
     parts = licensed_parts(sequences.values(), license_, source.location)
     reports = {}
     for path, sequence in sequences.items():

@@ -149,7 +149,7 @@ def place_of(source: str | os.PathLike[str] | Source, out: Path | None, url: str
     repository = url.rstrip("/") if url and url.startswith(_HUB) else None
     if is_url(location):
         if out is None:
-            raise ArgumentError("out", expected=f"a folder for the card of {location}", found="none")
+            raise ArgumentError("out", expected=f"a folder for the card, because {location} is a URL", found="none")
         tree = RemoteTree(location)
         name = PurePosixPath(location.partition("://")[2].partition("?")[0]).name
         return Place(location, None, name, tree.size() is not None, repository), out

@@ -132,7 +132,7 @@ def _yaml(value: Any, indent: str = "") -> str:
 def _glance(facts: Facts, details: CardDetails) -> str:
     rows = [
         ["frames", f"{facts.frames:,} in {facts.sequences_told}"],
-        ["splits", ", ".join(f"{name} {frames:,}" for name, (_, frames) in facts.splits.items())],
+        ["frames by split", ", ".join(f"{name} {frames:,}" for name, (_, frames) in facts.splits.items())],
         ["fields of scans", ", ".join(facts.fields) or "none"],
         ["grids", "; ".join(_grid(grid) for grid, _, _ in facts.grids) or "none"],
         ["sensors", ", ".join(facts.sensors) or ("simulated LiDAR" if facts.simulated else "not named")],

@@ -355,6 +355,7 @@ def open_content(
             other.data.sequence.location,
             expected=f"one of the frames {reader.frames[0]} to {reader.frames[-1]}",
             found=f"frames {other.frames[0]} to {other.frames[-1]}",
+            advice="choose others with `frames`",
         )
     return PageContent(reader, other, frames, thin_m)
 

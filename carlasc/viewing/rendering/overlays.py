@@ -75,7 +75,8 @@ def _pictures(
     for frame in frames:
         place, grid = scan_T_camera(reader.data.sequence, camera, frame), reader.data.read_grid(frame)
         if place is None:
-            raise MissingDataError(f"{reader.path}: frame {frame}", expected=f"an image of {camera.name}", found="none")
+            where, advice = f"{reader.path}: frame {frame}", "choose other frames with `frames`"
+            raise MissingDataError(where, expected=f"an image of {camera.name}", found="none", advice=advice)
         picture, labels = read_image(reader.data.sequence, camera, frame), grid.labels.reshape(-1)
         found, _ = cast_rays(grid.labels[None], grid.spec, place[:3, 3], rotate_vectors(place, looks[looks_somewhere]))
         voxels = np.full(len(looks), -1, np.int64)

@@ -262,7 +262,8 @@ def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell
     if film:
         frames = [frame for frame in renderers[0].reader.frames if all(frame in r.reader.frames for r in renderers)]
         if not frames:
-            raise MissingDataError(renderers[0].reader.path, expected="frames that all sources have", found="none")
+            where, advice = renderers[0].reader.path, "choose others with `frames`"
+            raise MissingDataError(where, expected="frames that all sources have", found="none", advice=advice)
         pictures = [[Cell(renderer, frame) for renderer in renderers] for frame in frames]
     else:
         pictures = [[Cell(renderer, frame) for renderer in renderers for frame in renderer.reader.frames]]
