@@ -72,7 +72,9 @@ def test_points_times_and_poses_come_back(tmp_path, kind, poses):
         units, said = recording.notes()
         assert units == "/lidar/points: the times of points are in s"
         assert "the poses are those of base_link" in said
-        assert said.endswith(", which is assumed: the messages do not name it") == (poses in ("pose", "covariance", "path"))
+        assert said.endswith(", which is assumed: the messages do not name it") == (
+            poses in ("pose", "covariance", "path")
+        )
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -348,7 +348,9 @@ def test_simulated_data_need_a_licence_from_their_author(tmp_path: Path) -> None
 def test_a_given_licence_does_not_replace_that_of_the_source(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     licensed(root, dict.fromkeys(carlasc.open(root).sequences(), "CC BY-NC-SA 3.0"))
-    with pytest.raises(ArgumentError, match=r"license: expected CC BY-NC-SA 3\.0, the licence of the source, .*, found MIT"):
+    with pytest.raises(
+        ArgumentError, match=r"license: expected CC BY-NC-SA 3\.0, the licence of the source, .*, found MIT"
+    ):
         write_card(root, license="mit", pictures=False)
     assert write_card(root, pictures=False).licenses == ("CC BY-NC-SA 3.0",)
 
