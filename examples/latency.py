@@ -23,7 +23,7 @@ def main(
     threads: Annotated[
         int | None, typer.Option(help="Number of threads on the CPU. Default: all cores.", min=1)
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Print latency and peak memory at batch 1, eagerly in float32 and compiled."""
     own = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)

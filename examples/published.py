@@ -1,8 +1,8 @@
 """Score published weights on simulated towns: `python examples/published.py LMSC_11_T1B.pt OUT`.
 
 Simulates towns, makes their ground truth, completes the ego scans with the weights, and scores them with 11 classes. The weights were trained on
-CARLA's towns, so this is a check of the whole chain: wrong axes, class ids, voxel sizes or sensor heights would give low scores. The towns were chosen
-before any of them was scored.
+CARLA's towns, so that this checks the whole pipeline: wrong axes, class ids, voxel sizes or sensor heights would give low scores. The towns were
+chosen before any of them was scored.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TOWNS = tuple(
 def score_towns(
     weights: Path, out: Path, *, every: int = 1, lower_m: float = 0.0, workers: int | None = None
 ) -> Evaluation:
-    """Simulate the towns, complete their ego scans, and score them. What exists in `out` is not made again."""
+    """Simulate the towns, complete their ego scans, and score them. Existing files in `out` are not made again."""
     spec = GridSpec.published()
     low, high = (np.float32(bound[2] - lower_m).item() for bound in (spec.lower, spec.upper))
     spec = spec.with_bounds((*spec.lower[:2], low), (*spec.upper[:2], high))

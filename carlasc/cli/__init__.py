@@ -19,7 +19,7 @@ from carlasc.core.first_use import note_compiling, say_compiling
 if TYPE_CHECKING:
     from carlasc.converting import OptionDeclaration
 
-_COMMANDS = (  # in the order of `--help`, which is that in which a new user needs them
+_COMMANDS = (  # in the order of `--help`: what a new user needs first
     "demo",
     "simulate",
     "regrid",
@@ -99,10 +99,10 @@ def _module(name: str) -> ModuleType:
 
 
 class _DeclaringCommand(Command):
-    """A command that has the options of the converter or exporter that it is given, beside its own."""
+    """A command with its own options and those of the converter or exporter that its arguments name."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Read the arguments, with the options of the converter or exporter that they name."""
+        """Read the arguments, including the options of the converter or exporter."""
         name = self.name or ""
         declared = _module(name).declared_options(args)
         if not declared:
@@ -119,7 +119,7 @@ class _Group(CommandGroup):
         return list(self.commands)
 
     def summary(self, name: str) -> str:
-        """Return what a command does. Its options are not made for that."""
+        """Return what a command does, without making its options."""
         text: str = getattr(_module(name), name).__doc__
         return " ".join(text.partition("\n\n")[0].split())
 
@@ -128,7 +128,8 @@ app = typer.Typer(
     name="carlasc",
     cls=_Group,
     **_SETTINGS,
-    help="Read, convert, regenerate and score CarlaSC data: complete, trace-free semantic scenes.",
+    help="A toolkit for semantic scene completion: read CarlaSC, convert other data sets to its layout, make ground truth at any voxel size,"
+    " and score predictions.",
 )
 
 
@@ -150,8 +151,8 @@ def _root(
         typer.Option(
             "--durable/--no-durable",
             show_default=False,
-            help="Sync files to the disk before they get their names, so that a power failure leaves no empty ones; on unless"
-            " CARLASC_DURABLE=no.",
+            help="Sync each file to the disk before it is renamed to its final name, so that a power failure leaves no empty file. Default: on,"
+            " unless the environment variable CARLASC_DURABLE is no.",
         ),
     ] = None,
 ) -> None:
@@ -163,6 +164,6 @@ def _root(
 
 def main() -> None:
     """Run the command line: the entry point `carlasc`."""
-    if sys.stderr is not None and sys.stderr.isatty():  # as progress: logs and programs that read stderr are not told
+    if sys.stderr is not None and sys.stderr.isatty():  # on terminals only, like progress bars
         note_compiling(say_compiling)
     app()

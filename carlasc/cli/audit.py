@@ -28,31 +28,34 @@ def audit(
             "GRIDS",
         ),
     ],
-    scans: Annotated[str, place_argument("The recording that they belong to, in the layout.", "SCANS")],
-    grid: Annotated[
-        str | None, typer.Option(help="Name of the grids; if not given, evaluation, or the only one.")
-    ] = None,
+    scans: Annotated[str, place_argument("The recording that the grids belong to, in CarlaSC's layout.", "SCANS")],
+    grid: Annotated[str | None, typer.Option(help="Name of the grids. Default: evaluation, or the only grid.")] = None,
     made_from: Annotated[
         str | None,
-        typer.Option(metavar="A:B", help="First and last scan, relative to its frame, that a grid was made from."),
+        typer.Option(
+            metavar="A:B",
+            help="First and last scan that each grid was made from, in frames relative to its frame. Default: not known.",
+        ),
     ] = None,
     frames: FramesOption = None,
     keep: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the sums of stretches of frames: an interrupted audit goes on, parts come together."
+            help="Folder for intermediate counts: an interrupted audit continues there, and --part needs it to join the parts."
         ),
     ] = None,
     html: Annotated[
         Path | None,
         file_option("--html", metavar="FILE", text="Also write the audit as one page, with the worst frames."),
     ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Print what is sound, too.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Print all checks, also those that found no fault.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Compare anybody's grids with the scans that they belong to, and name what is wrong with the grids.
+    """Compare grids of any origin with the scans that they belong to, and print what is wrong with the grids.
 
-    Exit code 0: sound, as far as the drives tell. 1: a fault, or a frame that cannot be read.
+    The exit code is 0 if no fault was found, and 1 if there is a fault or a frame that cannot be read.
     """
     window = None if made_from is None else parse_window(made_from, "made_from")
     with work.spread("Auditing", usual=1) as run:
@@ -74,10 +77,10 @@ def _print(result: AuditResult, *, everything: bool) -> None:
     for note in result.notes:
         echo(f"note: {note}", err=True)
     if not result.verdicts:
-        echo("counted; other parts have still to be counted before anything is judged")
+        echo("this part is counted; the part that ends last prints the verdicts")
         return
     for path, verdicts in result.verdicts.items():
-        title = f"{path}: {count(result.frames[path], 'frame')}, in the frame of {result.placed[path]}"
+        title = f"{path}: {count(result.frames[path], 'frame')}, grids in the coordinate frame of {result.placed[path]}"
         out.print(line(title, "bold"), soft_wrap=True)
         for verdict in verdicts:
             if everything or verdict.state != "sound":

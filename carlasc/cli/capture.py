@@ -22,20 +22,21 @@ OutArgument = Annotated[
 CamerasOption = Annotated[
     str,
     typer.Option(
-        help="Cameras of the vehicle, separated by commas: front, front_left, front_right, left, right, back_left, back_right, back.",
+        help="Cameras of the vehicle, separated by commas: front, front_left, front_right, left, right, back_left, back_right, back."
+        " Default: none.",
         metavar="NAMES",
     ),
 ]
 
 
 def camera_names(cameras: str) -> tuple[str, ...]:
-    """Return the names that the option gives."""
+    """Return the names in the value of the option."""
     return tuple(filter(None, map(str.strip, cameras.split(","))))
 
 
 @dataclass(frozen=True)
 class SensorFlags(Flags):
-    """What drives and what records it: the same in `simulate` and in `capture`."""
+    """The traffic and the sensors of a drive: the same options in `simulate` and in `capture`."""
 
     heading: ClassVar[str] = "Traffic and sensors"
 
@@ -46,12 +47,12 @@ class SensorFlags(Flags):
         typer.Option(help="Amount of traffic: 25, 50 or 100 moving vehicles, and as many pedestrians."),
     ] = "medium"
     channels: Annotated[int, typer.Option(help="Number of channels of each LiDAR.", min=1)] = 64
-    points: Annotated[int, typer.Option(help="Number of rays per scan, all channels together.", min=1)] = 130_000
-    range_m: Annotated[float, typer.Option("--range", help="Range of each LiDAR in metres.")] = 50.0
-    bev: Annotated[bool, typer.Option("--bev/--no-bev", help="Write bird's-eye pictures.")] = True
+    points: Annotated[int, typer.Option(help="Number of rays per scan, over all channels.", min=1)] = 130_000
+    range_m: Annotated[float, typer.Option("--range", help="Range of each LiDAR, in metres.")] = 50.0
+    bev: Annotated[bool, typer.Option("--bev/--no-bev", help="Write bird's-eye-view pictures.")] = True
 
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments of `carlasc.simulate` and `carlasc.record` that they give."""
+        """Return them as arguments of `carlasc.simulate` and `carlasc.record`."""
         lidar = carlasc.captures.Lidar(self.channels, self.points, self.range_m)
         return {"sensors": self.sensors, "seed": self.seed, "traffic": self.traffic, "lidar": lidar, "bev": self.bev}
 
@@ -66,9 +67,9 @@ class ServerFlags(Flags):
     port: Annotated[int, typer.Option(help="RPC port of the server.", min=1, max=65535)] = 2000
     traffic_port: Annotated[int, typer.Option(help="Port of the traffic manager.", min=1, max=65535)] = 8000
     timeout_s: Annotated[
-        float, typer.Option("--timeout", help="Longest time that the server may take to answer, in seconds.", min=1)
+        float, typer.Option("--timeout", help="Longest time to wait for an answer of the server, in seconds.", min=1)
     ] = 60.0
-    town: Annotated[str, typer.Option(help="Map to drive in.")] = "Town01"
+    town: Annotated[str, typer.Option(help="CARLA map to drive in.")] = "Town01"
 
 
 def capture(
@@ -79,10 +80,10 @@ def capture(
     cameras: CamerasOption = "",
     json: Json = False,
 ) -> None:
-    """Record a drive on a running CARLA server as a raw capture.
+    """Record a drive on a running CARLA server as a raw capture: the scans of all sensors.
 
-    A second run with the same options replays the drive and writes only the frames that are missing. At the end, also after an
-    error or Ctrl-C, the actors are destroyed and the settings of the server are restored.
+    A second run with the same options replays the drive and writes only the missing frames. At the end, also after an error or Ctrl-C,
+    the actors are destroyed and the settings of the server are restored.
     """
     signal.signal(signal.SIGTERM, _interrupt)  # clean up the server also when a batch system ends the command
     with progress_bar("capture") as progress:
@@ -102,7 +103,7 @@ def capture(
     echo(
         f"{result.out}: {counted(result.written, 'frame')} of {counted(result.sensors, 'LiDAR')} written,"
         f" {result.count - result.written} existed already"
-        f" (CARLA {result.server_version}, {result.vehicles} vehicles, {result.walkers} pedestrians)"
+        f" (CARLA {result.server_version}, {counted(result.vehicles, 'vehicle')}, {counted(result.walkers, 'pedestrian')})"
     )
     echo(f"next: carlasc regrid {result.out} --res 0.2")
 

@@ -16,19 +16,21 @@ from carlasc.errors import MissingDataError, count
 
 @dataclass(frozen=True)
 class DetailFlags(Flags):
-    """What the data themselves do not say."""
+    """Details that the data do not contain."""
 
-    heading: ClassVar[str] = "What the data do not say"
+    heading: ClassVar[str] = "Details of the publication"
 
-    name: Annotated[str | None, typer.Option(help="Name of the data set; that of the source if not given.")] = None
-    description: Annotated[str | None, typer.Option(help="What it is, in a sentence or two.")] = None
+    name: Annotated[str | None, typer.Option(help="Name of the data set. Default: the name of SOURCE.")] = None
+    description: Annotated[
+        str | None, typer.Option(help="Description in a sentence or two. Default: one made from the data.")
+    ] = None
     authors: Annotated[
-        list[str] | None, typer.Option("--author", help="Who publishes it; give it once for each author.")
+        list[str] | None, typer.Option("--author", help="Author or group that publishes it. Repeat it for several.")
     ] = None
     license: Annotated[
         str | None,
         typer.Option(
-            help="Licence of the sequences whose carlasc.json names none, such as cc-by-4.0, or the address of its text."
+            help="Licence of the sequences whose carlasc.json names none: a name such as cc-by-4.0, or the URL of its text."
         ),
     ] = None
     citation: Annotated[
@@ -36,18 +38,18 @@ class DetailFlags(Flags):
     ] = None
     url: Annotated[
         str | None,
-        typer.Option(help="Page where the data are published, such as https://huggingface.co/datasets/ORG/NAME."),
+        typer.Option(help="URL where the data are published, such as https://huggingface.co/datasets/ORG/NAME."),
     ] = None
-    contact: Annotated[str | None, typer.Option(help="Whom to ask.")] = None
+    contact: Annotated[str | None, typer.Option(help="Contact for questions, such as an e-mail address.")] = None
     version: Annotated[str, typer.Option("--data-version", help="Version of the data.")] = "1.0.0"
     published: Annotated[
-        str | None, typer.Option(metavar="YYYY-MM-DD", help="Date of the publication; today if not given.")
+        str | None, typer.Option(metavar="YYYY-MM-DD", help="Date of the publication. Default: today.")
     ] = None
 
     def details(self) -> carlasc.CardDetails:
-        """Return what the card says of them."""
+        """Return the details of the card."""
         if self.citation is not None and not self.citation.is_file():
-            raise MissingDataError(self.citation, expected="a BibTeX file", found="nothing")
+            raise MissingDataError(self.citation, expected="a BibTeX file", found="nothing", advice="check the path")
         citation = None if self.citation is None else self.citation.read_text(errors="replace")
         return carlasc.CardDetails(**{**vars(self), "authors": self.authors or (), "citation": citation})
 
@@ -62,20 +64,20 @@ def card(
             "-o",
             "--out",
             metavar="FOLDER",
-            text="Folder of the card, the root of what you publish. Default: the data, if they are a folder or a Parquet store; otherwise the"
-            " folder that they are in.",
+            text="Folder of the card: the root folder of the publication. Default: SOURCE, if it is a folder or a Parquet store; otherwise the"
+            " folder that contains SOURCE.",
         ),
     ] = None,
     pictures: Annotated[
-        bool, typer.Option("--pictures/--no-pictures", help="Draw a grid and a scan, with the extra `render`.")
+        bool, typer.Option("--pictures/--no-pictures", help="Draw a grid and a scan (needs the extra `render`).")
     ] = True,
     every: Annotated[int, typer.Option(metavar="N", help="Count the classes of every N-th frame.")] = 1,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing card.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the card of a data set: README.md for the Hugging Face Hub, and croissant.json with its responsible-AI fields.
+    """Write the card of a data set: README.md for the Hugging Face Hub, and croissant.json with the fields for responsible AI.
 
-    The licence of data that were converted holds for what was made from them; data whose licence forbids passing them on are refused.
+    Converted data keep the licence of their source. The command fails if that licence forbids publishing what is made from the data.
     """
     about = details.details()
     with work.spread("Counting", usual=1) as run:

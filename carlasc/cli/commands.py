@@ -1,4 +1,4 @@
-"""What all commands have in common as commands: plain help under headings, and errors of one line with an honest exit code."""
+"""Base classes of the commands: plain help under headings, and errors as one line with an exit code."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from carlasc.errors import ArgumentError, CarlascError
 _INTERRUPTED = "interrupted: files written so far are complete; run the same command again to continue"
 _ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")  # an argument in an error of the library: `workers`, `overwrite=True`
 _OPTIONS = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOptions("kiss-icp")`
-_UsageError: Any = typer.BadParameter.__mro__[1]  # typer exports it under no name of its own
+_UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
 
 
 class Command(TyperCommand):
@@ -41,10 +41,10 @@ class Command(TyperCommand):
 
 
 class CommandGroup(TyperGroup):
-    """The commands; a name that is none of them is one line on stderr."""
+    """The commands. An unknown name prints one line on stderr."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Read what stands before the command; without anything, print the help."""
+        """Read the options before the command. Without arguments, print the help."""
         with _errors_in_one_line(self):
             return super().make_context(info_name, args or ["--help"], parent, **extra)
 
@@ -101,7 +101,7 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
     except KeyboardInterrupt:
         fail(_INTERRUPTED, INTERRUPTED)
     except (SystemError, ValueError) as error:
-        # Ctrl-C while compiled code returned its result, or while a zip was written, which then cannot be closed
+        # caused by Ctrl-C while compiled code returned its result, or while a zip was written, which then cannot be closed
         if not any(isinstance(one, KeyboardInterrupt) for one in _chain(error)):
             raise
         fail(_INTERRUPTED, INTERRUPTED)
@@ -113,7 +113,7 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield an error, what caused it, what caused that, and so on."""
+    """Yield an error and the chain of its causes."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
@@ -126,7 +126,7 @@ def _typed(parameter: Any) -> str:
 
 
 def _replace_arguments(text: str, options: Mapping[str, str]) -> str:
-    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite` ``, where there is such an option."""
+    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite` ``, if the command has such an option."""
 
     def replace(match: re.Match[str]) -> str:
         name, value = match[1], match[2]

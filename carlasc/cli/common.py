@@ -22,27 +22,27 @@ if TYPE_CHECKING:
 
     from carlasc.core.frames import FrameRange
 else:
-    FrameRange = object  # only an annotation here: importing it loads NumPy, for which `--help` would wait
+    FrameRange = object  # used in annotations only: importing it loads NumPy, which would slow down `--help`
 
 _Number = TypeVar("_Number", int, float)
 
-_LINE_S = 10.0  # between two lines of progress where there is no terminal
+_LINE_S = 10.0  # time between two lines of progress without a terminal, seconds
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
-_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a URL, also one that lost a slash; a drive has one letter
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a URL, also with one slash only; a single letter is a drive
 
 
 def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None:
     """Return a path with `~` replaced, or a URL as it is.
 
     Raises:
-        ArgumentError: the place is empty, or is a URL with one slash, as shells and `Path` leave it.
+        ArgumentError: the place is empty, or is a URL with one slash (`Path` removes the other one).
     """
     if place is None:
         return None
     name = parameter.name or "source"
     if not place:
-        raise ArgumentError(name, expected="a path or a URL", found="nothing")
+        raise ArgumentError(name, expected="a path or a URL", found="an empty text")
     if "://" in place:
         return place
     if _URL.match(place) and not Path(place).exists():
@@ -67,17 +67,17 @@ def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None
         parameter.name or "out",
         expected="a path on this machine",
         found=f"the URL {str(file).replace(':/', '://', 1)}",
-        advice="write it here, then upload it",
+        advice="write a file on this machine, then upload it",
     )
 
 
 def place_argument(text: str, name: str = "SOURCE", default: str | None = None) -> Any:
-    """Return an argument for a path or a URL. `text` is its help, `name` what it is called there."""
+    """Return an argument for a path or a URL. `text` is its help, `name` its name in the help."""
     return typer.Argument(metavar=name, help=text, callback=_read_place, show_default=default or True)
 
 
 def places_argument(text: str, name: str = "SOURCES") -> Any:
-    """Return an argument for one or more paths or URLs. `text` is its help, `name` what it is called there."""
+    """Return an argument for one or more paths or URLs. `text` is its help, `name` its name in the help."""
     return typer.Argument(metavar=name, help=text, callback=_read_places)
 
 
@@ -96,22 +96,22 @@ def file_option(*flags: str, text: str, **settings: Any) -> Any:
     return typer.Option(*flags, help=text, callback=_read_file, **settings)
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")]
 
 
 def starting_with(incomplete: str, names: Iterable[str]) -> list[str]:
-    """Return the names that a shell offers to complete what was typed."""
+    """Return the names that begin with `incomplete`, for completion in a shell."""
     return [name for name in names if name.startswith(incomplete)]
 
 
 def echo(text: object, *, err: bool = False, nl: bool = True) -> None:
-    """Print lines on stdout or stderr. Names in them come from data: what a terminal would obey is shown escaped."""
+    """Print lines on stdout or stderr. Control characters are escaped, because names come from data."""
     typer.echo("\n".join(map(printable, str(text).split("\n"))), err=err, nl=nl)
 
 
 def line(text: str, style: str = "") -> Text:
-    """Return a line for a console, as it is: without markup, and with what a terminal would obey escaped."""
+    """Return a line for a console, without markup and with control characters escaped."""
     from rich.text import Text
 
     return Text(printable(text), style)
@@ -136,8 +136,8 @@ def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str =
 
     Args:
         failures: (what failed, message) of each.
-        total: how many were tried.
-        what: what they are called.
+        total: number of things that were tried.
+        what: what these are, in the plural.
     """
     if failures:
         summary = f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the command again"
@@ -171,7 +171,7 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
 def progress_bar(
     description: str, unit: str = "frames", *, transient: bool = False
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show progress on stderr while the block runs: a bar on a terminal, and else a line every ten seconds.
+    """Show progress on stderr while the block runs: a bar on a terminal, otherwise a line every ten seconds.
 
     Args:
         description: what is being done.
@@ -237,7 +237,7 @@ def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], optio
     """Read "a,b,c".
 
     Raises:
-        ArgumentError: these are not numbers, or their number is not one of `counts`.
+        ArgumentError: the text holds something else, or not as many numbers as one of `counts`.
     """
     try:
         values = tuple(kind(part) for part in text.split(","))
@@ -246,7 +246,7 @@ def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], optio
     if len(values) not in counts:
         wanted = " or ".join(map(str, counts))
         raise ArgumentError(
-            option, expected=f"{wanted} {'whole ' if kind is int else ''}numbers with commas between", found=repr(text)
+            option, expected=f"{wanted} {'whole ' if kind is int else ''}numbers separated by commas", found=repr(text)
         )
     return values
 
@@ -257,12 +257,12 @@ def _read_frames(text: str | None) -> FrameRange | None:
     return None if text is None else FrameRange.parse(text)
 
 
-FramesOption = Annotated[  # a parser's ValueError would become typer's message; that of a callback keeps its own
+FramesOption = Annotated[  # read in a callback: typer would replace the message of a parser's ValueError
     FrameRange | None,
     typer.Option(
         "--frames",
         metavar="A:B",
-        help="Only frames A to B, B not included; A:, :B and a single frame A are allowed too.",
+        help="Only frames A to B, without B. Also: A: (from A on), :B (before B), A (one frame).",
         parser=str,
         callback=_read_frames,
     ),

@@ -27,25 +27,25 @@ from carlasc.errors import ArgumentError, count
 
 @dataclass(frozen=True)
 class LayoutFlags(Flags):
-    """In which classes and axes sequences are written, and with what flow."""
+    """Classes, axes, scene flow and images of the written sequences."""
 
     classes: Annotated[
         str,
         typer.Option(
-            help="carla: CarlaSC's classes. The name of the data set's own class table, such as semantickitti: keep its ids."
-            " auto: keep those of SemanticKITTI, and else CarlaSC's."
+            help="Classes of the labels. carla: CarlaSC's classes. The name of the data set's own class table, such as semantickitti: its ids are"
+            " kept. auto: the ids of SemanticKITTI are kept, all others become carla."
         ),
     ] = "auto"
     axes: Annotated[
         Axes,
         typer.Option(
-            help="left: y is mirrored into CarlaSC's left-handed axes. right: right-handed, as in the data set."
+            help="Axes of the output. left: y is mirrored, as in CarlaSC, which is left-handed. right: right-handed, as in the data set."
         ),
     ] = "left"
     flow: Annotated[
         FlowSource,
         typer.Option(
-            help="auto: the velocity of each actor, from its tracked boxes or else from its points. none: no flow."
+            help="Scene flow. auto: the velocity of each actor, from its tracked boxes, or from its points without boxes. none: no flow."
         ),
     ] = "auto"
     allow_unknown: Annotated[bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")] = (
@@ -54,7 +54,8 @@ class LayoutFlags(Flags):
     images: Annotated[
         Images,
         typer.Option(
-            help="Images of cameras. copy: beside the scans. link: only where they lie. none: left out. Calibrations are always written."
+            help="Images of cameras. copy: copied into the output. link: only their paths are written. none: left out. Calibrations are always"
+            " written."
         ),
     ] = "none"
 
@@ -84,17 +85,15 @@ def _print_preview(found: tuple[carlasc.converting.RecordingPreview, ...], out: 
             f"{axis} {low:g}..{high:g}" for axis, low, high in zip("xyz", one.lower, one.upper, strict=True)
         )
         echo(f"  first scan: {one.points} points, {bounds} m; fields {', '.join(one.fields)}")
-        ground = "no ground is seen in it" if one.up is None else f"the sensor is {one.height_m:g} m above the ground"
+        ground = "no ground found" if one.up is None else f"height of the sensor above the ground: {one.height_m:g} m"
         wrong = one.up not in (None, "+z")
-        echo(f"  {ground}" + (f", but up is {one.up}: other axes than x forward, y left, z up" if wrong else ""))
+        echo(f"  {ground}" + (f"; up is {one.up}, so the axes are not x forward, y left, z up" if wrong else ""))
         echo(
             f"  poses: {'those of the recording' if one.poses == 'file' else 'estimated from the scans with KISS-ICP'}"
         )
         for note in one.notes:
             echo(f"  {note}")
-        echo(
-            f"  would become {out}/{one.split}/{one.name}, with {'no grids' if grids == 'none' else f'grids from {grids}'}"
-        )
+        echo(f"  output: {out}/{one.split}/{one.name}, with {'no grids' if grids == 'none' else f'grids from {grids}'}")
     echo("nothing was written")
 
 
@@ -108,7 +107,7 @@ def convert(
         str,
         typer.Argument(
             metavar="NAME",
-            help="The data set: kitti, argoverse2, ... (see --list). NAME --help shows its own options.",
+            help="Name of the data set: kitti, argoverse2, ... (see --list). NAME --help also shows the options of this data set.",
             autocompletion=lambda incomplete: starting_with(incomplete, carlasc.converting.converter_names()),
         ),
     ],
@@ -116,19 +115,19 @@ def convert(
     out: Annotated[str, place_argument("Folder to write to, or its URL.", "OUT")],
     sequences: Annotated[
         str | None,
-        typer.Option(help="Names of sequences or the last parts of them, separated by commas: 00,08. Default: all."),
+        typer.Option(help="Names of sequences, or their last parts, separated by commas, such as 00,08. Default: all."),
     ] = None,
     split: Annotated[SplitName, typer.Option(help="Only sequences of this split.")] = "all",
     grids: Annotated[
         Literal["scans", "voxels", "none"],
         typer.Option(
-            help="scans: made from scans merged over time (the coarse grid if no other is given). voxels: the data set's own."
-            " none: no grids."
+            help="Grids to write. scans: made from scans merged over time (by default coarse ones). voxels: the grids of the data set. none: no"
+            " grids."
         ),
     ] = "scans",
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="Say what is found and what would be done; write nothing."),
+        typer.Option("--dry-run", help="Print what would be read and written, and write nothing."),
     ] = False,
     json: Json = False,
     _list: Annotated[
@@ -156,7 +155,7 @@ def convert(
     if run.part is not None and grids == "scans" and not bounded:
         raise ArgumentError(
             "--part",
-            expected="--bounds or --grids none with it, because the height of grids is found from the ground of all sequences",
+            expected="--bounds or --grids none, because the height of the grid is otherwise measured in all sequences",
             found="neither",
         )
     made = carlasc.groundtruth.GridOptions(

@@ -26,7 +26,7 @@ def demo(
     ] = 20,
     seed: Annotated[int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)] = 0,
 ) -> None:
-    """Simulate two drives, for training and validation, make their ground truth in the published grids, check it, and draw it in pictures and a page. This takes about a minute."""
+    """Simulate two drives, one to train and one to validate, make their ground truth, check it, and draw pictures and a page for a browser. This takes about a minute."""
     from carlasc.demo import demonstrate
 
     with work.spread("demo", shown=False) as run:
@@ -49,7 +49,7 @@ def demo(
 
 @contextmanager
 def _show_step(name: str) -> Iterator[Callable[[int, int], None]]:
-    """Print the name of a step, and its time when it is done; in between, show its progress where there is a terminal."""
+    """Print the name of a step, and its time when it is done. On a terminal, also show its progress."""
     start, has_bar = time.perf_counter(), sys.stderr.isatty()
     if not has_bar:  # a bar would be drawn over an unfinished line
         echo(f"{name} ...", nl=False)

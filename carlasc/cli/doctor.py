@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 def doctor(
     folder: Annotated[
         Path | None,
-        file_argument("Where the speed of the disk is measured; if not given, where temporary files go.", "FOLDER"),
+        file_argument("Folder whose disk speed is measured. Default: the folder for temporary files.", "FOLDER"),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Print what is installed and what the machine offers, as text to paste into an issue. It names no user."""
+    """Print the installed packages and the properties of the machine, as text to paste into an issue. User names are left out."""
     from carlasc.inspection.installation import doctor as look
 
     found = look(folder)
@@ -49,20 +49,20 @@ def _lines(found: Installation) -> Iterator[str]:
     cpu = found.processor
     yield "\nprocessor"
     yield f"  {cpu.model}, {cpu.cores} cores, {cpu.usable} usable"
-    yield f"  Numba compiles for {cpu.target or 'nothing'}: {' '.join(cpu.features) or 'no instructions that it could name'}"
+    yield f"  Numba compiles for {cpu.target or 'nothing'}: {' '.join(cpu.features) or 'unknown instructions'}"
     yield f"  threads: {', '.join(f'{name} {value}' for name, value in found.threads.items()) or 'no settings'}"
     if (code := found.compiled) is not None:
         state = (
             "writable"
             if code.writable
-            else "NOT WRITABLE: every process compiles anew; NUMBA_CACHE_DIR=FOLDER names another"
+            else "NOT WRITABLE: every process compiles again; set NUMBA_CACHE_DIR to a folder that is writable"
         )
         yield "\ncompiled code"
         yield f"  {code.folder} ({state}): {code.files} files, {code.bytes / 1e6:.1f} MB"
         yield f"  a loop of one line compiles in {code.compile_s:.2f} s"
     disk = found.disk
     yield "\ndisk"
-    yield f"  {disk.folder}: {disk.free_bytes / 1e9:.1f} GB free; files are {'synced' if found.durable else 'not synced'} before they get their names"
+    yield f"  {disk.folder}: {disk.free_bytes / 1e9:.1f} GB free; files are {'synced' if found.durable else 'not synced'} before they are renamed to their final names"
     yield f"  32 MB: written and synced at {disk.write_mb_s:.0f} MB/s, read at {disk.read_mb_s:.0f} MB/s; 4 kB: synced in {disk.sync_ms:.1f} ms"
     yield "\nmissing"
     missing = [extra for extra in found.extras if extra.problems]
@@ -75,7 +75,7 @@ def _lines(found: Installation) -> Iterator[str]:
 
 
 def _describe_extra(extra: Extra) -> str:
-    """Return the versions of what it installs, or what is wrong with it."""
+    """Return the versions of its packages, or what is wrong with them."""
     if extra.problems:
         return ", ".join(extra.problems)
     return "complete: " + ", ".join(f"{package.name} {package.version}" for package in extra.packages)

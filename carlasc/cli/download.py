@@ -12,23 +12,28 @@ from carlasc.errors import count
 
 
 def download(
-    out: Annotated[Path, file_argument("Folder that the zips are written to.")],
+    out: Annotated[Path, file_argument("Folder to write the zips to.")],
     split: Annotated[
-        list[str] | None, typer.Option(help="train (two zips), val, test or all; can be given several times.")
+        list[str] | None,
+        typer.Option(
+            help="Split: train (two zips), val, test or all. Repeat it for several. Needed for sequences only."
+        ),
     ] = None,
     what: Annotated[
         Literal["sequences", "fine", "cylindrical"],
-        typer.Option(help="Sequences (scans, poses, coarse grids), or only fine or cylindrical grids (of all splits)."),
+        typer.Option(
+            help="What to download. sequences: scans, poses and coarse grids. fine, cylindrical: only these grids, of all splits."
+        ),
     ] = "sequences",
     extract: Annotated[bool, typer.Option("--extract", help="Extract each zip into OUT, then remove it.")] = False,
-    keep: Annotated[bool, typer.Option("--keep", help="With --extract: keep the zip too.")] = False,
-    connections: Annotated[int, typer.Option(help="Number of connections at once.", min=1)] = 4,
-    base_url: Annotated[str | None, typer.Option(help="A mirror: fetch the zips from BASE_URL/<name>.")] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="With --extract: keep the zips.")] = False,
+    connections: Annotated[int, typer.Option(help="Number of parallel connections.", min=1)] = 4,
+    base_url: Annotated[str | None, typer.Option(help="URL of a mirror: zips are read from BASE_URL/NAME.")] = None,
     json: Json = False,
 ) -> None:
-    """Fetch the published zips. If it is interrupted, run the same command again to continue.
+    """Download the published zips. If it is interrupted, run the same command again to continue.
 
-    A zip need not be extracted: every command reads it in place.
+    The zips need not be extracted: every command can read them.
     """
     from carlasc.storage import download as fetch
 
@@ -48,4 +53,4 @@ def download(
         return
     for archive in result.archives:
         place = archive.path if archive.folder is None else f"{count(archive.files, 'file')} in {archive.folder}"
-        echo(f"{archive.name}: {archive.fetched / 1e9:.2f} GB fetched: {place}")
+        echo(f"{archive.name}: {archive.fetched / 1e9:.2f} GB downloaded: {place}")

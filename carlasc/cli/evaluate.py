@@ -37,54 +37,61 @@ class GridChoiceFlags(Flags):
     """The grids and the frames that are compared, and the classes of the predictions."""
 
     grid: Annotated[
-        str | None, typer.Option(help="Grid with the predictions; if not given, the name of the true grid.")
+        str | None, typer.Option(help="Name of the grid with the predictions. Default: as for --truth-grid.")
     ] = None
     truth_grid: Annotated[
-        str | None, typer.Option(help="Grid with the ground truth; if not given, evaluation, or the only grid.")
+        str | None, typer.Option(help="Name of the grid with the ground truth. Default: evaluation, or the only grid.")
     ] = None
     source_classes: Annotated[
         str | None,
-        typer.Option(help="Class table of SOURCE's labels, if the data do not name one: carla, carlasc11, ..."),
+        typer.Option(help="Class table of the labels in SOURCE, if its metadata do not name it: carla, carlasc11, ..."),
     ] = None
     frames: FramesOption = None
 
 
 @dataclass(frozen=True)
 class ScoringFlags(Flags):
-    """What is scored of each frame."""
+    """What is scored in each frame."""
 
-    heading: ClassVar[str] = "Part of the grid"
+    heading: ClassVar[str] = "What is scored"
 
-    voxels: Annotated[Voxels, typer.Option(help="Voxels that count: those that the truth evaluated, or all.")] = "known"
+    voxels: Annotated[
+        Voxels, typer.Option(help="known: score only voxels that are known in the ground truth. all: score all voxels.")
+    ] = "known"
     near_m: Annotated[
-        float, typer.Option("--near", help="Score only voxels at this distance from the sensor or farther, metres.")
+        float, typer.Option("--near", help="Score only voxels at least this far from the sensor, in metres.")
     ] = 0.0
     far_m: Annotated[
-        float | None, typer.Option("--far", help="Score only voxels nearer to the sensor than this, metres.")
+        float | None,
+        typer.Option("--far", help="Score only voxels nearer to the sensor than this, in metres. Default: no limit."),
     ] = None
     fov: Annotated[
-        float, typer.Option(help="Score only voxels in this angle about the forward axis, degrees.", min=1, max=360)
+        float,
+        typer.Option(
+            help="Score only voxels in a field of view of this angle, centred forward, in degrees.", min=1, max=360
+        ),
     ] = 360.0
     by: Annotated[
         list[str] | None,
         typer.Option(
             metavar="PART",
-            help="Also score by distance, height, visibility, motion or seen (by a camera); may be given several times.",
+            help="Also score by distance, height, visibility, motion or seen (by a camera). Repeat it for several.",
         ),
     ] = None
     rays: Annotated[
-        bool, typer.Option("--rays", help="Also score what rays meet first: RayIoU. Needs poses and a Cartesian grid.")
+        bool,
+        typer.Option(
+            "--rays", help="Also score the first occupied voxel on each ray: RayIoU. Needs poses and a Cartesian grid."
+        ),
     ] = False
 
     actors: Annotated[
         bool,
-        typer.Option(
-            "--actors", help="Also score who is in each voxel, over time too, and how fast: PQ, LSTQ, velocity."
-        ),
+        typer.Option("--actors", help="Also score actors: panoptic quality (PQ), tracking (LSTQ), and velocities."),
     ] = False
 
     def options(self) -> carlasc.Scoring:
-        """Return what is scored."""
+        """Return the scoring that the options describe."""
         whole = (self.near_m, self.far_m, self.fov) == (0.0, None, 360.0)
         region = None if whole else _Region(self.near_m, self.far_m, self.fov)
         return carlasc.Scoring(self.voxels, region, self.by or (), self.rays, self.actors)
@@ -97,9 +104,11 @@ class OutputFlags(Flags):
     heading: ClassVar[str] = "Output"
 
     per_frame: Annotated[
-        Path | None, file_option("--per-frame", text="Write the scores of each frame to this CSV file.")
+        Path | None, file_option("--per-frame", text="Also write the scores of each frame to this CSV file.")
     ] = None
-    plot: Annotated[Path | None, file_option("--plot", text="Draw the scores of each frame to this PNG file.")] = None
+    plot: Annotated[
+        Path | None, file_option("--plot", text="Also draw the scores of each frame to this .png, .svg or .pdf file.")
+    ] = None
     as_json: Json = False
     latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX.")] = False
     csv: Annotated[bool, typer.Option("--csv", help="Print the tables as CSV.")] = False
@@ -117,40 +126,40 @@ def evaluate(
             " SSCBench, Occ3D, OpenOccupancy or CarlaOcc."
         ),
     ],
-    truth: Annotated[str, place_argument("Ground truth: likewise.", "TRUTH")],
+    truth: Annotated[str, place_argument("Ground truth, in one of the same forms.", "TRUTH")],
     convention: Annotated[
         str | None,
         typer.Option(
             help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, occ3d-lidar, occ3d-lidar-sparseocc,"
-            " occ3d-camera, openoccupancy; own scores the data's own classes. If not given: the benchmark whose files TRUTH holds; otherwise carlasc, or own for"
-            " classes that it has no map for.",
+            " occ3d-camera, openoccupancy; or own, which scores the classes of the data. Default: the benchmark whose files TRUTH holds, otherwise"
+            " carlasc, or own for classes that carlasc has no map for.",
             autocompletion=lambda incomplete: starting_with(incomplete, (*carlasc.metrics.CONVENTIONS, "own")),
         ),
     ] = None,
     all_conventions: Annotated[
-        bool, typer.Option("--all-conventions", help="Print one row for each convention instead of the tables.")
+        bool, typer.Option("--all-conventions", help="Print one row per convention instead of the tables.")
     ] = False,
     forecast: Annotated[
         Around | None,
         typer.Option(
-            help="Score forecasts: grids named by how far ahead they are, such as forecast_1s. They are around the sensor of the frame that"
-            " they are made in (present), or of the frame that they predict (future)."
+            help="Score forecasts: grids with names such as forecast_1s. present: they are around the sensor of the frame in which they are made."
+            " future: around the sensor of the frame that they predict."
         ),
     ] = None,
     compare: Annotated[
         str | None,
         place_option(
-            "--compare", text="Other predictions of the same sequences: compare SOURCE with them by a paired test."
+            "--compare", text="Other predictions of the same sequences, to compare SOURCE with by a paired test."
         ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="What to call the predictions in the tables; SOURCE's name if not given.")
+        str | None, typer.Option(help="Name of the predictions in the tables. Default: the name of SOURCE.")
     ] = None,
 ) -> None:
-    """Score predicted grids by the rules of a benchmark: IoU of each class, their mean, and completeness.
+    """Score predicted grids by the rules of a benchmark: IoU per class, mIoU, and completeness.
 
-    Benchmarks differ in the voxels that count, in the classes, and in the classes of the mean: scores by different conventions cannot be
-    compared. Intersections and unions are summed over all frames before they are divided.
+    Benchmarks differ in the voxels that are scored, in the classes, and in the classes of the mean. Scores by different conventions can
+    therefore not be compared. Intersections and unions are summed over all frames before they are divided.
     """
     if output.plot is not None:
         from carlasc.inspection.charts import check_plot
@@ -165,7 +174,7 @@ def evaluate(
             "plot": output.plot,
         }
         if other_options := [option for option, value in alone.items() if value]:
-            raise ArgumentError(other_options[0], expected="no such option with --forecast", found="both")
+            raise ArgumentError(other_options[0], expected="none with --forecast", found="both", advice="leave one out")
         common |= {"convention": convention, "around": forecast}
         with work.spread("Scoring", usual=1) as run:
             by_time = carlasc.metrics.evaluate_forecasts(source, truth, scoring=scoring.options(), run=run, **common)
@@ -182,7 +191,7 @@ def evaluate(
     other = None
     if compare is not None:
         whole = replace(scoring, by=None, rays=False, actors=False).options()
-        with work.spread("Scoring the other", usual=1) as run:
+        with work.spread("Scoring --compare", usual=1) as run:
             other = carlasc.evaluate(compare, truth, scoring=whole, name=Path(compare).name, run=run, **common)
     if output.per_frame is not None:
         from carlasc.storage.files import write_output
@@ -243,14 +252,14 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
         found = comparison.difference
         out.print(
             line(
-                f"mIoU less that of {other.name}: {100 * found.value:+.2f}, 95 % interval {100 * found.low:+.2f} to {100 * found.high:+.2f},"
+                f"mIoU minus that of {other.name}: {100 * found.value:+.2f}, 95 % interval {100 * found.low:+.2f} to {100 * found.high:+.2f},"
                 f" p = {comparison.p_value:.3g} ({count(len(comparison.sequences), 'sequence')})"
             )
         )
     if result.actors is not None and not math.isnan(result.actors.velocity_m_s):
         speeds = result.actors.velocity_by_speed.items()
         bands = ", ".join(f"from {low:g} m/s {value:.2f}" for low, value in speeds if not math.isnan(value))
-        out.print(line(f"velocity of moving voxels: off by {result.actors.velocity_m_s:.2f} m/s in the mean ({bands})"))
+        out.print(line(f"mean velocity error of moving voxels: {result.actors.velocity_m_s:.2f} m/s ({bands})"))
     for note in result.notes:
         echo(f"note: {note}", err=True)
 

@@ -34,7 +34,7 @@ def export(
         str,
         typer.Argument(
             metavar="NAME",
-            help="The other data set: kitti, occ3d, ... (see --list). NAME --help shows its own options.",
+            help="Name of the other data set: kitti, occ3d, ... (see --list). NAME --help also shows the options of this data set.",
             autocompletion=lambda incomplete: starting_with(incomplete, carlasc.converting.exporter_names()),
         ),
     ],
@@ -43,16 +43,16 @@ def export(
     sequences: Annotated[
         str | None, typer.Option(help="Names of sequences, separated by commas. Default: all.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write frames again that exist.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write existing frames again.")] = False,
     json: Json = False,
     _list: Annotated[
         bool,
         typer.Option("--list", help="List the exporters that are installed.", callback=_print_list, is_eager=True),
     ] = False,
 ) -> None:
-    """Write sequences as another data set's files, so that its tools can read them.
+    """Write sequences in the format of another data set, so that its tools can read them.
 
-    Run it again to continue where it stopped: frames that exist are skipped.
+    Run it again to continue where it stopped: existing frames are skipped.
     """
     with run.spread(f"export {name}") as spread:
         result = carlasc.export(

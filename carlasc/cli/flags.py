@@ -1,4 +1,4 @@
-"""Groups of options: what commands share is declared once, as a class whose fields are options and which makes the library's objects."""
+"""Groups of options that commands share. Each group is a class: its fields are options, and its methods make the library's objects."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ if TYPE_CHECKING:
     from carlasc.converting import OptionDeclaration
     from carlasc.running import Engine, Run
 
-_DECLARED = "declared_"  # the parameter of a declared option is called so, that it meets none of the command's own
+_DECLARED = (
+    "declared_"  # prefix of parameters of declared options, so that no parameter of the command has the same name
+)
 
 
 @dataclass(frozen=True)
 class Flags:
-    """A group of options: each field is an option, or another group. Annotations are read when the command is used, not before.
+    """A group of options: each field is an option, or another group. Annotations are read when the command is used.
 
     Attributes:
-        heading: what the options stand under in `--help`; empty for no heading of their own.
+        heading: heading of the options in `--help`; empty for none.
     """
 
     heading: ClassVar[str] = ""
@@ -40,17 +42,17 @@ class Flags:
 
 @dataclass(frozen=True)
 class DeclaredOptions(Flags):
-    """The options that a converter or an exporter declares, as text by name, as far as they are given."""
+    """The options that a converter or an exporter declares: the given values by name."""
 
     values: Mapping[str, Any]
 
 
 def flatten(function: Callable[..., None], declared: Sequence[OptionDeclaration] = ()) -> Callable[..., None]:
-    """Return the function of a command as typer takes it: the options of its groups are parameters of the function itself.
+    """Return a function for typer, in which each option of a group is a parameter of the function itself.
 
     Args:
         function: the function of a command, whose parameters are annotated with options or groups of options.
-        declared: options that stand for a parameter of type `DeclaredOptions`.
+        declared: options that replace the parameter of type `DeclaredOptions`.
     """
     hints = get_type_hints(function, include_extras=True)
     parameters: list[inspect.Parameter] = []
@@ -74,7 +76,7 @@ def flatten(function: Callable[..., None], declared: Sequence[OptionDeclaration]
 def declared_by(kind: Literal["converter", "exporter"], arguments: Sequence[str]) -> tuple[OptionDeclaration, ...]:
     """Return the options of the converter or exporter that the arguments of a command name, if they name one."""
     named = [argument for argument in arguments if not argument.startswith("-")]
-    if not named:  # of which the library need not be loaded
+    if not named:  # the library need not be loaded
         return ()
     from carlasc import converting
 
@@ -151,17 +153,17 @@ def _shown(default: object) -> str:
 class WorkFlags(Flags):
     """How work is spread."""
 
-    heading: ClassVar[str] = "How the work is spread"
+    heading: ClassVar[str] = "Parallel work"
 
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that work side by side; if not given, one per core.", min=1)
-    ] = None
+    workers: Annotated[int | None, typer.Option(help="Number of parallel processes. Default: one per core.", min=1)] = (
+        None
+    )
     cluster: Annotated[
         str | None,
         typer.Option(
             metavar="WHERE",
-            help="Work on a Dask cluster: local or local:N (processes here), tcp://HOST:PORT (a scheduler), slurm (with --workers jobs),"
-            " or the dotted path of a class that starts one.",
+            help="Run on a Dask cluster: local or local:N (N processes on this machine), tcp://HOST:PORT (a running scheduler), slurm"
+            " (starts --workers jobs), or the dotted path of a cluster class. Default: no cluster.",
         ),
     ] = None
 
@@ -174,7 +176,7 @@ class WorkFlags(Flags):
         Args:
             title: what is being done.
             unit: what is counted.
-            usual: number of processes if none is given; None for one per core.
+            usual: number of processes without --workers; None for one per core.
             shown: whether there is a progress bar.
         """
         from carlasc.running.spreading import Run
@@ -200,11 +202,9 @@ class WorkFlags(Flags):
 
 @dataclass(frozen=True)
 class OneWorkerFlags(WorkFlags):
-    """How work is spread that one process usually does."""
+    """How work is spread; by default, one process does it."""
 
-    workers: Annotated[int | None, typer.Option(help="Processes that work side by side; if not given, one.", min=1)] = (
-        None
-    )
+    workers: Annotated[int | None, typer.Option(help="Number of parallel processes. Default: one.", min=1)] = None
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class RunFlags(WorkFlags):
         str | None,
         typer.Option(
             metavar="I/N",
-            help="Do only the I-th of N parts; other commands do the others, on any machine that reaches the output.",
+            help="Do only part I of N, such as 2/4. Run the other parts as commands of their own, on any machine that can write to the output.",
         ),
     ] = None
 

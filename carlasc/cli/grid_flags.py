@@ -1,4 +1,4 @@
-"""The options of what makes grids, which `regrid`, `convert`, `simulate` and `validate` share."""
+"""The options for making grids, which `regrid`, `convert`, `simulate` and `validate` share."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ import carlasc
 from carlasc.cli.common import echo, parse_numbers
 from carlasc.cli.flags import Flags
 from carlasc.core.choices import Complete, Coordinates, Dynamic, Preset, Rays, VoteRule
-from carlasc.errors import ArgumentError
+from carlasc.errors import ArgumentError, count
 
-_FEW = 8  # voxels along an axis, of a grid that is unusual
-_MOVED_M = 1e-3  # bounds that move less are those that were asked for, rounded
-_VOXEL_BYTES, _LARGE_BYTES = 8, 2e9  # of a label and a count; of a frame that is unusual
+_FEW = 8  # fewer voxels along an axis are unusual
+_MOVED_M = 1e-3  # bounds that differ by less are equal up to rounding
+_VOXEL_BYTES, _LARGE_BYTES = 8, 2e9  # size of a label and a count; a larger frame is unusual
+MOTION_HELP = (
+    "How moving points are found. boxes, instances, flow: by the field of that name. evidence: a point moves if rays of other scans passed"
+    " through its position. none: only classes that always move. auto: the best field that exists, and evidence for what it misses"
+)
 
 
 @dataclass(frozen=True)
@@ -27,22 +31,22 @@ class GridFlags(Flags):
     res: Annotated[
         str | None,
         typer.Option(
-            help="Size of a voxel: one value in metres, or one value per axis: x,y,z or radius,degrees,z. Give this, --size or --preset."
+            help="Voxel size in metres: one value, or one per axis, x,y,z (cylindrical: radius,azimuth,z with the azimuth in degrees). Use only"
+            " one of --res, --size and --preset."
         ),
     ] = None
-    size: Annotated[str | None, typer.Option(help="Number of voxels per axis, X,Y,Z, within exactly the bounds.")] = (
-        None
-    )
+    size: Annotated[str | None, typer.Option(help="Number of voxels per axis: X,Y,Z. The bounds stay exact.")] = None
     preset: Annotated[Preset | None, typer.Option(help="A grid of the published data set.")] = None
-    coordinates: Annotated[Coordinates | None, typer.Option(help="Coordinates of the grid; default: cartesian.")] = None
+    coordinates: Annotated[Coordinates | None, typer.Option(help="Coordinates of the grid. Default: cartesian.")] = None
     bounds: Annotated[
         str | None,
         typer.Option(
-            help="x0,x1,y0,y1,z0,z1 in metres (cylindrical: radius in metres, azimuth in degrees, z in metres); default: the published bounds."
+            help="Lower and upper bound of each axis, x0,x1,y0,y1,z0,z1, in metres (cylindrical: radius, azimuth in degrees, z). Default: those of"
+            " the published data set."
         ),
     ] = None
     yes: Annotated[
-        bool, typer.Option("--yes", help="Make the grid although its size or its bounds are probably a mistake.")
+        bool, typer.Option("--yes", help="Make the grid even if its size or its bounds are probably a mistake.")
     ] = False
 
     def spec_or_published(self) -> carlasc.GridSpec:
@@ -52,9 +56,9 @@ class GridFlags(Flags):
         return self.spec()
 
     def spec(self) -> carlasc.GridSpec:
-        """Return the grid that the options describe, and say on stderr what is unusual about it.
+        """Return the grid that the options describe, and print on stderr what is unusual about it.
 
-        Azimuths are degrees here and radians everywhere else.
+        Azimuths are in degrees in options, and in radians in the library.
 
         Raises:
             ArgumentError: not exactly one of --res, --size and --preset, values that are not valid for a grid, or values that are
@@ -64,9 +68,10 @@ class GridFlags(Flags):
         unusual = [*unusual_of(spec, asked)]
         found = "; ".join(text for text, _ in unusual)
         if any(mistake for _, mistake in unusual) and not self.yes:
-            raise ArgumentError("grid", expected="a grid for scenes", found=found, advice="give --yes to make it")
+            expected = f"{_FEW} voxels or more along x and y, the bounds asked for, {_LARGE_BYTES / 1e9:g} GB per frame at most"
+            raise ArgumentError("grid", expected=expected, found=found, advice="give --yes to make it all the same")
         if unusual:
-            echo(f"note: {found}", err=True)
+            echo(f"note: the grid has {found}", err=True)
         return spec
 
     def _spec(self) -> tuple[carlasc.GridSpec, carlasc.GridSpec]:
@@ -82,7 +87,7 @@ class GridFlags(Flags):
             raise ArgumentError("coordinates", expected="cylindrical with --preset cylindrical", found="cartesian")
         if self.preset is not None and self.bounds is not None:
             raise ArgumentError(
-                "bounds", expected="none with --preset, which has its own bounds", found=repr(self.bounds)
+                "bounds", expected="none, because --preset has bounds", found=repr(self.bounds), advice="use --size"
             )
         cylindrical = "cylindrical" in (self.preset, self.coordinates)
         spec = carlasc.GridSpec.published("cylindrical" if cylindrical else "cartesian")
@@ -114,18 +119,18 @@ def unusual_of(spec: carlasc.GridSpec, asked: carlasc.GridSpec) -> Iterator[tupl
     axes = ("x", "y", "z") if spec.coordinates == "cartesian" else ("the radius", "the azimuth", "z")
     for number, axis in enumerate(axes):
         if spec.size[number] < _FEW and (axis != "z" or spec.size != asked.size):
-            yield f"{spec.size[number]} voxels along {axis}", axis != "z"
+            yield f"{count(spec.size[number], 'voxel')} along {axis}", axis != "z"
         (low, up), (old, end) = ((grid.lower[number], grid.upper[number]) for grid in (spec, asked))
         if abs(low - old) + abs(up - end) > _MOVED_M:
-            bounds = f"{axis} {low:.2f}..{up:.2f} m instead of {old:.2f}..{end:.2f}"
+            bounds = f"{axis} from {low:.2f} to {up:.2f} m instead of {old:.2f} to {end:.2f} m"
             yield bounds, up - low > 2 * (end - old)
     if (size := spec.num_voxels * _VOXEL_BYTES) > _LARGE_BYTES:
-        yield f"{spec.num_voxels:,} voxels, {size / 1e9:.1f} GB for each frame", True
+        yield f"{spec.num_voxels:,} voxels, {size / 1e9:.1f} GB per frame", True
 
 
 @dataclass(frozen=True)
 class VoteFlags(Flags):
-    """How votes are counted, and what is kept of them."""
+    """How votes are counted, and what is written about them."""
 
     heading: ClassVar[str] = "Votes"
 
@@ -133,31 +138,33 @@ class VoteFlags(Flags):
         VoteRule | None,
         typer.Option(
             "--voting",
-            help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the published files (default for captures);"
-            " sample: every sample counts, as in the paper; ray: a voxel is occupied where enough of the rays that enter it end in it (default for scans).",
+            help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the published files (default for captures)."
+            " sample: one vote per sample, as in the paper. ray: a voxel is occupied if enough of the rays that enter it end in it (default for"
+            " scans).",
         ),
     ] = None
-    free_step_m: Annotated[float, typer.Option(help="Distance between two free samples on a ray, in metres.")] = 1.5
-    keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of every class.")] = False
+    free_step_m: Annotated[float, typer.Option(help="Distance between free-space samples on a ray, in metres.")] = 1.5
+    keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of each class per voxel.")] = False
     keep_evidence: Annotated[
         bool,
         typer.Option(
             "--keep-evidence",
-            help="Also write how certain each voxel is: probabilities, flags and number of scans (for scans only).",
+            help="Also write how certain each voxel is: probabilities, flags and number of scans (only for grids from scans).",
         ),
     ] = False
     keep_actors: Annotated[
         bool,
-        typer.Option("--keep-actors", help="Also write which actor each voxel belongs to, and how fast it moves."),
+        typer.Option("--keep-actors", help="Also write the actor that each voxel belongs to, and its velocity."),
     ] = False
     min_confidence: Annotated[
         float,
         typer.Option(
-            help="Voxels that are neither free nor occupied with at least this probability become unknown (for scans only)."
+            help="Set a voxel to unknown if it is neither free nor occupied with at least this probability, 0 to below 1 (only for grids from"
+            " scans)."
         ),
     ] = 0.0
     keep_seen: Annotated[
-        bool, typer.Option("--keep-seen", help="Also write which cameras see each voxel (for data with cameras only).")
+        bool, typer.Option("--keep-seen", help="Also write which cameras see each voxel (only for data with cameras).")
     ] = False
 
     def voting(self) -> carlasc.Voting:
@@ -182,20 +189,21 @@ class PoseFlags(Flags):
     poses: Annotated[
         carlasc.motion.PoseSource,
         typer.Option(
-            help="file: those of the data. kiss-icp: estimated from the scans. auto: the file if it exists, else estimated."
+            help="Where poses come from. file: the poses of the data. kiss-icp: estimated from the scans. auto: the file if it exists, otherwise"
+            " estimated."
         ),
     ] = "auto"
     refine: Annotated[
         carlasc.motion.RefineMode,
         typer.Option(
-            help="Change poses so that neighbouring scans agree. auto: where scans come clearly nearer to each other; always; never."
+            help="Refine poses, so that neighbouring scans agree. auto: only where scans then agree clearly better. always: all poses. never: none."
         ),
     ] = "auto"
     force: Annotated[
         bool,
         typer.Option(
             "--force",
-            help="Accept poses that jump between frames, under which scans do not overlap, or whose calibration is missing.",
+            help="Accept poses even if they jump between frames, if scans do not overlap under them, or if their calibration is missing.",
         ),
     ] = False
 
@@ -206,28 +214,25 @@ class PoseFlags(Flags):
 
 @dataclass(frozen=True)
 class WindowFlags(Flags):
-    """Which scans are merged, and what happens to what moves."""
+    """Which scans are merged, and what happens to moving points."""
 
     heading: ClassVar[str] = "Scans merged over time"
 
     window: Annotated[
         str | None,
-        typer.Option(help="First and last scan to merge, relative to each frame, in frames; default: -30:30."),
+        typer.Option(
+            metavar="A:B",
+            help="First and last scan to merge, in frames relative to the current frame. Default: -30:30.",
+        ),
     ] = None
     dynamic: Annotated[
         Dynamic | None,
         typer.Option(
-            help="What happens to moving points. align: complete each actor from all scans (default); current: use those of the frame"
-            " itself; drop: use none; tube: leave them where they were seen, as in SemanticKITTI."
+            help="What happens to moving points. align: each actor is completed from all scans (default). current: only points of the frame"
+            " itself are used. drop: they are left out. tube: they stay where they were seen, which leaves ghost trails, as in SemanticKITTI."
         ),
     ] = None
-    motion: Annotated[
-        carlasc.motion.MotionSource | None,
-        typer.Option(
-            help="What tells which points move. boxes, instances, flow: the field of that name; evidence: free space that other scans saw"
-            " there; none: nothing but moving classes; auto: the best field that exists, and evidence for what it misses (default)."
-        ),
-    ] = None
+    motion: Annotated[carlasc.motion.MotionSource | None, typer.Option(help=f"{MOTION_HELP} (default).")] = None
 
     def from_scans(self, poses: carlasc.motion.PoseOptions) -> carlasc.FromScans:
         """Return how scans are merged, with the defaults of `FromScans` for what is not given."""
@@ -244,34 +249,39 @@ class WindowFlags(Flags):
 class ScanFlags(WindowFlags):
     """How scans are merged."""
 
-    window_m: Annotated[float | None, typer.Option(help="Merge only scans within this driven distance, in metres.")] = (
-        None
-    )
+    window_m: Annotated[
+        float | None, typer.Option(help="Merge only scans within this driven distance, in metres. Default: no limit.")
+    ] = None
     stride: Annotated[
-        int | None, typer.Option(help="Merge every N-th scan of the window; default: 1.", metavar="N")
+        int | None, typer.Option(help="Merge every N-th scan of the window. Default: 1.", metavar="N")
     ] = None
     complete: Annotated[
         Complete | None,
         typer.Option(
-            help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay unknown; mirror: a side is taken from the"
-            " other side; body: what is still missing comes from similar vehicles (default)."
+            help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay unknown. mirror: one side is copied from the"
+            " other. body: like mirror, and the rest is copied from similar vehicles (default)."
         ),
     ] = None
     no_own_path: Annotated[
         bool,
         typer.Option(
             "--no-own-path",
-            help="Do not count the space that the recording vehicle drove through as free. By default it is free, which removes ghost trails there.",
+            help="Do not count the space that the recording vehicle drove through as free. By default it counts as free, which removes ghost trails"
+            " there.",
         ),
     ] = False
     rays: Annotated[
         Rays | None,
         typer.Option(
-            help="Which rays of other scans are followed. all (default); enough: a part of those near the sensor, where they are dense."
+            help="Which rays of other scans are followed. all: every ray (default). enough: near the sensor, where rays are dense, only some of them."
         ),
     ] = None
-    min_range_m: Annotated[float | None, typer.Option(help="Leave out nearer points, in metres.")] = None
-    max_range_m: Annotated[float | None, typer.Option(help="Leave out farther points, in metres.")] = None
+    min_range_m: Annotated[
+        float | None, typer.Option(help="Leave out nearer points, in metres. Default: the range in carlasc.json.")
+    ] = None
+    max_range_m: Annotated[
+        float | None, typer.Option(help="Leave out farther points, in metres. Default: the range in carlasc.json.")
+    ] = None
 
     def _given(self) -> dict[str, Any]:
         others = {
@@ -288,13 +298,13 @@ def parse_window(text: str, option: str = "window") -> tuple[int, int]:
         return int(first), int(last)
     except ValueError:
         raise ArgumentError(
-            option, expected="A:B, in frames relative to the current one, such as -30:30", found=repr(text)
+            option, expected="A:B, in frames relative to the current frame, such as -30:30", found=repr(text)
         ) from None
 
 
 @dataclass(frozen=True)
 class GroundTruthFlags(Flags):
-    """What makes grids: the same options in `regrid` and in `convert`."""
+    """The options for making grids, the same in `regrid` and in `convert`."""
 
     grid: GridFlags
     votes: VoteFlags

@@ -18,7 +18,7 @@ def info(
     ] = ".",
     as_json: Json = False,
 ) -> None:
-    """List what a data set holds: splits, sequences, frames, fields, grids and how they were made. No frame is read."""
+    """List the contents of a data set: splits, sequences, frames, fields, grids and how they were made. No frame is read."""
     overview = carlasc.info(source)
     if as_json:
         print_json(overview.to_dict())
@@ -30,21 +30,22 @@ def _print(overview: Overview) -> None:
     from carlasc.cli.tables import print_table
 
     out = console()
-    splits = ", ".join(f"{name} {number}" for name, number in overview.splits.items())
+    names = {name: number for name, number in overview.splits.items() if name != "none"}
+    splits = f" ({', '.join(f'{name} {number}' for name, number in names.items())})" if names else ""
     out.print(line(overview.location, "bold") + line(f": {overview.level} ({overview.store})"))
     if overview.sequences:
         size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
-        out.print(line(f"{count(len(overview.sequences), 'sequence')}: {splits}{size}"))
-        header = ("Sequence", "Frames", "Numbers", "Gaps", "Fields", "Grids", "Frame", "Classes", "Size")
+        out.print(line(f"{count(len(overview.sequences), 'sequence')}{splits}{size}"))
+        header = ("Sequence", "Frames", "Numbers", "Gaps", "Fields", "Grids", "Axes", "Classes", "Size")
         print_table(out, header, [_row(sequence) for sequence in overview.sequences], turn=False)
     for sequence in overview.sequences:
         if sequence.problem:
             out.print(line(f"{sequence.path or sequence.name}: {sequence.problem}"))
     if kinds := _kinds_of_grids(overview):
-        header = ("Grid", "Axes", "Size", "Cell", "Bounds", "Parts", "Sequences", "Frames", "Made")
+        header = ("Grid", "Coordinates", "Voxels", "Voxel size", "Bounds", "Fields", "Sequences", "Frames", "Made")
         print_table(out, header, [_grid_row(grids) for grids in kinds])
     for capture in overview.captures:
-        span = f"{capture.first}..{capture.last}" + (f" with {capture.gaps} gaps" if capture.gaps else "")
+        span = f"{capture.first}..{capture.last}" + (f" with {count(capture.gaps, 'gap')}" if capture.gaps else "")
         text = f"raw capture {capture.path or '.'}: {count(capture.sensors, 'sensor')}, {count(capture.frames, 'frame')} ({span})"
         out.print(line(text))
 
@@ -66,7 +67,7 @@ def _row(sequence: SequenceOverview) -> list[str]:
 
 
 def _kinds_of_grids(overview: Overview) -> list[list[GridOverview]]:
-    """Return the grids of all sequences, those that differ in nothing but their sequence and frames together."""
+    """Return the grids of all sequences, grouped by name, geometry and how they were made."""
     kinds: dict[tuple[object, ...], list[GridOverview]] = {}
     for sequence in overview.sequences:
         for grid in sequence.grids:

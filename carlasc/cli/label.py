@@ -9,6 +9,7 @@ import typer
 import carlasc
 from carlasc.cli.common import FramesOption, Json, echo, place_argument, place_option, print_json
 from carlasc.cli.flags import RunFlags
+from carlasc.cli.grid_flags import MOTION_HELP
 from carlasc.errors import ArgumentError, count
 
 
@@ -21,34 +22,37 @@ def label(
         typer.Option(
             "--from",
             metavar="FILES",
-            help="Folder of the predictions: a file for each frame, by sequence. motion: what carlasc finds to move, as instances and flow. images: the classes of the pixels that show the points.",
+            help="Folder of predictions, with a folder per sequence and a file per frame. motion: instances and flow of the actors that carlasc"
+            " finds to move. images: the class of each point is that of the camera pixel that shows it.",
         ),
     ],
     pixels: Annotated[
         str | None,
         typer.Option(
             metavar="FOLDER",
-            help="With --from images, classes of pixels: SEQUENCE/CAMERA/000000.png or .npy; default: image_labels of SOURCE.",
+            help="With --from images: folder of the classes of pixels, as SEQUENCE/CAMERA/000000.png or .npy. Default: image_labels of SOURCE.",
         ),
     ] = None,
     motion: Annotated[
         carlasc.motion.MotionSource | None,
-        typer.Option(help="With --from motion, what tells which points move; default: the best field, and free space."),
+        typer.Option(help=f"With --from motion. {MOTION_HELP} (default)."),
     ] = None,
     classes: Annotated[
-        str | None, typer.Option(metavar="TABLE", help="Class table of the predictions, by name or in a JSON file.")
+        str | None, typer.Option(metavar="TABLE", help="Class table of the predictions: its name, or a JSON file.")
     ] = None,
     logits: Annotated[
-        bool, typer.Option("--logits", help="Scores of classes are those from before the softmax.")
+        bool, typer.Option("--logits", help="The predicted class scores are logits (before the softmax).")
     ] = False,
-    by: Annotated[str | None, typer.Option(help="What made the labels; the name of FILES if not given.")] = None,
+    by: Annotated[
+        str | None, typer.Option(help="Name of the network, for the metadata. Default: the name of FILES.")
+    ] = None,
     frames: FramesOption = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what this command has made.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a copy of SOURCE with the labels that a network predicted for its points or images, or with what moves in it. SOURCE is not changed.
+    """Write a copy of SOURCE with labels that a network predicted for its points or images, or with estimated motion. SOURCE is not changed.
 
-    Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
+    Unchanged files are hard links. If it is interrupted, run the same command again to finish it.
     """
     if pixels is not None and predictions != "images":
         raise ArgumentError("pixels", expected="--from images", found=f"--from {predictions}")
@@ -82,7 +86,7 @@ def label(
         print_json(result)
         return
     if result.left_out:
-        echo(f"note: without {', '.join(result.left_out)}, of other labels or classes")
+        echo(f"note: {', '.join(result.left_out)} left out, because of other labels or classes")
     files = f"{count(result.linked, 'file')} linked, {result.files} written"
     echo(
         f"{result.out}: labels of {count(result.frames, 'frame')} predicted by {result.by} ({result.classes}); {files}"
@@ -92,9 +96,9 @@ def label(
 def _label_motion(
     source: str, out: str, motion: carlasc.motion.MotionSource, overwrite: bool, run: RunFlags, json: bool
 ) -> None:
-    """Write what moves, and print what was found."""
+    """Write the moving actors as instances and flow, and print their number."""
     observe = carlasc.FromScans(motion=carlasc.motion.MotionOptions(motion))
-    with run.spread("Finding what moves", "scans and files") as spread:
+    with run.spread("Finding moving actors", "scans and files") as spread:
         result = carlasc.label_motion(source, out, observe=observe, overwrite=overwrite, run=spread)
     if json:
         print_json(result)

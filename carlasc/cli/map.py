@@ -10,7 +10,8 @@ import typer
 import carlasc
 from carlasc.cli.common import FramesOption, Json, echo, file_argument, file_option, place_argument, print_json
 from carlasc.cli.flags import WorkFlags
-from carlasc.cli.grid_flags import PoseFlags
+from carlasc.cli.grid_flags import MOTION_HELP, PoseFlags
+from carlasc.errors import count
 
 
 def map(
@@ -20,11 +21,11 @@ def map(
     out: Annotated[
         Path | None,
         file_argument(
-            "File of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap); may be left out with --mesh or --distance."
+            "File of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). Not needed with --mesh or --distance."
         ),
     ] = None,
     cell_m: Annotated[
-        float, typer.Option("--cell", help="Size of a cell, in metres: one point is written per cell.")
+        float, typer.Option("--cell", help="Cell size, in metres: one point is written per cell.")
     ] = 0.05,
     frames: FramesOption = None,
     actors: Annotated[
@@ -36,25 +37,19 @@ def map(
         file_option("--mesh", text="File of the surface, with classes as colours: .ply or .glb.", metavar="FILE"),
     ] = None,
     grid: Annotated[
-        str | None, typer.Option(help="Take this grid of one frame (see --frames) as the map, instead of the scans.")
+        str | None, typer.Option(help="Make the map from this grid of one frame (see --frames), instead of the scans.")
     ] = None,
     distance: Annotated[
         Path | None,
         file_option(
-            "--distance", text="File of the distance of each voxel from the surface, with --grid: .npz.", metavar="FILE"
+            "--distance", text="With --grid: .npz file of the distance of each voxel from the surface.", metavar="FILE"
         ),
     ] = None,
-    motion: Annotated[
-        carlasc.motion.MotionSource,
-        typer.Option(
-            help="What tells which points move. boxes, instances, flow: the field of that name; evidence: free space that other scans saw"
-            " there; none: nothing but moving classes; auto: the best field that exists, and evidence for what it misses."
-        ),
-    ] = "auto",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
+    motion: Annotated[carlasc.motion.MotionSource, typer.Option(help=f"{MOTION_HELP}.")] = "auto",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a map of a drive: the static points of its scans in one frame, without what moves; also as a mesh, or for OctoMap."""
+    """Write a map of a drive: the static points of all scans in one coordinate frame, as points, as a mesh, or for OctoMap."""
     options = poses.options()
     with run.spread("Mapping", "scans") as spread:
         result = carlasc.map(
@@ -78,6 +73,6 @@ def map(
         echo(f"note: {note}")
     for name in result.files:
         echo(name)
-    what, of = ("voxels", f"of {grid}") if grid is not None else ("points", f"of {result.frames} scans")
-    bodies = f", {result.actors} actors beside it" if actors else ""
+    what, of = ("voxels", f"of {grid}") if grid is not None else ("points", f"of {count(result.frames, 'scan')}")
+    bodies = f", and {count(result.actors, 'actor')} in files of their own" if actors else ""
     echo(f"{result.points:,} {what} {of}{bodies}, in {result.elapsed_s:.1f} s")

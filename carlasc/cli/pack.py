@@ -1,4 +1,4 @@
-"""`carlasc pack`: one store instead of a quarter of a million files."""
+"""`carlasc pack`: all files of a data set in one store."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ from carlasc.errors import count
 
 def pack(
     run: RunFlags,
-    source: Annotated[str, place_argument("Folder, zip or URL with one or more sequences.")],
-    out: Annotated[str, place_argument("Store to write; its ending says which kind: .zarr, .h5 or .parquet.", "OUT")],
+    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, or a URL.")],
+    out: Annotated[str, place_argument("Store to write. Its name ends in .zarr, .h5 or .parquet.", "OUT")],
     small: Annotated[
         bool,
-        typer.Option("--small", help="Pack points with PCodec (zarr only): smaller, but fewer programs can read it."),
+        typer.Option(
+            "--small", help="Compress points with PCodec (only .zarr): smaller, but fewer programs can read it."
+        ),
     ] = False,
     lossy_mm: Annotated[
-        float | None, typer.Option(help="Quantise points to this many millimetres. Without it, every bit is kept.")
+        float | None, typer.Option(help="Round coordinates of points to this step, in millimetres. Default: exact.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a store that exists at OUT.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing store.")] = False,
     json: Json = False,
 ) -> None:
-    """Pack all sequences of SOURCE into one store, which is several times smaller. Nothing is lost.
+    """Pack all sequences of SOURCE into one store, which is several times smaller. Without --lossy-mm, nothing is lost.
 
     If it is interrupted, run the same command again to finish it.
     """
@@ -37,7 +39,7 @@ def pack(
     elif result.is_finished:
         _print(result)
     else:
-        echo(f"{result.out}: part {run.part} is packed; the last part finishes the store")
+        echo(f"{result.out}: part {run.part} is packed; the part that ends last finishes the store")
 
 
 def _print(result: carlasc.storage.packing.PackResult) -> None:
@@ -55,4 +57,4 @@ def _print(result: carlasc.storage.packing.PackResult) -> None:
     console().print(table)
     if result.left_out:
         more = f" and {len(result.left_out) - 5} more" if len(result.left_out) > 5 else ""
-        echo(f"Left out, because the layout does not know them: {', '.join(result.left_out[:5])}{more}")
+        echo(f"left out, because they are not part of CarlaSC's layout: {', '.join(result.left_out[:5])}{more}")

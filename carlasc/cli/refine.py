@@ -18,12 +18,12 @@ def refine(
     run: RunFlags,
     source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")],
     out: Annotated[str, place_option("-o", "--out", text="Folder of the data set with refined poses.")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what this command has made.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a copy of SOURCE whose poses were changed so that neighbouring scans agree. SOURCE is not changed.
+    """Write a copy of SOURCE with refined poses, so that neighbouring scans agree. SOURCE is not changed.
 
-    Files that do not change are hard links. If it is interrupted, run the same command again to finish it.
+    Unchanged files are hard links. If it is interrupted, run the same command again to finish it.
     """
     options = poses.options()
     with run.spread("Refining poses", "scans and files") as spread:
@@ -34,6 +34,6 @@ def refine(
     for note in result.notes:
         echo(note)
     if result.left_out:
-        echo(f"note: without {', '.join(result.left_out)}, made with other poses")
+        echo(f"note: {', '.join(result.left_out)} left out, because of other poses")
     files = f"{count(result.linked, 'file')} linked, {result.files} written"
-    echo(f"{result.out}: poses of {len(result.refined)} of {len(result.sequences)} sequences refined; {files}")
+    echo(f"{result.out}: poses of {len(result.refined)} of {count(len(result.sequences), 'sequence')} refined; {files}")

@@ -24,21 +24,22 @@ class CameraFlags(Flags):
 
     view: Annotated[
         ViewName,
-        typer.Option(help="From behind and above, from straight above (bird's-eye view), or both."),
+        typer.Option(help="perspective: from behind and above. bev: from straight above (bird's-eye view)."),
     ] = "perspective"
     viewpoint: Annotated[
         str | None,
         typer.Option(
-            help="Any of azimuth=DEG elevation=DEG distance=M fov=DEG target=X,Y,Z position=X,Y,Z, in one pair of quotes."
+            help="Position of the camera: any of azimuth=DEG elevation=DEG distance=M fov=DEG target=X,Y,Z position=X,Y,Z (degrees and metres),"
+            " together in quotes."
         ),
     ] = None
-    orbit: Annotated[bool, typer.Option("--orbit", help="Circle the scene once (a film).")] = False
+    orbit: Annotated[bool, typer.Option("--orbit", help="Make a film that circles the scene once.")] = False
     camera: Annotated[
         str | None,
-        typer.Option(help="Draw the grid over the images of this camera of the recording, and nothing else."),
+        typer.Option(help="Draw only the grid, over the images of this camera of the recording."),
     ] = None
     still: Annotated[
-        bool, typer.Option("--still", help="The camera does not follow the ego vehicle (needs poses).")
+        bool, typer.Option("--still", help="Do not move the camera with the ego vehicle (needs poses).")
     ] = False
 
     def options(self) -> carlasc.CameraOptions:
@@ -55,23 +56,23 @@ class StyleFlags(Flags):
 
     style: Annotated[
         StyleName,
-        typer.Option(help="paper: 300 dpi, type of 8 points, and the legend in a file of its own (NAME.legend.png)."),
+        typer.Option(help="paper: 300 dpi, text of 8 points, and the legend in a separate file (NAME.legend.png)."),
     ] = "screen"
     size: Annotated[
         str | None,
         typer.Option(
-            help="WIDTHxHEIGHT in pixels, or with a unit, such as 8.8cmx5cm or 3.5inx2in. Default: 1280x720, or 8.8cmx5cm on paper."
+            help="WIDTHxHEIGHT in pixels, or with a unit, such as 8.8cmx5cm or 3.5inx2in. Default: 1280x720; with --style paper: 8.8cmx5cm."
         ),
     ] = None
     dpi: Annotated[
         float | None,
-        typer.Option(help="Pixels per inch, written into a PNG. Default: 300 on paper and for a size with a unit."),
+        typer.Option(help="Pixels per inch, written into a PNG. Default: 300 for paper and for a size with a unit."),
     ] = None
     captions: Annotated[
         list[str] | None,
         typer.Option(
             "--caption",
-            help="With --grid-of: text of a panel, once for each. Default: what differs between the panels.",
+            help="With --grid-of: caption of a panel. Repeat it for each panel. Default: what differs between the panels.",
         ),
     ] = None
     columns: Annotated[int | None, typer.Option(help="With --grid-of: number of panels in a row.", min=1)] = None
@@ -93,11 +94,11 @@ class ContentFlags(Flags):
 
     what: Annotated[
         str | None,
-        typer.Option(help="grid, scan, flow, truth, errors; several, separated by commas, are drawn side by side."),
+        typer.Option(help="grid, scan, flow, truth or errors. Several, separated by commas, are drawn side by side."),
     ] = None
     color: Annotated[
         GridColor,
-        typer.Option(help="What the colours of the grid mean: classes, one of the kinds of evidence, or actors."),
+        typer.Option(help="What the colours of the grid show: classes, a kind of evidence, actors, or cameras."),
     ] = "class"
     boxes: Annotated[bool, typer.Option("--boxes", help="Draw boxes around actors.")] = False
 
@@ -110,7 +111,7 @@ class PanelFlags(Flags):
 
     grid_of: Annotated[
         bool,
-        typer.Option("--grid-of", help="Draw panels of several SOURCES, or of the frames of one, with captions."),
+        typer.Option("--grid-of", help="Draw several SOURCES, or the frames of one, as panels with captions."),
     ] = False
     palette: Annotated[
         PaletteName,
@@ -123,8 +124,8 @@ def render(
     sources: Annotated[
         list[str],
         places_argument(
-            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the file of one frame;"
-            " several with --grid-of.",
+            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the file of one frame."
+            " With --grid-of: one or more.",
         ),
     ],
     out: Annotated[
@@ -132,7 +133,7 @@ def render(
     ] = None,
     scene: SceneFlags,
     fps: Annotated[
-        float | None, typer.Option(help="Pictures per second of a film. Default: 10, the rate of the data.")
+        float | None, typer.Option(help="Frames of a film per second. Default: 10, the rate of the data.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     as_json: Json = False,
@@ -144,7 +145,7 @@ def render(
 ) -> None:
     """Draw a frame (PNG) or several frames (GIF, MP4, WebP): grids, scans, scene flow, predictions with ground truth and errors.
 
-    No screen and no GPU are needed. The camera is behind and above the ego vehicle and follows it.
+    Neither a screen nor a GPU is needed. The camera is behind and above the ego vehicle and moves with it.
     Without --frames, a picture shows the first frame and a film shows all frames.
     """
     scenes = [scene.scene(source, panels.palette) for source in sources]

@@ -21,26 +21,29 @@ _SHOWN = 12
 def report(
     work: WorkFlags,
     source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
-    grid: Annotated[str | None, typer.Option(help="Only the grid of this name; default: all grids.")] = None,
+    grid: Annotated[str | None, typer.Option(help="Only the grid of this name. Default: all grids.")] = None,
     html: Annotated[
         Path | None,
         file_option("--html", metavar="FILE", text="Also write the reports as one page for a browser."),
     ] = None,
     remake: Annotated[
-        bool, typer.Option("--remake", help="Make the reports from the files, also where a run left some.")
+        bool, typer.Option("--remake", help="Make all reports from the files, also where reports exist.")
     ] = False,
     holdout: Annotated[
-        bool, typer.Option("--holdout", help="Add the scores of held-out rays (see `carlasc validate --holdout`).")
+        bool, typer.Option("--holdout", help="Also measure held-out rays (see `carlasc validate --holdout`).")
     ] = False,
     save: Annotated[
-        bool, typer.Option("--save", help="Write the reports beside their grids, if carlasc made these.")
+        bool,
+        typer.Option(
+            "--save", help="Write the reports into the folders of the grids (only of grids that carlasc made)."
+        ),
     ] = False,
     everything: Annotated[bool, typer.Option("--all", help="Print all actors, not only the first twelve.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Print the report of each grid: what is in it, how it was made, how well actors were tracked, how it changes with fewer scans.
+    """Print the report of each grid: contents, settings, tracks of actors, and how much the grid changes with fewer scans.
 
-    `carlasc regrid` leaves a report beside each grid. Grids without one are read and measured.
+    `carlasc regrid` writes a report with each grid. For other grids, the report is made from their files.
     """
     from carlasc.inspection.report_page import write_report_page
 

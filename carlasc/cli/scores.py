@@ -12,14 +12,12 @@ from carlasc.cli.common import Overwrite, console, echo
 
 
 def scores(
-    files: Annotated[list[Path], typer.Argument(help="Results of `carlasc evaluate --json`.")],
+    files: Annotated[list[Path], typer.Argument(help="JSON files that `carlasc evaluate --json` printed.")],
     format: Annotated[
         Literal["text", "markdown", "latex", "html"] | None,
-        typer.Option(help="How to write the table; by the ending of OUT, or text, if not given."),
+        typer.Option(help="Format of the table. Default: by the ending of OUT, otherwise text."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File to write; standard output if not given.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write. Default: print the table.")] = None,
     mixed: Annotated[
         bool, typer.Option("--mixed", help="Allow results by different conventions, which cannot be compared.")
     ] = False,
@@ -45,7 +43,9 @@ def scores(
         echo(text, nl=False)
         return
     if out.exists() and not overwrite:
-        raise ConflictError(out, problem="exists already", advice="choose another name, or give `overwrite=True`")
+        raise ConflictError(
+            out, problem="the file exists", advice="choose another name, or replace it with `overwrite=True`"
+        )
     from carlasc.storage.files import write_output
 
     write_output(out, text.encode())

@@ -26,10 +26,10 @@ def simulate(
     sensors: SensorFlags,
     run: RunFlags,
 ) -> None:
-    """Record a drive through a simulated town as a raw capture, or its scans and ground truth at once.
+    """Simulate a drive through a town, and write a raw capture (the scans of all sensors), or scans and ground truth.
 
-    With a .zarr store as OUT, or with a grid (--res, --size, --preset), the scans of the ego sensor and the ground truth of all sensors are
-    written, and no raw capture. A second run with the same options writes only the frames that are missing.
+    If OUT is a .zarr store, or a grid is given (--res, --size, --preset), the scans of the ego sensor and the ground truth of all sensors are
+    written instead of a raw capture. A second run with the same options writes only the missing frames.
     """
     drive = {"count": count, "first_frame": first_frame, **sensors.arguments()}
     drive["cameras"] = camera_names(cameras)

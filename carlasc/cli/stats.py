@@ -10,6 +10,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, console, echo, file_option, line, place_argument, print_json, report_failures
 from carlasc.cli.flags import OneWorkerFlags
+from carlasc.errors import count
 
 if TYPE_CHECKING:
     from carlasc.core import ClassTable
@@ -23,24 +24,24 @@ def stats(
     source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
     by: Annotated[
         Literal["total", "split", "sequence"],
-        typer.Option(help="Print the shares of the whole, of each split too, or of each sequence too."),
+        typer.Option(help="Print shares of the whole (total), and also of each split or of each sequence."),
     ] = "split",
     grid: Annotated[
-        str, typer.Option(help="Grid whose voxels are counted; in a sequence with one other grid, that one.")
+        str, typer.Option(help="Grid whose voxels are counted. A sequence that has only one grid uses that one.")
     ] = "evaluation",
     remap: Annotated[
-        str, typer.Option(help="Remap to the classes of the second table: auto, none, carlasc11, semantickitti19, ...")
+        str, typer.Option(help="Classes of the second table: auto, none (no table), carlasc11, semantickitti19, ...")
     ] = "auto",
-    every: Annotated[int, typer.Option(metavar="N", help="Count every N-th frame.")] = 1,
+    every: Annotated[int, typer.Option(metavar="N", help="Count only every N-th frame.")] = 1,
     plot: Annotated[
-        Path | None, file_option("--plot", text="Draw the histograms to a .png, .svg or .pdf file.")
+        Path | None, file_option("--plot", text="Also draw the histograms to this .png, .svg or .pdf file.")
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Count the classes of points and of known voxels, and compute class weights: as tables, a plot or JSON."""
     from carlasc.inspection.charts import check_plot, draw_histograms
 
-    if plot is not None:  # counting may take hours: a mistake in this option is reported before
+    if plot is not None:  # before counting, which may take hours
         check_plot(plot)
     with work.spread("Counting", usual=1) as run:
         result = carlasc.stats(source, grid=grid, remap=None if remap == "none" else remap, every=every, run=run)
@@ -73,10 +74,12 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
             print_table(out, header, rows, title=f"{kind}, % by sequence")
     total = result.total
     if total.grids:
-        text = f"{total.known_share:.1%} of voxels known ({total.grids} grids); shares of voxels are shares of the known voxels; class 0 of points is unlabelled"
-        out.print(line(text))
+        out.print(line(f"{total.known_share:.1%} of voxels known ({count(total.grids, 'grid')})"))
+        out.print(line("voxels % is of the known voxels; class 0 of points is unlabelled"))
+    else:
+        out.print(line("no voxels counted: choose a grid with --grid (`carlasc info` lists them)"))
     if total.actor_voxels:
-        out.print(line(f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} move"))
+        out.print(line(f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} of them move"))
 
 
 def _class_table(

@@ -1,4 +1,4 @@
-"""Tables that can be read at every width of the terminal: turned or printed in parts, rather than with broken words."""
+"""Tables for terminals of any width: a wide table is transposed or printed in parts, so that no word is broken."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.text import Text
 
 from carlasc.errors import printable
 
-_MOST_COLUMNS = 10  # a table with more columns beside the first is turned
+_MOST_COLUMNS = 10  # a table with more columns beside the first is transposed
 _TEXT_WIDTH = 16  # a longer text is wrapped at this width or wider, never inside a word
 _BORDER = 3  # border and padding of a column, in characters
 _NUMBER = re.compile(r"[-+\d.,%]*")
@@ -25,15 +25,15 @@ def print_table(
 ) -> None:
     """Print a table whose first column holds the names of the rows.
 
-    A table with more than ten columns beside the first, or one that is wider than the terminal, is turned: its columns become rows.
-    What is still too wide is printed in several parts, each of which starts with the first column.
+    A table with more than ten columns beside the first, or one that is wider than the terminal, is transposed. If it is still too wide, it is
+    printed in several parts, each of which starts with the first column.
 
     Args:
         console: where to print; its width is that of the terminal.
         header: names of the columns.
         rows: the cells of each row, as many as there are columns.
         title: printed above the table.
-        turn: whether the table may be turned; False for one whose rows must stay rows.
+        turn: whether the table may be transposed.
     """
     title, header = printable(title), [printable(name) for name in header]
     rows = [[printable(cell) for cell in row] for row in rows]  # names come from data
@@ -80,7 +80,7 @@ def _most(texts: Column) -> int:
 
 
 def _widths(columns: list[Column], width: int) -> list[int]:
-    """Share the width between the columns: each gets what it needs, and what is left goes to those with longer texts."""
+    """Return the width of each column: the least that it needs, and for columns with longer texts a part of the rest."""
     widths = [_least(column) for column in columns]
     spare = width - _least_width(columns)
     while spare > 0 and (short := [i for i, column in enumerate(columns) if widths[i] < _most(column)]):

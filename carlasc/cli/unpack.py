@@ -1,4 +1,4 @@
-"""`carlasc unpack`: from a packed store to the published files again."""
+"""`carlasc unpack`: the published files from a packed store."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def unpack(
     source: Annotated[str, place_argument("Packed store, zip or URL.")],
     out: Annotated[str, place_argument("Folder to write.", "OUT")],
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write into a folder that exists, and replace files of the same names.")
+        bool, typer.Option("--overwrite", help="Write into an existing folder, and replace files of the same names.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Write all sequences of SOURCE as published files: the same bytes that were packed.
+    """Write all sequences of SOURCE as files in CarlaSC's layout, with the bytes that were packed.
 
     If it is interrupted, run the same command again to finish it.
     """

@@ -32,7 +32,7 @@ _COLORS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
 @dataclass(frozen=True)
 class HoldoutFlags(Flags):
-    """Which scans are left out, and the grids that the others give."""
+    """Which scans are left out."""
 
     heading: ClassVar[str] = "Held-out rays"
 
@@ -40,12 +40,12 @@ class HoldoutFlags(Flags):
         bool,
         typer.Option(
             "--holdout",
-            help="Also leave scans out, and follow their rays through the grids that the other scans give, in one process per core if"
-            " --workers is not given.",
+            help="Also leave scans out, make grids from the other scans, and compare the rays of the left-out scans with these grids (by default"
+            " in one process per core).",
         ),
     ] = False
     holdout_every: Annotated[
-        int | None, typer.Option(metavar="N", min=2, help="Leave every N-th scan out; default: 10.")
+        int | None, typer.Option(metavar="N", min=2, help="Leave out every N-th scan. Default: 10.")
     ] = None
 
 
@@ -62,7 +62,7 @@ def validate(
     every: Annotated[
         int | None,
         typer.Option(
-            metavar="N", help="Read the contents of every N-th frame; of about forty frames per sequence if not given."
+            metavar="N", help="Read the contents of every N-th frame. Default: about forty frames per sequence."
         ),
     ] = None,
     full: Annotated[bool, typer.Option("--full", help="Read the contents of all frames.")] = False,
@@ -77,13 +77,15 @@ def validate(
 ) -> None:
     """Check a data set: files, poses, times, and whether scans agree with poses and grids. The exit code is 1 if there is an error.
 
-    It finds files of the wrong size, labels without votes, unknown classes, poses that are not rigid or jump, and gaps. From the
-    scans it recognizes a mirrored y axis, poses of a camera, transposed rotations, and a grid that is shifted by a cell.
+    It finds files of the wrong size, labels without votes, unknown classes, poses that are not rigid or jump, and gaps. By comparing scans
+    with poses and grids, it recognizes a mirrored y axis, poses of a camera, transposed rotations, and a grid shifted by one voxel.
     """
     if full and every is not None:
-        raise ArgumentError("every", expected="only one of --every and --full", found="both")
+        raise ArgumentError("every", expected="only one of --every and --full", found="both", advice="leave one out")
     if not holdout.holdout and (holdout.is_given or grid.is_given or scans.is_given):
-        raise ArgumentError("holdout", expected="given with the options of held-out rays", found="not given")
+        raise ArgumentError(
+            "holdout", expected="--holdout, because its options are given", found="none", advice="give `holdout`"
+        )
     spec, observe = grid.spec_or_published(), scans.from_scans(carlasc.motion.PoseOptions("file"))
     rays = None
     with work.spread("Validating", "steps", usual=1) as run:
@@ -122,25 +124,26 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
             f"{share:.1%} of points in voxels of their class ({grid})" for grid, share in report.voxel_share.items()
         ]
         if report.pose_share is not None:
-            figures.append(f"{report.pose_share:.1%} of a scan's structure on that of an earlier scan under the poses")
+            figures.append(f"{report.pose_share:.1%} of a scan's structure overlaps that of an earlier scan")
         if report.disagreement_m is not None and report.refined_m is not None:
             figures.append(
                 f"scans agree within {100 * report.disagreement_m:.1f} cm ({100 * report.refined_m:.1f} cm with refined poses)"
             )
         name = report.path or result.location
-        text = f"{name}: {count(report.frames, 'frame')}, {report.sampled} read{''.join('; ' + figure for figure in figures)}"
-        out.print(line(text), soft_wrap=True)
+        out.print(line(f"{name}: {count(report.frames, 'frame')}, {report.sampled} read"), soft_wrap=True)
+        for figure in figures:
+            out.print(line(f"  {figure}"), soft_wrap=True)
         if report.mounting:
             mounting = ", ".join(f"{axis} {value}" for axis, value in report.mounting.items())
             out.print(line(f"  sensor in the frame of the poses: {mounting}"), soft_wrap=True)
         for camera, agreement in report.images.items():
             out.print(line(f"  images of {camera} on the scans: {agreement}"), soft_wrap=True)
-    counts = ", ".join(f"{result.count(severity)} {severity}s" for severity in SEVERITIES)
+    counts = ", ".join(count(result.count(severity), severity) for severity in SEVERITIES)
     out.print(line(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold"), soft_wrap=True)
 
 
 def print_held_out(result: HoldoutResult) -> None:
-    """Print what became of the held-out rays: of all sequences together, or of each if their classes differ."""
+    """Print the scores of the held-out rays: of all sequences together, or of each if their classes differ."""
     total = result.total
     parts = result.sequences if total is None else {result.location: total}
     for name, scores in parts.items():

@@ -1,7 +1,7 @@
-"""The motion of a recording's numbered actors: their points are collected while scans are read, and each one's path is then estimated.
+"""The motion of the numbered actors of a recording: their points are collected while scans are read, then their paths are estimated.
 
-A path is estimated as soon as its actor was not seen for a while, and only its velocities are kept. So memory does not grow with the recording, except
-for the result.
+A path is estimated when its actor was not seen for a while, and only its velocities are kept. Except for the result, memory therefore does not
+grow with the length of the recording.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from carlasc.running.spreading import Run
 Velocity = tuple[float, float, float]
 """(vx, vy, vz) in m/s over ground, right-handed sensor frame."""
 
-_MAX_GAP = 10  # frames for which an actor may be hidden; after a longer gap a new path begins
+_MAX_GAP = 10  # frames for which an actor may be hidden; a new path begins after a longer gap
 _MAX_OBSERVATIONS = 400  # of one path
 _MAX_POINTS = 1000  # of one observation
-_FARTHEST_M = 1e4  # no LiDAR sees so far: such numbers are damage, also infinity and NaN
+_FARTHEST_M = 1e4  # points farther than any LiDAR measures are damaged, as infinity and NaN are
 _BATCH = 32  # paths that are estimated together
 
 
@@ -112,7 +112,7 @@ class _VelocityEstimate:
 class ActorMotion:
     """Collects the observations of actors, frame by frame, and estimates their velocities.
 
-    If the class table has no classes of moving actors, actors that stay where they are get zero.
+    If the class table has no classes of moving actors, static actors get zero.
 
     Args:
         classes: table of the labels.
@@ -157,9 +157,7 @@ class ActorMotion:
         return self._velocities
 
     def _run(self) -> None:
-        chains = sorted(
-            self._ended, key=_ObservationChain.size, reverse=True
-        )  # so that no worker has a long one left at the end
+        chains = sorted(self._ended, key=_ObservationChain.size, reverse=True)  # longest first: no worker ends late
         self._ended = []
         with closing(run_all(self._estimate, chains, self._run_options)) as estimates:
             for chain, velocities in zip(chains, estimates, strict=True):

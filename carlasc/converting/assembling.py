@@ -1,4 +1,4 @@
-"""The clouds of a frame as one scan: in the frame of the layout, at one instant, with the place where each ray began."""
+"""The clouds of a frame as one scan: in the frame of the layout, at one instant, with the origin of each ray."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from carlasc.errors import CarlascError, FormatError, describe
 from carlasc.motion.odometry import move_each, ticks_of
 from carlasc.storage import layout
 
-_APART_M = 0.25  # places of one sensor within a sweep that are nearer to each other count as one
+_APART_M = 0.25  # positions of a sensor within a sweep that are closer than this count as one
 
 
 @dataclass(frozen=True)
 class Rig:
-    """The sensors of a recording, and where they are.
+    """The sensors of a recording, and their poses.
 
     Attributes:
         sensors: the LiDARs.
@@ -32,7 +32,7 @@ class Rig:
 
     @property
     def needs_motion(self) -> bool:
-        """Whether points can only be put in place where the motion of the vehicle is known."""
+        """Whether the motion of the vehicle is needed to place points."""
         return any(not sensor.deskewed for sensor in self.sensors)
 
 
@@ -75,22 +75,22 @@ def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> As
         motion: the motion of the vehicle around the frame; None if it is not known.
 
     Raises:
-        CarlascError: the frame cannot be read. Whatever else a converter raises becomes a FormatError, because its author may be anybody.
+        CarlascError: the frame cannot be read. Other exceptions of a converter become a FormatError.
     """
     try:
         clouds = handle.read()
     except (CarlascError, OSError, MemoryError):
         raise
     except Exception as error:
-        raise FormatError(handle.location, problem=f"the converter failed: {describe(error)}") from error
+        problem, advice = f"the converter failed: {describe(error)}", "check the file, or report the error"
+        raise FormatError(handle.location, problem=problem, advice=advice) from error
     return assemble(clouds, rig, motion, handle.location)
 
 
 def assemble(clouds: Sequence[Cloud], rig: Rig, motion: VehicleMotion | None, where: str) -> Assembled:
     """Put the clouds of a frame together, in their order. Every point is kept.
 
-    Points that were taken one after the other are moved to where they would be at the time of the frame, if their times and the motion of
-    the vehicle are known.
+    Points are corrected for the motion of the vehicle, to the time of the frame, if their times and the motion are known.
 
     Args:
         clouds: at least one.
@@ -113,7 +113,7 @@ def assemble(clouds: Sequence[Cloud], rig: Rig, motion: VehicleMotion | None, wh
     seconds = _joined([cloud.seconds for cloud in clouds], clouds, np.float32)
     if seconds is not None:
         fields["seconds"] = seconds
-    # All frames of a recording have origins, or none has: also those in which the vehicle stands.
+    # Either all frames of a recording have origins or none, also frames in which the vehicle is at rest.
     if any(origins.any() for _, origins in placed) or any(_follows_motion(cloud, rig, motion) for cloud in clouds):
         fields["origins"] = np.concatenate([origins for _, origins in placed])
     for name in clouds[0].others:
@@ -140,7 +140,7 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
 
 
 def _follows_motion(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> bool:
-    """Return whether it is known where the sensor was at each point of a cloud."""
+    """Return whether the position of the sensor is known for each point of a cloud."""
     sensor = rig.sensors[cloud.sensor]
     return cloud.seconds is not None and motion is not None and (sensor.calibrated or not sensor.deskewed)
 
@@ -174,14 +174,14 @@ def _place(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> tuple[NDArra
 
 
 def _origin(sensor: Sensor, scan_T_points: Transform) -> NDArray[np.float32]:
-    """Return the place of a sensor in the frame of the scan; that frame's origin itself up to rounding."""
+    """Return the position of a sensor in the frame of the scan; exactly the origin if it differs by rounding only."""
     origin = transform_points(scan_T_points, sensor.origin)
     origin[np.abs(origin) < 1e-9] = 0
     return origin.astype(np.float32)
 
 
 def _thinned(path: NDArray[np.float64], sensor: Sensor, scan_T_points: Transform) -> NDArray[np.float32]:
-    """Return (T, 3) places of a sensor over a sweep, of which neighbours within `_APART_M` are the same."""
+    """Return (T, 3) positions of a sensor over a sweep; neighbours within `_APART_M` are equal."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     if length[-1] < _APART_M:
         return np.tile(_origin(sensor, scan_T_points), (len(path), 1))

@@ -20,13 +20,13 @@ def write_cameras(plan: RecordingPlan, target: AxesAndClasses, images: Images) -
     """Write the cameras of a recording, and return notes.
 
     Args:
-        plan: the recording, and where it is written.
-        target: the axes in which it is written.
-        images: what becomes of the images.
+        plan: the recording and its output.
+        target: the axes of the output.
+        images: "copy", "link" or "none".
 
     Raises:
         FormatError: a calibration is damaged.
-        StorageError: nothing can be written.
+        StorageError: the output cannot be written.
     """
     cameras = plan.recording.cameras()
     if not cameras:
@@ -36,7 +36,7 @@ def write_cameras(plan: RecordingPlan, target: AxesAndClasses, images: Images) -
     if plan.writer.read_document(layout.CAMERAS) != content:
         plan.writer.write_document(layout.CAMERAS, content)
     if images == "link" and not any(camera.images for camera in cameras):
-        return ["no image of a camera lies in a file of its own: --images copy writes those that exist"]
+        return ["no camera has images in separate files to link to: --images copy writes the images"]
     return _copy_images(plan, cameras) if images == "copy" else []
 
 
@@ -48,7 +48,7 @@ def _in_layout(camera: CameraModel, plan: RecordingPlan, target: AxesAndClasses,
 
 
 def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[str]:
-    """Copy the images of all frames, those that are stored together at once; return how many do not exist."""
+    """Copy the images of all frames, those that are stored together at once; return the number of missing images."""
     missing, blocks = 0, dict[int, list[int]]()
     for handle in plan.recording.frames:
         blocks.setdefault(handle.number // plan.writer.block, []).append(handle.number)

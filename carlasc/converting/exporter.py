@@ -1,12 +1,12 @@
-"""The protocol of exporters: an exporter expresses sequences of the layout as the files of another data set.
+"""The protocol of exporters: an exporter writes sequences in the format of another data set.
 
 Another distribution adds one by a class that inherits `FrameExporter` or `SequenceExporter`, and an entry point:
 
     [project.entry-points."carlasc.exporters"]
     name = "package.module:Class"
 
-The options of an exporter are the arguments of its constructor. It holds values only, so that it can be pickled into a worker.
-`carlasc.export` chooses the frames, calls workers, writes every file whole, and continues what an earlier run began.
+The options of an exporter are the arguments of its constructor. It holds only values, so that it can be pickled into a worker.
+`carlasc.export` chooses the frames, calls workers, writes each file completely or not at all, and continues earlier runs.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Exported:
 
 
 class Exporter(ABC):
-    """What exporters of both kinds have.
+    """The common part of both kinds of exporters.
 
     Attributes:
         title: what it writes, in a few words.
@@ -61,14 +61,14 @@ class Exporter(ABC):
         return vars(self)
 
     def check_output(self, source: str, root: Path) -> tuple[int, list[str]] | None:
-        """Check what `root` holds instead of an export, if an option asks for it.
+        """Check the files in `root` instead of an export, if an option requests that.
 
         Args:
-            source: the place that was given, which need not be of the layout.
+            source: the given source, which need not have CarlaSC's layout.
             root: folder of the other data set.
 
         Returns:
-            The number of files, and what users must know, one line each; None to export.
+            The number of files, and notes for the user, one line each; None to export.
 
         Raises:
             CarlascError: something is wrong in `root`.
@@ -83,10 +83,10 @@ class Exporter(ABC):
         """Check that a sequence has what the export needs, before anything is written.
 
         Returns:
-            What users must know of the result, one line each.
+            Notes for the user, one line each.
 
         Raises:
-            CarlascError: it cannot be exported; says what is missing.
+            CarlascError: it cannot be exported; the message names what is missing.
         """
         return []
 
@@ -95,11 +95,11 @@ class Exporter(ABC):
         return sequence.scan_frames().tolist()
 
     def documents(self, sequence: storage.Sequence) -> Files:
-        """Return the files that a sequence has once, by their path in its folder."""
+        """Return the files of a sequence that belong to no single frame, by their path in its folder."""
         return {}
 
     def index(self, root: Path, exported: Sequence[Exported]) -> Files:
-        """Return the files that the data set has once, by their path in `root`. They are written last.
+        """Return the files that belong to no single sequence, by their path in `root`. They are written last.
 
         Args:
             root: folder of the other data set. It may hold sequences of earlier exports.
@@ -109,11 +109,11 @@ class Exporter(ABC):
 
 
 class FrameExporter(Exporter):
-    """Writes one or more files for each frame. Frames are made and written side by side."""
+    """Writes one or more files per frame. Frames are made and written in parallel."""
 
     @abstractmethod
     def frame_files(self, sequence: storage.Sequence, frame: int) -> tuple[str, ...]:
-        """Return the paths of the files that `make_frame` gives."""
+        """Return the paths of the files that `make_frame` returns."""
 
     @abstractmethod
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
@@ -137,7 +137,7 @@ class SequenceFile(AbstractContextManager["SequenceFile"]):
 
 
 class SequenceExporter(Exporter):
-    """Writes one file for each sequence, with all of its frames. Frames are made side by side, and written by one process."""
+    """Writes one file per sequence, with all of its frames. Frames are made in parallel, and written by one process."""
 
     @abstractmethod
     def file(self, sequence: storage.Sequence) -> str:
@@ -153,7 +153,7 @@ class SequenceExporter(Exporter):
 
     @abstractmethod
     def open(self, path: Path, sequence: storage.Sequence) -> SequenceFile:
-        """Open a new file to write to. It gets its name when all frames have been added."""
+        """Open a new file to write to. It is renamed to its final name after all frames were added."""
 
     @abstractmethod
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Mapping[str, NDArray[Any]]:

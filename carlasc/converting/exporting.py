@@ -1,4 +1,4 @@
-"""`export`: sequences of the layout as another data set's files."""
+"""`export`: writes sequences of the layout in the format of another data set."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from carlasc.storage.files import (
 )
 
 RECORD = "carlasc-export.json"
-"""The file that says what exports wrote to a folder."""
+"""The file in a folder that records its exports."""
 
 
 def export(
@@ -46,28 +46,28 @@ def export(
     options: Mapping[str, Any] | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ExportResult:
-    """Write sequences of the layout as another data set's files, so that its tools can read them.
+    """Write sequences of the layout in the format of another data set, so that its tools can read them.
 
-    A second run skips the frames that exist; where a format has one file per sequence, it skips the sequences that are complete. A frame
-    that cannot be written is reported in the result, and the others are written.
+    A second run skips existing frames; if a format has one file per sequence, it skips complete sequences. A frame that cannot be written
+    is reported in the result, and the others are written.
 
     Args:
         name: the other data set: one of `exporter_names()`.
         source: anything that `carlasc.open` takes, or a Source.
         out: folder to write to.
         sequences: names of the sequences to export; None exports all.
-        overwrite: write frames again that exist.
-        options: of the exporter, by name, such as `{"grid": "evaluation"}`; text is read as the type of the option (see
+        overwrite: write existing frames again.
+        options: options of the exporter, by name, such as `{"grid": "evaluation"}`; text is parsed as the type of the option (see
             `option_declarations`).
-        run: how the work is spread. A part exports a share of the frames, or of the sequences where each is one file; the part that finds
-            that nothing is missing any more writes what the data set has once.
+        run: how the work is spread. A part exports a share of the frames, or of the sequences if each is one file. The last part to finish
+            writes the files that belong to no single sequence.
 
     Returns:
         What was written, what was skipped, and what failed.
 
     Raises:
-        ArgumentError: no exporter has that name, or it has no such option.
-        MissingDataError: a sequence does not exist, or lacks what the export needs.
+        ArgumentError: the exporter or its option does not exist.
+        MissingDataError: a sequence does not exist, or lacks data that the export needs.
         ConflictError: `out` lies inside `source`, or holds an export of other sequences or with other options.
         StorageError: the output cannot be written. The files written so far are complete.
     """
@@ -81,7 +81,7 @@ def export(
     opened = storage.as_source(source)
     check_outside(root, opened.location)
     every = _by_name(opened)
-    folders = exporter.folders(list(every))  # of all sequences: a folder's name does not depend on which are exported
+    folders = exporter.folders(list(every))  # of all sequences: names of folders do not depend on the choice
     chosen, notes = [], []
     for sequence in _choose(every, sequences, opened.location):
         notes += exporter.check(sequence)
@@ -116,10 +116,10 @@ def export(
 
 
 def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
-    """Return the sequences of a source by name: the Cartesian one where a sequence has both coordinates.
+    """Return the sequences of a source by name. If a sequence has both coordinates, the Cartesian one is taken.
 
     Raises:
-        FormatError: two sequences have the same name, and would be written to the same place.
+        FormatError: two sequences have the same name, so that they would be written to the same place.
     """
     found: dict[str, storage.Sequence] = {}
     for sequence in source.sequences().values():
@@ -147,14 +147,14 @@ def _choose(
 
 
 def _place(exporter: Exporter, exported: Exported) -> str:
-    """Return what belongs to one sequence only: its folder, or its file where several sequences share a folder."""
+    """Return the place of one sequence only: its folder, or its file if several sequences share a folder."""
     if isinstance(exporter, SequenceExporter):
         return PurePosixPath(exported.folder, exporter.file(exported.sequence)).as_posix()
     return exported.folder
 
 
 def _deal(exporter: Exporter, chosen: Sequence[Exported], part: Part) -> list[Exported]:
-    """Return the sequences of a part, each with its frames of that part: a sequence that is one file is in one part."""
+    """Return the sequences of a part, each with its frames of that part. A sequence that is one file is in one part."""
     if isinstance(exporter, SequenceExporter):
         return list(part.take(chosen))
     dealt = set(part.take([(n, frame) for n, exported in enumerate(chosen) for frame in exported.frames]))
@@ -195,13 +195,13 @@ class _SequenceExport:
     """The export of sequences, one after the other.
 
     Attributes:
-        exporter: what makes the files.
+        exporter: the exporter.
         root: folder of the other data set.
-        overwrite: whether frames are written again that exist.
+        overwrite: whether existing frames are written again.
         run: how the work is spread.
-        steps: is called after each frame.
-        exported: what exists after the export.
-        skipped: number of frames that existed already.
+        steps: called after each frame.
+        exported: the sequences in the output.
+        skipped: number of frames that existed before.
         failures: frames that could not be written.
     """
 
@@ -225,7 +225,7 @@ class _SequenceExport:
         self.exported.append(replace(exported, frames=tuple(f for f in exported.frames if f not in failures)))
 
     def _write_frames(self, exported: Exported, folder: Path) -> dict[int, str]:
-        """Write the frames of a sequence that do not exist yet, each in files of its own; return the messages of those that failed."""
+        """Write the missing frames of a sequence, each in its own files; return the messages of those that failed."""
         exporter, sequence = self.exporter, exported.sequence
         assert isinstance(exporter, FrameExporter)
         jobs = [
@@ -245,7 +245,7 @@ class _SequenceExport:
     def _write_file(self, exported: Exported, folder: Path) -> dict[int, str]:
         """Write the file of a sequence, unless it exists with all frames; return the messages of those that failed.
 
-        A file that lacks frames is made anew.
+        A file that lacks frames is written again.
         """
         exporter, sequence = self.exporter, exported.sequence
         assert isinstance(exporter, SequenceExporter)
@@ -279,7 +279,7 @@ class _SequenceExport:
         self.steps(frames)
 
     def _made(self, function: Callable[[ExportJob], Any], jobs: list[ExportJob]) -> Generator[Any, None, None]:
-        """Return the results of jobs; that of a frame that no worker could finish is a message, as of one that cannot be made."""
+        """Return the results of jobs: the arrays of a frame, or a message if the frame or its worker failed."""
         return run_all(function, jobs, self.run, lost=lambda job, message: message)
 
 
@@ -319,7 +319,7 @@ class ExportRecord:
     Args:
         root: folder of the other data set.
         name: name of the exporter.
-        product: what it writes.
+        product: the product.
     """
 
     def __init__(self, root: Path, name: str, product: str) -> None:
@@ -327,10 +327,10 @@ class ExportRecord:
         self._all = parse_json(self._path.read_bytes(), str(self._path)) if has_content(self._path) else {}
 
     def check(self, sequences: Mapping[str, storage.Sequence], settings: Mapping[str, Any]) -> None:
-        """Check that the places of sequences, which are paths in the folder, are new, or hold them, exported with the same settings.
+        """Check that the places of sequences in the folder are new, or hold the same sequences, exported with the same settings.
 
         Raises:
-            ConflictError: one holds something else.
+            ConflictError: a place holds something else.
         """
         known, wanted = self._all.get(self._name, {}).get(self._product, {}), _plain(settings)
         for place, sequence in sequences.items():

@@ -1,4 +1,4 @@
-"""How the sequences of a conversion are written: what the caller says of it, and what that means for the ids and the axes of a data set."""
+"""Options for the sequences of a conversion, and the ids and axes of a data set that follow from them."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ class LayoutOptions:
 
     Attributes:
         classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids; "auto"
-            keeps those of SemanticKITTI, whose programs know no others, and maps those of other data sets.
+            keeps those of SemanticKITTI, because its tools need them, and maps those of other data sets.
         axes: "left" mirrors y into CarlaSC's left-handed axes; "right" keeps the right-handed ones.
-        flow: "auto" gives points the velocity of their actor: from tracked boxes where the data set has them, else estimated from
-            the actor's points, if they are numbered; "none" writes no flow.
+        flow: "auto" gives points the velocity of their actor: from tracked boxes if the data set has them, otherwise estimated from
+            the points of numbered actors; "none" writes no flow.
         allow_unknown: treat class ids that the table does not have as unlabelled.
-        images: what becomes of the images of cameras: "copy" writes them beside the scans, "link" writes where they lie, "none" leaves them
-            out. The calibration of the cameras is written in any case.
+        images: images of cameras: "copy" copies them into the output, "link" writes their paths, "none" leaves them out. The calibration
+            of the cameras is always written.
 
     Raises:
-        ArgumentError: unknown axes, an unknown source of flow, or something else about images.
+        ArgumentError: an unknown value of `axes`, `flow` or `images`.
     """
 
     classes: str = "auto"
@@ -63,7 +63,7 @@ class LayoutOptions:
         if converter.to_carla is None:
             raise ArgumentError(
                 "classes",
-                expected=f"{converter.classes.name}, because nothing maps this table to CarlaSC's",
+                expected=f"{converter.classes.name}, because no map to CarlaSC's classes exists",
                 found="carla",
             )
         return AxesAndClasses(converter.classes, converter.to_carla, self.axes == "left", self.allow_unknown)
@@ -94,7 +94,7 @@ class AxesAndClasses:
         """Return the ids that are written for the ids that were read.
 
         Raises:
-            FormatError: an id is unknown; names it, and how often it occurs. `where` names the labels.
+            FormatError: an id is unknown; the message names it and its frequency. `where` names the labels.
         """
         ids = self.source.names if self.remap is None else self.remap.mapping
         lookup = _lookup_table(tuple(ids), tuple(ids if self.remap is None else self.remap.mapping.values()))

@@ -1,6 +1,6 @@
-"""The second stage of a conversion, in workers: what needs the motion of actors is added to the scans that the first stage wrote.
+"""The second stage of a conversion, in workers: fields that need the motion of actors are added to the scans of the first stage.
 
-Scans are read from where they were written, not from the data set again, if the store can read them.
+Scans are read from the output, not from the data set again, if the store can read them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from carlasc.core.scans import Scan
 from carlasc.motion import Segment, Track, ground_points, segment_by_boxes
 
 _FAR_M = 100.0  # objects farther away than this are not filled in
-_CELLS_M = (0.25, 0.5, 1.0)  # how near labelled points must be: the smallest cell that has any decides
+_CELLS_M = (0.25, 0.5, 1.0)  # cells around labelled points: the smallest cell with labelled points decides
 _GROUND_CELLS_M = (0.5, 1.0, 2.0)  # in the plane: on the ground, the rings of two scans may be metres apart
 _HALF = 1 << 14  # cells to each side of the origin
 
@@ -57,12 +57,12 @@ class MotionBlock(StageBlock[MotionJob]):
     flow: bool = True
 
     def make(self, job: MotionJob, frame: ConvertedFrame) -> Fields:
-        """Return what the motion of actors adds to a frame."""
+        """Return the fields that the motion of actors adds to a frame."""
         return _by_instances(job, self) if job.tracks is None else _by_boxes(job, self)
 
 
 def _read_back(job: MotionJob, block: MotionBlock, *names: str) -> Fields:
-    """Return fields of a frame as they were written, only those that exist; labels only if they are of the data set."""
+    """Return the existing fields of a frame as they were written; labels only if they are from the data set."""
     number, writer = job.handle.number, block.writer
     wanted = [name for name in names if job.labelled or name != "labels"]
     written = {name: writer.read(name, number) for name in wanted if writer.has(name, number)}
@@ -118,7 +118,7 @@ def _labels_of(
     classes: ClassTable,
     labelled: list[tuple[NDArray[np.float64], NDArray[np.unsignedinteger]]],
 ) -> NDArray[np.uint32]:
-    """Return the class of each point: that of the box that it is in, that of labelled points nearby, ground, or geometry without a class."""
+    """Return the class of each point: the class of its box, of labelled points nearby, ground, or geometry without a class."""
     labels = np.full(len(points), classes.geometry_id, np.uint32)
     ground = ground_points(points)
     if classes.ground_id is not None:
@@ -145,7 +145,7 @@ def _labelled_nearby(
 
 
 def _boxes_of(job: MotionJob, tracks: Sequence[Track]) -> Boxes:
-    """Return the annotated boxes of a frame, and those of tracks that extend to it although nobody annotated them there."""
+    """Return the annotated boxes of a frame, and boxes of tracks that extend to it without an annotation."""
     number = job.handle.number
     there = set() if job.boxes is None else set(job.boxes.tracks.tolist())
     scan_T_first = invert(job.first_T_scan)
@@ -170,10 +170,10 @@ def labels_nearby(
     labelled: Sequence[tuple[NDArray[np.floating], NDArray[np.unsignedinteger]]],
     classes: ClassTable,
 ) -> NDArray[np.uint32]:
-    """Return the class that most labelled points near each point have.
+    """Return the most frequent class of the labelled points near each point.
 
-    Points on the ground get classes of the ground, others get other classes. Classes of what can move are not taken over: it may have
-    moved since.
+    Points on the ground get classes of the ground, others get other classes. Classes of actors are not copied, because actors may have
+    moved in the meantime.
 
     Args:
         points: (N, 3) metres, in a frame whose z points up.

@@ -1,4 +1,4 @@
-"""What a conversion will do: the recordings that were asked for, where each goes, and its poses and times."""
+"""The plan of a conversion: the requested recordings, the output of each, and its poses and times."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ from carlasc.storage.metadata import Metadata
 from carlasc.storage.resuming import agree_metadata, agree_poses, agree_times, check_grid
 from carlasc.storage.sinks import SequenceWriter, Sink
 
-_AROUND_S = 1.0  # of the trajectory that a frame needs: longer than a sweep
+_AROUND_S = 1.0  # part of the trajectory that a frame needs: longer than a sweep
 
 
 @dataclass
 class RecordingPlan:
-    """One recording and where it is written.
+    """One recording and its output.
 
     Attributes:
-        recording: what is read.
-        writer: where it is written.
+        recording: the recording.
+        writer: the output.
         times: (F,) seconds by frame number, by the recording's clock.
         trajectory: poses of the vehicle by the same clock; None until they are estimated.
         poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
         pose_source: where poses come from.
-        boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in the frame of the scan; None
-            where the data set has no boxes.
+        boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in the frame of the scan; None if the
+            data set has no boxes.
         flow: whether flow is written.
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
-        notes: what users must know of the poses and times, one line each.
+        notes: notes for the user on poses and times, one line each.
         missing: numbers of the frames whose scan is not written yet.
-        unfinished: numbers of the frames that lack what the motion of actors says, or whose scan is missing.
+        unfinished: numbers of the frames without a scan, or without the fields from the motion of actors.
     """
 
     recording: Recording
@@ -85,14 +85,14 @@ class RecordingPlan:
 
     @property
     def added(self) -> tuple[str, ...]:
-        """Names of the fields that the motion of actors gives."""
+        """Names of the fields from the motion of actors."""
         flow = ("flow",) if self.flow else ()
         return flow if self.boxes is None else ("labels", "instances", "boxes", *flow)
 
     def motion(self, handle: FrameHandle) -> VehicleMotion | None:
         """Return the motion of the vehicle around a frame; None if it is not known when the frame is read.
 
-        Poses that are estimated on the way are not: they come from the scans. It makes no difference that an earlier run found them.
+        Poses that are estimated from the scans are not known then, even if an earlier run estimated them.
         """
         estimated = self.pose_source == KISS_ICP and not self.rig.needs_motion
         if estimated or self.trajectory is None or self.trajectory.seconds is None:
@@ -108,7 +108,7 @@ class RecordingPlan:
 def choose_recordings(
     recordings: list[Recording], source: Path, wanted: Collection[str] | None, split: SplitName
 ) -> list[Recording]:
-    """Return the recordings that were asked for, by the whole name or its last part, and of the wanted split.
+    """Return the requested recordings, by their names or last parts of names, and by split.
 
     Args:
         recordings: those that exist.
@@ -117,8 +117,8 @@ def choose_recordings(
         split: the split in lower case, or "all".
 
     Raises:
-        MissingDataError: a name does not exist, or no recording is left; lists those that exist.
-        ConflictError: two recordings have one name.
+        MissingDataError: a name does not exist, or no recording is left; the message lists those that exist.
+        ConflictError: two recordings have the same name.
     """
     by_name: dict[str, Recording] = {}
     for recording in recordings:
@@ -152,7 +152,7 @@ def choose_recordings(
 
 
 def sequence_path(recording: Recording) -> str:
-    """Return the path of the sequence that a recording becomes."""
+    """Return the path of the output sequence of a recording."""
     return f"{recording.split}/{recording.name}/cartesian"
 
 
@@ -166,21 +166,21 @@ def plan_recording(
     flow: bool,
     voxels: bool,
 ) -> RecordingPlan:
-    """Read a recording's poses, times and boxes, check them, and find out which frames are missing. Nothing is written.
+    """Read and check the poses, times and boxes of a recording, and find missing frames in the output. Nothing is written.
 
     Args:
         recording: the recording.
-        converter: what reads the data set.
-        sink: where it is written.
-        target: the axes and classes in which it is written.
+        converter: the converter.
+        sink: the output.
+        target: the axes and classes of the output.
         options: where poses come from.
-        flow: whether flow is written, if there is any.
+        flow: whether flow is written, if it is available.
         voxels: whether the recording's own voxel grids are written.
 
     Raises:
         FormatError: poses, times or boxes are not valid, or scans do not overlap under the poses.
-        MissingDataError: the recording has no poses or voxels, although they are asked for.
-        ConflictError: another grid exists where the voxels are written.
+        MissingDataError: the recording has no poses or voxels, although they were requested.
+        ConflictError: the output has another grid in the place of the voxels.
     """
     writer = sink.sequence(sequence_path(recording))
     own_times = recording.times()
@@ -189,9 +189,9 @@ def plan_recording(
     poses = None if trajectory is None else scan_poses(trajectory, recording, times)
     notes: list[str | None] = []
     if not recording.rays:
-        notes.append("nobody knows where points were seen from, so no grids are made from them")
+        notes.append("the positions of the sensor are not known, so no grids are made from scans")
     elif poses is None:
-        why = "as asked for" if options.source == KISS_ICP else "because the recording has none"
+        why = "as requested" if options.source == KISS_ICP else "because the recording has none"
         notes.append(f"poses were estimated from the scans with KISS-ICP, {why}")
     else:
         if not options.force and writer.read_document(layout.POSES) is None:
@@ -221,7 +221,7 @@ def plan_recording(
 
 
 def _finished(plan: RecordingPlan, number: int) -> bool:
-    """Return whether a frame whose scan is written has all that the motion of actors says."""
+    """Return whether a frame with a scan also has all fields from the motion of actors."""
     if plan.boxes is None and not plan.writer.has("instances", number):
         return True  # the frame has no numbers in the data set
     return all(plan.writer.has(name, number) for name in plan.added)
@@ -237,7 +237,7 @@ def _read_boxes(recording: Recording) -> dict[int, Boxes] | None:
     moved = not np.array_equal(scan_T_vehicle, np.eye(4))
     found = {}
     for number, own in boxes.items():
-        if number <= last:  # also of frames without a scan: they tell how an object moves
+        if number <= last:  # also of frames without a scan, because they show the motion of objects
             try:
                 found[number] = own.transform(scan_T_vehicle) if moved else own
             except FormatError as error:
@@ -246,11 +246,11 @@ def _read_boxes(recording: Recording) -> dict[int, Boxes] | None:
 
 
 def _check_voxels(recording: Recording, writer: SequenceWriter, target: AxesAndClasses) -> GridSpec:
-    """Return the geometry of a recording's own voxels, after checking that they may be written.
+    """Return the geometry of a recording's own voxels, after a check that they can be written.
 
     Raises:
         MissingDataError: the recording has no voxels.
-        ConflictError: another grid of that name exists there.
+        ConflictError: the output has another grid of that name.
     """
     if recording.voxels is None:
         raise MissingDataError(
@@ -266,28 +266,28 @@ def _check_voxels(recording: Recording, writer: SequenceWriter, target: AxesAndC
 
 
 def _announce(plan: RecordingPlan) -> None:
-    """Say what is going to be written, to a store that needs to know: the scans, and the room that they take."""
+    """Declare the scans and their sizes, for stores that need this before anything is written."""
     if plan.writer.block == 1:
         return
     frames, points = plan.recording.frames, list[int]()
     for handle in {frames[i].number: frames[i] for i in (0, len(frames) // 2, -1)}.values():
-        with suppress(CarlascError):  # reading the frame again raises the same error, and that one is reported
+        with suppress(CarlascError):  # the error is reported when the frame is read again
             points.append(sum(len(cloud.points) for cloud in handle.read()))
     plan.writer.expect({"points": [handle.number for handle in frames]}, {"points": max(points)} if points else None)
 
 
 def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> None:
-    """Write carlasc.json, times and the voxel grid's params.json, and take over the poses that an earlier run estimated.
+    """Write carlasc.json, times and the params.json of the voxel grid, and reuse poses that an earlier run estimated.
 
     A second estimate might differ in its last digits.
 
     Args:
-        plan: the recording and where it is written.
-        target: the axes and classes in which it is written.
-        metadata: what carlasc.json says of all recordings.
+        plan: the recording and its output.
+        target: the axes and classes of the output.
+        metadata: the entries of carlasc.json that all recordings share.
 
     Raises:
-        ConflictError: other poses, times or metadata exist there.
+        ConflictError: the output has other poses, times or metadata.
     """
     writer = plan.writer
     extra: dict[str, object] = {**metadata.extra, "poses": plan.pose_source, "sensors": _sensors(plan, target)}
@@ -323,7 +323,7 @@ def write_poses(plan: RecordingPlan, target: AxesAndClasses) -> None:
     """Write poses.txt.
 
     Raises:
-        ConflictError: other poses exist there.
+        ConflictError: the output has other poses.
     """
     assert plan.poses is not None
     poses = mirror_poses(plan.poses) if target.mirrored else plan.poses

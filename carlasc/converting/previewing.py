@@ -1,4 +1,4 @@
-"""What a conversion would read and do: found by reading one scan of each recording. Nothing is written."""
+"""A preview of a conversion, from one scan of each recording. Nothing is written."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from carlasc.converting.trajectory import FILE, KISS_ICP, frame_times, read_traj
 from carlasc.groundtruth.heights import find_ground
 from carlasc.motion.options import PoseOptions
 
-_LEAST_M = 0.3  # a ground that is nearer to the sensor is none
+_LEAST_M = 0.3  # ground must be at least this far below the sensor
 _UP = {"+z": (0, 1, 2), "-z": (0, 1, 2), "+y": (2, 0, 1), "-y": (2, 0, 1), "+x": (1, 2, 0), "-x": (1, 2, 0)}
 
 
@@ -28,20 +28,20 @@ class RecordingPreview:
     """A recording that a conversion would read.
 
     Attributes:
-        name: name of the sequence that it would become.
+        name: name of the sequence in the output.
         split: the split that it belongs to.
         location: where it is.
         frames: number of frames.
         rate_hz: frames per second; None if it has no times.
         sensors: names of its LiDARs.
-        fields: what its first scan has: fields of the layout.
+        fields: fields of its first scan, by their names in the layout.
         points: number of points of the first scan.
         lower: least x, y, z of these points, metres, right-handed, in the frame of the scan.
         upper: greatest x, y, z.
-        up: the direction away from the ground, "+z" if axes are as they must be; None if no ground is seen.
-        height_m: height of the first sensor above the ground, guessed from the first scan; None if no ground is seen.
+        up: the direction away from the ground, "+z" for correct axes; None if no ground was found.
+        height_m: height of the first sensor above the ground, estimated from the first scan; None if no ground was found.
         poses: "file", or "kiss-icp" if they would be estimated from the scans.
-        notes: what users must know, one line each.
+        notes: notes for the user, one line each.
     """
 
     name: str
@@ -77,12 +77,12 @@ def preview(
         sequences: names of sequences or the last parts of them; None for all.
         split: only sequences of this split.
         poses: where poses would come from.
-        options: what the converter takes beside the source, by name.
+        options: options of the converter, by name.
 
     Raises:
         ArgumentError: an argument has a wrong value, or no converter has that name.
         MissingDataError: the source, a sequence or the poses do not exist.
-        FormatError: a file does not hold what it must.
+        FormatError: a file does not have the format.
     """
     converter = open_converter(name, Path(source), options)
     recordings = choose_recordings(find_recordings(converter), Path(source), sequences, split)

@@ -5,9 +5,9 @@ Another distribution adds a converter by a class that inherits `Converter` and a
     [project.entry-points."carlasc.converters"]
     name = "package.module:Class"
 
-A converter gives everything as the other data set has it: in right-handed axes (x forward, y to the left, z up) and with its class ids.
-What a data set does not have is absent. Mirroring, remapping, poses from scans, deskewing, labels and flow from boxes, and grids are the
-same for all converters, and `carlasc.convert` does them.
+A converter returns the data of the other data set in right-handed axes (x forward, y to the left, z up), with its own class ids. Missing
+data are None or empty. `carlasc.convert` does the rest, in the same way for all converters: mirroring, remapping, poses from scans,
+deskewing, labels and flow from boxes, and grids.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Split = Literal["Train", "Val", "Test"]
 
 @dataclass(frozen=True)
 class Sensor:
-    """A LiDAR of a recording, and how its points are given.
+    """A LiDAR of a recording, and the frame and the state of its points.
 
     Attributes:
-        name: the data set's name of it.
+        name: its name in the data set.
         vehicle_T_sensor: (4, 4) float64 pose of the sensor in the frame of the vehicle.
         points_in: "sensor" if its points are given in its own frame, "vehicle" if in that of the vehicle.
-        deskewed: whether the points are where they would be if all were taken at the time of the frame. If not, clouds with `seconds`
-            are corrected by the motion of the vehicle.
+        deskewed: whether points are already corrected for the motion of the vehicle, to the time of the frame. If not, clouds with
+            `seconds` are corrected.
         height_m: height of the sensor above the ground; None if it is not known.
         calibrated: whether `vehicle_T_sensor` is known. If not, it is an assumption: the identity, or what `Recording.notes` says.
     """
@@ -79,8 +79,8 @@ class Cloud:
         instances: (N,) uint32 number of each point's actor, 0 for none. An actor has the same number in all frames of the
             recording, whether it moves or not, and in its boxes. None if the points have no instances.
         seconds: (N,) time of each point after the time of the frame; None if it is unknown.
-        origins: (N, 3) float32, where the ray of each point began, metres, in the frame of the points; None: at the sensor.
-        others: further fields of the layout with a row per point, by name; vectors right-handed, in the frame of the points.
+        origins: (N, 3) float32 origin of the ray of each point, metres, in the frame of the points; None: at the sensor.
+        others: other fields of the layout with a row per point, by name; vectors right-handed, in the frame of the points.
         sensor: index of the sensor in `Recording.sensors`.
     """
 
@@ -105,7 +105,7 @@ class VoxelContent:
     Attributes:
         labels: (X, Y, Z) class ids of the data set.
         known: (X, Y, Z) bool, voxels that take part in an evaluation.
-        files: the original files by name. They are kept beside the grid, so that an export gives them back.
+        files: the original files by name. They are kept beside the grid, so that an export can write them again.
     """
 
     labels: NDArray[np.unsignedinteger]
@@ -115,15 +115,15 @@ class VoxelContent:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the vehicle was.
+    """The poses of the vehicle over time.
 
     Attributes:
         world_T_vehicle: (K, 4, 4) float64, right-handed.
         seconds: (K,) time of each pose, increasing, by the clock of `Recording.times`; None if pose i is that of frame i.
-        where: what errors name: the file that the poses come from.
+        where: the file of the poses, for errors.
 
     Raises:
-        FormatError: shapes do not match, a pose is not rigid, times do not increase, or one is no number of seconds.
+        FormatError: shapes do not match, a pose is not rigid, times do not increase, or a time is not finite.
     """
 
     world_T_vehicle: NDArray[np.float64]
@@ -155,11 +155,11 @@ class Trajectory:
 
 
 class FrameHandle(ABC):
-    """One frame. It holds paths and numbers only, so that it can be pickled into a worker and read there.
+    """One frame. It holds only paths and numbers, so that a worker can unpickle and read it.
 
     Attributes:
-        number: the frame's number, from 0. Row `number` of times belongs to this frame, and of poses without times.
-        location: the name of the frame in error messages: the file of its points.
+        number: number of the frame, from 0: its row in the times, and in poses without times.
+        location: the file of its points, for errors.
         labelled: whether its points have labels, if the recording has labels at all.
     """
 
@@ -169,11 +169,11 @@ class FrameHandle(ABC):
 
     @abstractmethod
     def read(self) -> Sequence[Cloud]:
-        """Read what each sensor saw. A conversion reads a frame once.
+        """Read the points of each sensor. A conversion reads a frame once.
 
         Raises:
             MissingDataError: a file does not exist.
-            FormatError: a file does not hold what it must.
+            FormatError: a file does not have the format.
         """
 
     def read_voxels(self) -> VoxelContent | None:
@@ -184,20 +184,20 @@ class FrameHandle(ABC):
 class Recording(ABC):
     """One sequence of another data set.
 
-    The frame of its vehicle has x forward, y to the left and z up. In the layout, a scan has these axes too, and its origin is the first
+    The frame of its vehicle has x forward, y to the left and z up. A scan in the layout has the same axes, with its origin at the first
     sensor.
 
     Attributes:
         name: name of the sequence in the layout, such as "KITTI_00".
         split: the split that it belongs to.
-        location: its name in error messages.
+        location: its name in errors.
         frames: its frames, by increasing number.
         sensors: its LiDARs; the first is the origin of scans.
         has_labels: whether points of some frames have labels.
         has_instances: whether points of some frames have instances.
         voxels: geometry of its own voxel grids, right-handed, in the frame of scans; None if it has none.
-        rays: whether each point was seen from its sensor, so that there is free space between the two. A cloud whose sensor is not
-            known has no rays, and no grids are made from its scans.
+        rays: whether the position of the sensor is known for each point, so that the space between the two is free. Without rays, no
+            grids are made from the scans.
     """
 
     name: str
@@ -217,51 +217,51 @@ class Recording(ABC):
             force: continue without a calibration that the poses need.
 
         Raises:
-            FormatError: a file does not hold what it must.
-            MissingDataError: a file without which the poses cannot be used does not exist.
+            FormatError: a file does not have the format.
+            MissingDataError: a file that the poses need does not exist.
         """
         return None
 
     def times(self) -> NDArray[np.float64] | None:
-        """Return (F,) seconds by frame number; None if the recording has no times. Frames that do not exist may have any time."""
+        """Return (F,) seconds by frame number; None if the recording has no times. Missing frames may have any time."""
         return None
 
     def boxes(self) -> Mapping[int, Boxes] | None:
         """Return the tracked boxes of each annotated frame, by number, in the frame of the vehicle; None if the data set has none.
 
-        Labels are class ids of the data set. A frame without an entry was not annotated; an entry without boxes means that the
-        annotators saw nothing.
+        Labels are class ids of the data set. A frame without an entry was not annotated. A frame with an entry but no boxes was
+        annotated and contains no object.
 
         Raises:
-            FormatError: a file does not hold what it must.
+            FormatError: a file does not have the format.
         """
         return None
 
     def cameras(self) -> Sequence[CameraModel]:
-        """Return the cameras; none if the recording has none, or their calibration does not exist.
+        """Return the cameras; empty if the recording has none, or if their calibration does not exist.
 
-        Their `sensor_T_camera` leads to the frame of the vehicle. `times` are by the clock of `times()`, a row per frame number, and `images`
+        Their `sensor_T_camera` maps to the frame of the vehicle. `times` are by the clock of `times()`, a row per frame number, and `images`
         are paths.
 
         Raises:
-            FormatError: a file does not hold what it must.
+            FormatError: a file does not have the format.
         """
         return ()
 
     def image(self, camera: CameraModel, frame: int) -> tuple[str, bytes] | None:
-        """Return the image of one of the cameras: the ending of its file, "jpg" or "png", and its bytes; None if there is none.
+        """Return an image of a camera: the ending of its file, "jpg" or "png", and its bytes; None if it does not exist.
 
-        It is the file that `images` of the camera names, unless a recording keeps its images in another way.
+        By default, it is the file that `images` of the camera names.
         """
         path = Path(camera.images[frame] if camera.images else "")
         return (path.suffix[1:], path.read_bytes()) if path.suffix in (".jpg", ".png") and path.is_file() else None
 
     def problems(self) -> list[tuple[int, str]]:
-        """Return (frame number, message in one line) of frames that should exist and do not."""
+        """Return (frame number, message in one line) of each frame that is missing."""
         return []
 
     def notes(self) -> list[str]:
-        """Return what users must know of the recording, one line each, such as what is missing and what was assumed instead."""
+        """Return notes for the user, one line each, such as what is missing and what was assumed instead."""
         return []
 
     @cached_property
@@ -278,19 +278,19 @@ class Converter(ABC):
     Options are keyword parameters of the constructor, each with its type, its default and its help:
     `sweeps: Annotated[bool, "Read all scans, not only key frames."] = True`. `carlasc convert NAME --help` shows them.
 
-    All but `title` may be set in the constructor, where options decide them.
+    All attributes except `title` may be set in the constructor, if they depend on options.
 
     Attributes:
         source: folder of the data set, or of one of its sequences.
         title: what it reads, in a few words.
         classes: the data set's class table.
-        to_carla: maps its ids to CarlaSC's; None if nothing does, or if they are CarlaSC's: sequences keep their ids.
-        keeps_classes: whether sequences keep the data set's ids unless CarlaSC's are asked for.
+        to_carla: maps its ids to CarlaSC's; None if no map exists, or if they are CarlaSC's already. Sequences then keep their ids.
+        keeps_classes: whether sequences keep the data set's ids by default.
         sensor: the sensor that took the scans.
-        min_range_m: nearer points are left out of grids: they belong to the vehicle that carries the sensor.
-        max_range_m: farther points are left out of grids: they are too sparse to tell free space from occupied space.
-        license: licence of the data, such as "CC BY-NC-SA 4.0", which holds for what is made from them too; None if it is not known.
-        citation: what to cite for the data, in one line; None if it is not known.
+        min_range_m: nearer points are left out of grids, because they belong to the recording vehicle.
+        max_range_m: farther points are left out of grids, because they are too sparse.
+        license: licence of the data and of what is made from them, such as "CC BY-NC-SA 4.0"; None if it is not known.
+        citation: the publication to cite, in one line; None if it is not known.
         simulated: whether the data were recorded in a simulator.
     """
 
@@ -313,5 +313,5 @@ class Converter(ABC):
         """Return the recordings.
 
         Raises:
-            MissingDataError: none exists; says what was looked for.
+            MissingDataError: none exists; the message names the expected files.
         """

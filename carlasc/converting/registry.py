@@ -1,4 +1,4 @@
-"""The installed converters and exporters, which distributions declare in two entry-point groups, and the options that each of them takes.
+"""The installed converters and exporters, which distributions declare in two entry-point groups, and their options.
 
 An option of a converter or an exporter is a keyword parameter of its constructor, with its type, its default and its help text:
 
@@ -60,10 +60,10 @@ def load_exporter(name: str) -> type[Exporter]:
 
 
 def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
-    """Return the remaps to apply, in order, to convert ids of a table to CarlaSC's: those of carlasc, or that of an installed converter.
+    """Return the remaps that map ids of a table to CarlaSC's, in order: from carlasc, or from an installed converter.
 
     Returns:
-        The remaps; none for CarlaSC's own table. None if nothing maps the table.
+        The remaps; empty for CarlaSC's own table. None if no map exists.
     """
     try:
         return remaps_between(table, CARLA)
@@ -73,7 +73,7 @@ def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
         try:
             converter = load_converter(name)
         except DependencyError:
-            continue  # another distribution's, which is broken, but is not asked for
+            continue  # a broken converter of another distribution, which is not needed here
         if getattr(converter, "classes", None) == table and converter.to_carla is not None:
             return (converter.to_carla,)
     return None
@@ -85,10 +85,10 @@ def open_converter(name: str | type[Converter], source: Path, options: Mapping[s
     Args:
         name: the name of an installed converter, or a class that inherits `Converter`.
         source: folder of the data set.
-        options: what the converter takes beside the source, by name; text is read as the type of the option.
+        options: options of the converter, by name; text is parsed as the type of the option.
 
     Raises:
-        ArgumentError: no converter has that name, it has no such option, or the option cannot have that value.
+        ArgumentError: the converter or its option does not exist, or the option cannot have that value.
         DependencyError: it cannot be loaded.
     """
     kind = load_converter(name) if isinstance(name, str) else name
@@ -99,17 +99,19 @@ def find_recordings(converter: Converter) -> list[Recording]:
     """Return the recordings of a converter.
 
     Raises:
-        MissingDataError: it finds none; names the converters that find some in the same place.
-        FormatError: a file does not hold what it must.
+        MissingDataError: no recording exists; the message names other converters that find some there.
+        FormatError: a file does not have the format.
     """
     try:
         return converter.sequences()
     except MissingDataError as error:
         others = [name for name in converter_names() if _finds(name, type(converter), converter.source)]
         if others:
-            error.advice = f"this is what {' or '.join(f'`carlasc convert {name}`' for name in others)} reads"
+            error.advice = (
+                f"use {' or '.join(f'`carlasc convert {name}`' for name in others)}, which can read this folder"
+            )
         elif _is_in_layout(converter.source):
-            error.advice = "this has the layout of CarlaSC already: `carlasc regrid` makes its grids"
+            error.advice = "make grids with `carlasc regrid`, because this folder has CarlaSC's layout already"
         raise
 
 
@@ -125,7 +127,7 @@ def _finds(name: str, other_than: type[Converter], source: Path) -> bool:
     try:
         kind = load_converter(name)
         return kind is not other_than and any(recording.frames for recording in kind(source).sequences())
-    except Exception:  # noqa: BLE001 (another data set's: code of another distribution may fail in any way, and is not asked for)
+    except Exception:  # noqa: BLE001 (code of another distribution, which is not needed here, may fail in any way)
         return False
 
 
@@ -136,9 +138,9 @@ class OptionDeclaration:
     Attributes:
         name: its name, that of a parameter of the constructor.
         type: str, int, float or bool.
-        default: its value if it is not given.
-        help: what it does; empty if its author does not say.
-        choices: the values that it may have; empty if it may have any value of its type.
+        default: its default value.
+        help: what it does; empty if it has no help.
+        choices: the allowed values; empty if every value of its type is allowed.
     """
 
     name: str
@@ -170,11 +172,11 @@ class OptionDeclaration:
 
 
 def option_declarations(kind: type[Converter] | type[Exporter]) -> tuple[OptionDeclaration, ...]:
-    """Return the options that a converter or an exporter declares: the parameters of its constructor, but for the source.
+    """Return the options that a converter or an exporter declares: the parameters of its constructor, except the source.
 
     Raises:
-        DependencyError: annotations cannot be read, or a parameter has no default, or a type that is none of str, int, float, bool and
-            a Literal of texts.
+        DependencyError: annotations cannot be read, a parameter has no default, or its type is not str, int, float, bool or a Literal of
+            texts.
     """
     try:
         hints = get_type_hints(kind.__init__, include_extras=True)
@@ -196,7 +198,7 @@ def read_options(kind: type[Converter] | type[Exporter], options: Mapping[str, A
         options: values by the names of options; None for no options.
 
     Raises:
-        ArgumentError: there is no such option, or it cannot have that value.
+        ArgumentError: an option does not exist, or cannot have that value.
         DependencyError: a declaration is not valid.
     """
     options, known = options or {}, {declared.name: declared for declared in option_declarations(kind)}

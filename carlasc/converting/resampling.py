@@ -1,4 +1,4 @@
-"""Grids in another geometry, for data sets whose voxels and axes are given: resampling, and the frames of other data sets."""
+"""Grids in the geometry of other data sets: resampling, and the coordinate frames of other data sets."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from carlasc.storage.metadata import Axes
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
-_SNAP = 1e-6  # in voxels: a centre that lies on a face, but for rounding, belongs to the voxel above it
-_SAME = 1e-4  # relative difference of voxel sizes that are equal, but for the float32 bounds of the layout
+_SNAP = 1e-6  # in voxels: a centre that is on a face, up to rounding, belongs to the voxel above it
+_SAME = 1e-4  # relative difference of voxel sizes that are equal up to the float32 bounds of the layout
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class TargetFrame:
 
 
 def is_same(one: GridSpec, other: GridSpec) -> bool:
-    """Return whether two Cartesian grids have the same voxels, but for the rounding of bounds."""
+    """Return whether two Cartesian grids have the same voxels, up to the rounding of bounds."""
     near = [np.allclose(getattr(one, bound), getattr(other, bound), rtol=0, atol=_SAME) for bound in ("lower", "upper")]
     return one.size == other.size and all(near)
 
@@ -68,14 +68,14 @@ def resample_to(
 
     Along an axis on which the target is not finer, a voxel of the source belongs to the voxel of the target that contains its centre.
     Along an axis on which it is finer, a voxel of the target takes the voxel of the source that contains its own centre. Of the voxels of
-    the source that a voxel of the target gets so:
+    the source that belong to a voxel of the target:
 
-    - if any is occupied, it takes the class of most of the occupied ones, the lowest of several;
-    - otherwise, if any is known, it is free;
+    - if any is occupied, the voxel takes the most frequent class of the occupied ones (the lowest id of equally frequent ones);
+    - otherwise, if any is known, the voxel is free;
     - otherwise it is unknown.
 
-    Unlike `carlasc.groundtruth.resample`, which makes ground truth from finer ground truth, free voxels do not outvote occupied ones, so
-    that thin objects stay.
+    In `carlasc.groundtruth.resample`, which makes ground truth from finer ground truth, free voxels can outvote occupied ones. Here they
+    cannot, so that thin objects stay.
 
     Args:
         labels: (X, Y, Z) class ids of the source; 0 is free. Those of unknown voxels do not matter.
@@ -98,9 +98,7 @@ def resample_to(
     voxels, winners = most_frequent(np.ravel_multi_index(tuple(places), target.size), found)
     resampled[voxels] = winners.astype(labels.dtype)
     seen = known
-    for axis in sorted(
-        range(3), key=lambda axis: target.size[axis] / source.size[axis]
-    ):  # the array stays small for long
+    for axis in sorted(range(3), key=lambda axis: target.size[axis] / source.size[axis]):  # largest reduction first
         seen = _any_by_target(seen, pairs[axis], target.size[axis], axis)
     return resampled.reshape(target.size), seen
 
@@ -140,7 +138,7 @@ def _targets_of(
 def _any_by_target(
     values: NDArray[np.bool_], pair: tuple[NDArray[np.int64], NDArray[np.int64]], size: int, axis: int
 ) -> NDArray[np.bool_]:
-    """Return `values` with the cells of the target along an axis: each is true if any of the cells of the source that go to it is."""
+    """Return `values` with the cells of the target along an axis: each is true if any of its cells of the source is true."""
     values = np.moveaxis(values, axis, 0)
     result = np.zeros((size, *values.shape[1:]), np.bool_)
     cells, places = pair
@@ -153,7 +151,7 @@ def _any_by_target(
 
 
 def resampling_notes(source: GridSpec, target: GridSpec, name: str) -> list[str]:
-    """Return what is lost where a grid is expressed in the voxels of another one, in a line each; nothing if they are the same.
+    """Return what is lost if a grid is expressed in the voxels of another one, one line each; empty if the voxels are the same.
 
     Args:
         source: geometry of the grid, in the target's frame.

@@ -1,4 +1,4 @@
-"""What a conversion or an export returns, and what both need: the check of the place that is written to."""
+"""The results of conversions and exports, and the check of the output folder."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ConvertResult:
     Attributes:
         sequences: locations of the sequences that were written.
         made: number of frames that were converted.
-        skipped: number of frames that existed already.
+        skipped: number of frames that existed before.
         failures: frames that could not be converted, or whose grid could not be made.
         grids: locations of the grids that were made from scans.
         notes: remarks about the result, one line each.
@@ -70,10 +70,10 @@ class ExportResult:
 
 
 def check_outside(out: Path, source: str) -> None:
-    """Check that a folder to write to is not the source, and not inside it. A URL is never the same place.
+    """Check that a folder to write to is neither the source nor inside it. A URL is never the same place.
 
     Raises:
-        ConflictError: it is.
+        ConflictError: the folder is the source, or inside it.
     """
     if out.resolve().is_relative_to(Path(source).resolve()):
         raise ConflictError(

@@ -1,4 +1,4 @@
-"""`convert`: every recording of another data set becomes a sequence of the layout, and grids are made from what was written."""
+"""`convert`: writes each recording of another data set as a sequence of the layout, and makes grids from these sequences."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from carlasc.storage.sinks import Sink
 from carlasc.storage.transport.targets import LocalTarget, check_shared
 
 Grids = GridOptions | Literal["voxels"] | None
-_LOOKED_AT = 3  # sequences, and scans of each, from which it is found how many points a grid leaves out
-_MANY = 0.05  # of the points between the sides of a grid: worth a note if they lie above or below it
+_LOOKED_AT = 3  # number of sequences, and of scans of each, in which points outside of the grid are counted
+_MANY = 0.05  # share of the points between the sides of a grid: more points above it give a note
 
 
 def convert(
@@ -66,12 +66,12 @@ def convert(
         sequences: which ones, by their names or the last part of them ("00"); None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
         layout: how sequences are written: their classes, their axes, and whether they get flow.
-        poses: where poses come from, and whether poses are accepted under which the scans do not overlap, or whose calibration is missing.
+        poses: where poses come from, and whether poses are accepted if scans do not overlap under them, or if a calibration is missing.
         grids: the grids that are made from scans merged over time; "voxels" takes the data set's own voxels, with count 0 where they are
             unknown; None writes no grids.
-        options: what the converter takes beside the source, by name; text is read as the type of the option (see `option_declarations`).
-        run: how the work is spread. A part converts whole recordings, because poses and motion are found along each; grids then keep
-            their height, because the ground of the other recordings is not known.
+        options: options of the converter, by name; text is parsed as the type of the option (see `option_declarations`).
+        run: how the work is spread. A part converts whole recordings, because poses and motion are estimated along each of them. Grids
+            then keep their height, because the ground of the other recordings is not known.
 
     Returns:
         What was written, what was skipped, and what failed.
@@ -115,7 +115,7 @@ def convert(
                 conversion.run(metadata)
                 conversion.notes += write_cameras(conversion.plan, target, layout.images)
         if sink is not out:
-            sink.finish(incomplete=True)  # what is missing could not be read, and is reported
+            sink.finish(incomplete=True)  # missing frames could not be read, and are reported
         made = None
         if isinstance(grids, GridOptions):
             made = _make_grids(
@@ -139,7 +139,7 @@ def convert(
 
 
 class _ConvertedScans(Source):
-    """What some conversions wrote to a sink."""
+    """The sequences that some conversions wrote to a sink."""
 
     def __init__(self, sink: Sink, conversions: Series[Conversion]) -> None:
         self.location, self._source = sink.location, sink.source()
@@ -157,10 +157,10 @@ def _make_grids(
     poses: PoseOptions,
     run: Run,
 ) -> RegridResult | None:
-    """Make the grids of what conversions wrote to a sink; None if no scan was converted.
+    """Make grids of the converted sequences; None if no scan was converted.
 
-    All grids have the same bounds, so that one training set can hold them: those of the options, moved to where the ground is if that is
-    asked for.
+    All grids have the same bounds, so that they can be in one training set: the bounds of the options, moved to the height of the ground if
+    `follow_ground` is set.
     """
     conversions = [conversion for conversion in conversions if conversion.has_scans]
     if not conversions:
@@ -178,7 +178,7 @@ def _make_grids(
 
 
 def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec, list[str]]:
-    """Return the grid, moved to where the ground is, and what users must know of it. `where` is the place that is written to."""
+    """Return the grid, moved to the height of the ground, and notes for the user. `where` is the output."""
     fitted = fit_to_ground(spec, joined(grounds)) if grounds else spec
     if fitted == spec:
         return spec, []
@@ -186,14 +186,14 @@ def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec,
     heights = f"the sensor is {low} m" if low == high else f"the sensors are {low} to {high} m"
     return fitted, [
         f"{where}: {heights} above the ground, so grids reach from {fitted.lower[2]:g} to {fitted.upper[2]:g} m in z"
-        f" instead of {spec.lower[2]:g} to {spec.upper[2]:g}; bounds that are given are kept"
+        f" instead of {spec.lower[2]:g} to {spec.upper[2]:g} m; give --bounds to keep them"
     ]
 
 
 def _what_is_cut(spec: GridSpec, source: Source) -> list[str]:
-    """Return a note on how many points lie above the grid, if many do, from a few scans of a few sequences.
+    """Return a note on the points above the grid, if there are many, from a few scans of a few sequences.
 
-    What lies below it is noted where the ground is measured.
+    Points below the grid are noted where the ground is measured.
     """
     within = above = 0
     for sequence in list(source.values())[:_LOOKED_AT]:
@@ -206,12 +206,12 @@ def _what_is_cut(spec: GridSpec, source: Source) -> list[str]:
         return []
     return [
         f"{source.location}: {100 * above / within:.0f}% of the points between the sides of the grid are above it (z > {spec.upper[2]:g} m);"
-        " the scans keep them, and --bounds makes a higher grid"
+        " scans keep these points; give --bounds for a higher grid"
     ]
 
 
 def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
-    """Return the recordings of a part: those whose middle frame is among its share of all frames."""
+    """Return the recordings of a part: those with their middle frame in its share of all frames."""
     if part.count == 1:
         return list(recordings)
     ends = np.cumsum([len(recording.frames) for recording in recordings])
@@ -221,7 +221,7 @@ def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
 
 
 def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> None:
-    """Check what can be checked before a recording is looked for.
+    """Check the arguments, before recordings are searched for.
 
     Raises:
         ArgumentError: a value is not allowed, or does not fit the output.
@@ -249,7 +249,7 @@ def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> No
         if part.count > 1 and grids.follow_ground:
             raise ArgumentError(
                 "follow_ground",
-                expected="False, or `grids=None`, with `part`: the height of grids is found from the ground of all recordings",
+                expected="False, or `grids=None`, because a part does not know the ground of all recordings",
                 found="True",
             )
     if not source.exists():
@@ -263,5 +263,5 @@ def _check_rays(recordings: Series[Recording]) -> None:
                 "grids",
                 expected="voxels or none",
                 found=f"scans for {recording.location}",
-                advice="nobody knows where its points were seen from, so free space cannot be told from unknown space",
+                advice="choose voxels or none: its points have no sensor positions, so free space cannot be distinguished from unknown space",
             )

@@ -1,4 +1,4 @@
-"""The first stage of a conversion, in workers: each frame is read once, and its scan is written. And what both stages share."""
+"""The first stage of a conversion, in workers: each frame is read once, and its scan is written. Also code that both stages share."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from carlasc.storage import layout
 from carlasc.storage.sinks import SequenceWriter
 
 VOXEL_FILES = "voxels_kitti"
-"""Folder of a sequence that keeps the other data set's own voxel files unchanged, so that an export gives them back."""
+"""Folder of a sequence with the unchanged voxel files of the other data set, so that an export can write them again."""
 
 Fields = Mapping[str, NDArray[Any]]
 """Arrays of a frame by the names of their fields, in the order in which they are written."""
 
 Item = TypeVar("Item")
-_FRAMES = 8  # of a task where each has files of its own, because a task costs more than a frame
+_FRAMES = 8  # frames per task if each has its own files, because a task costs more than a frame
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class FrameJob:
 
     Attributes:
         handle: the frame.
-        motion: the motion of the vehicle around it, if that is known.
+        motion: the motion of the vehicle around it, if known.
     """
 
     handle: FrameHandle
@@ -47,14 +47,14 @@ class FrameJob:
 
 @dataclass
 class ConvertedFrame:
-    """What a stage did with one frame: its fields were written, or must still be, or it failed.
+    """The result of a stage for one frame: its fields were written, or are still to be written, or it failed.
 
     Attributes:
         number: frame number.
         fields: its fields, until they are written.
         failure: error message, if it failed.
-        points: (N, 3) float32 that poses are estimated from, right-handed, if they are asked for.
-        actors: its numbered actors, if they are asked for.
+        points: (N, 3) float32 points to estimate poses from, right-handed, if they were requested.
+        actors: its numbered actors, if they were requested.
         unnumbered: number of its moving points that belong to no numbered actor.
     """
 
@@ -75,8 +75,8 @@ class StageBlock(ABC, Generic[Job]):
 
     Attributes:
         jobs: the frames.
-        target: how they are written.
-        writer: where they are written.
+        target: the axes and classes of the output.
+        writer: the output.
         rig: the sensors.
     """
 
@@ -87,13 +87,13 @@ class StageBlock(ABC, Generic[Job]):
 
     @abstractmethod
     def make(self, job: Job, frame: ConvertedFrame) -> Fields:
-        """Return the fields of a frame that are to be written, and note what else was asked for in the frame."""
+        """Return the fields of a frame to write, and add other requested data to the result."""
 
     def convert(self) -> list[ConvertedFrame]:
         """Convert the frames, and write them if the writer can be used in workers. A frame that cannot be read has failed.
 
         Raises:
-            StorageError: nothing can be written, so every other frame would fail in the same way.
+            StorageError: the output cannot be written, so that all other frames would fail, too.
         """
         frames = [ConvertedFrame(job.handle.number) for job in self.jobs]
         for job, frame in zip(self.jobs, frames, strict=True):
@@ -108,12 +108,12 @@ class StageBlock(ABC, Generic[Job]):
         return frames
 
     def fail(self, message: str) -> list[ConvertedFrame]:
-        """Return the frames of a block that no worker could finish."""
+        """Return the frames of a block whose worker failed."""
         return [ConvertedFrame(job.handle.number, failure=message) for job in self.jobs]
 
 
 def write_frames(writer: SequenceWriter, frames: Iterable[ConvertedFrame]) -> None:
-    """Write the fields of some frames, those of a frame in their order, and forget them."""
+    """Write the fields of some frames, in the order of each frame, and drop them from memory."""
     frames = list(frames)
     if fields := {frame.number: frame.fields for frame in frames if frame.fields}:
         writer.write_frames(fields)
@@ -124,7 +124,7 @@ def write_frames(writer: SequenceWriter, frames: Iterable[ConvertedFrame]) -> No
 def in_blocks(
     items: Sequence[Item], number_of: Callable[[Item], int], writer: SequenceWriter
 ) -> Iterator[Sequence[Item]]:
-    """Yield frames in the blocks that a worker does in one task: those that are stored together, or else a few in a row.
+    """Yield frames in blocks, one per task: frames that are stored together, otherwise a few successive ones.
 
     Args:
         items: the frames, by increasing number.
@@ -139,7 +139,7 @@ def in_blocks(
 
 @dataclass(frozen=True)
 class ScanJob(FrameJob):
-    """A frame to read; `write` says whether its scan is to be written: False where it exists already."""
+    """A frame to read; `write` is False if its scan exists already."""
 
     write: bool = True
 
@@ -210,7 +210,7 @@ def _voxel_fields(
     if voxels is None:
         return {}
     labels = target.map_labels(voxels.labels, f"voxels of {handle.location}")
-    known = voxels.known & ~((labels == 0) & (voxels.labels > 0))  # occupied, but of a class that has no target
+    known = voxels.known & ~((labels == 0) & (voxels.labels > 0))  # occupied, but its class has no target
     labels[~known] = 0
     for name, data in voxels.files.items():
         writer.write_document(f"{VOXEL_FILES}/{name}", data)

@@ -1,4 +1,4 @@
-"""The stages of the conversion of one recording: its scans are read once and written, then what the motion of actors says is added."""
+"""The stages of the conversion of one recording: its scans are read once and written, then labels, boxes and flow from the motion of actors are added."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class Conversion:
         converter: what reads the data set.
         target: how frames are written.
         run_options: how the work is spread.
-        steps: is called after each frame of each stage.
+        steps: called after each frame of each stage.
         failures: frames that failed.
         notes: remarks about the result, one line each.
-        ground: the ground in some of its scans; None if there is none, or it cannot be read back.
+        ground: the ground in some of its scans; None if none was found, or scans cannot be read back.
     """
 
     plan: RecordingPlan
@@ -60,10 +60,10 @@ class Conversion:
     _unnumbered: int = 0
 
     def run(self, metadata: Metadata) -> None:
-        """Convert the recording, or what an earlier run left to do."""
+        """Convert the recording, or the frames that an earlier run did not convert."""
         plan = self.plan
         begin(plan, self.target, metadata)
-        if plan.poses is None and plan.rig.needs_motion:  # scans are corrected by the poses: each is then read twice
+        if plan.poses is None and plan.rig.needs_motion:  # the poses correct the scans: each scan is read twice
             self.steps.expect(len(plan.recording.frames))
             plan.take_estimate(estimate_poses(plan.recording, self.converter, plan.times, self.steps, self.run_options))
             write_poses(plan, self.target)
@@ -88,7 +88,7 @@ class Conversion:
     def _read_scans(self) -> Mapping[int, Mapping[int, Velocity]]:
         """Read each frame once, and write its scan; return the velocities of numbered actors by frame.
 
-        Poses are estimated on the way if there are none, and actors are followed if their motion is to be estimated.
+        Missing poses are estimated meanwhile, and actors are tracked if their motion must be estimated.
         """
         plan = self.plan
         follow = plan.flow and plan.boxes is None and bool(plan.unfinished)
@@ -112,12 +112,12 @@ class Conversion:
             if follow:
                 actors.add(result.number, float(plan.times[result.number]), pose, result.actors)
                 self._unnumbered += result.unnumbered
-        if estimate and len(self._failed) < len(plan.recording.frames):  # where every frame failed, that is reported
+        if estimate and len(self._failed) < len(plan.recording.frames):  # otherwise, the failures are reported
             plan.take_estimate(fill_gaps(list(found), np.array(list(found.values())), plan.recording))
         return actors.finish()
 
     def _placed(self, results: Iterator[ConvertedFrame]) -> Iterator[tuple[ConvertedFrame, NDArray[np.float64]]]:
-        """Yield the frames that were read with their poses, which are estimated on the way if they are not known."""
+        """Yield the frames that were read with their poses, which are estimated if they are not known."""
         usable = (result for result in results if result.failure is None)
         if self.plan.poses is not None:
             for result in usable:
@@ -139,11 +139,11 @@ class Conversion:
             yield waiting.popleft(), pose
 
     def _work(self, blocks: Sequence[StageBlock[Any]]) -> Iterator[ConvertedFrame]:
-        """Yield the frames of blocks after they were converted; what workers cannot write is written here."""
+        """Yield the frames of blocks after their conversion; if workers cannot write them, they are written here."""
         run = partial(run_all, StageBlock.convert, run=self.run_options)
 
         def one_by_one(block: StageBlock[Any], message: str) -> list[ConvertedFrame]:
-            """Work on the frames of a lost block again, each alone: one of them may have killed the workers."""
+            """Convert the frames of a lost block again, one by one, because one of them may have killed the workers."""
             if len(block.jobs) == 1 or self.plan.writer.block > 1:
                 return block.fail(message)
             singles = [replace(block, jobs=(job,)) for job in block.jobs]
@@ -160,7 +160,7 @@ class Conversion:
                 self.steps(len(frames))
 
     def _finish(self, velocities: Mapping[int, Mapping[int, Velocity]]) -> None:
-        """Add labels, instances, boxes and flow, as far as the motion of actors gives them."""
+        """Add labels, instances, boxes and flow from the motion of actors."""
         plan = self.plan
         wanted = [
             handle
@@ -191,7 +191,7 @@ class Conversion:
         deque(self._work(blocks), maxlen=0)  # frames are written; nothing is kept
 
     def _labelled_around(self, handle: FrameHandle) -> tuple[MotionJob, ...]:
-        """Return the labelled frames before and after one that has no labels although others have."""
+        """Return the labelled frames before and after an unlabelled frame of a recording with labels."""
         plan = self.plan
         if handle.labelled or not plan.recording.has_labels or plan.poses is None:
             return ()
@@ -238,7 +238,7 @@ class Conversion:
         notes = [*plan.recording.notes(), *plan.notes]
         if plan.boxes is not None and not plan.recording.has_labels:
             notes.append(
-                "points have no labels: those in boxes got the class of the box, others are ground or of no class"
+                "points have no labels: points in boxes got the class of the box, others are ground or have no class"
             )
         elif plan.boxes is not None and not all(handle.labelled for handle in plan.recording.frames):
             unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
@@ -258,7 +258,7 @@ class Conversion:
 
 
 def _near(tracks: list[Track], handles: Sequence[FrameHandle], poses: NDArray[np.float64]) -> tuple[Track, ...]:
-    """Return the tracks that come near the sensor in some frames, cut to these frames: few enough to be sent to a worker."""
+    """Return the tracks near the sensor in some frames, cut to these frames, so that little is sent to a worker."""
     here = poses[handles[0].number, :2, 3]
     near = []
     for track in tracks:

@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
 _ACCEPT = "accept them as they are with `force=True`"
-_SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # fourth differences: what no vehicle does at the rate of scans
+_SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # fourth differences, which are nearly 0 for a vehicle
 _JITTER_M = 0.05
 
 
 def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return (F,) seconds by frame number, by the recording's own clock, from the times that it gives; 10 Hz from 0 if it gives none.
+    """Return (F,) seconds by frame number, by the clock of the recording; without times, 10 Hz from 0.
 
     Raises:
-        FormatError: a frame has no time, or a time is no number of seconds.
+        FormatError: a frame has no time, or a time is not finite.
     """
     frames = recording.frames[-1].number + 1
     if times is None:
@@ -53,9 +53,9 @@ def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDAr
 
 
 def read_trajectory(recording: Recording, times: NDArray[np.float64], options: PoseOptions) -> Trajectory | None:
-    """Return the poses of the vehicle at their own times, from the recording's files; None if they are to be estimated.
+    """Return the poses of the vehicle at their own times, from the recording's files; None if they must be estimated.
 
-    Poses without times of their own are those of the frames.
+    Poses without times belong to the frames, one by one.
 
     Args:
         recording: the recording.
@@ -63,8 +63,8 @@ def read_trajectory(recording: Recording, times: NDArray[np.float64], options: P
         options: where poses come from.
 
     Raises:
-        MissingDataError: the file of poses does not exist, and they are not to be estimated.
-        FormatError: a frame has no pose, or there is one pose for all of them.
+        MissingDataError: the file of poses does not exist, and poses must not be estimated.
+        FormatError: a frame has no pose, or all frames share one pose.
     """
     trajectory = None if options.source == KISS_ICP else recording.poses(force=options.force)
     if trajectory is None:
@@ -94,18 +94,18 @@ def read_trajectory(recording: Recording, times: NDArray[np.float64], options: P
 
 
 def at_frames(world_T_vehicle: NDArray[np.float64], times: NDArray[np.float64]) -> Trajectory:
-    """Return the trajectory of (F, 4, 4) poses of frames. Where times do not increase, frames are taken to be 0.1 s apart."""
+    """Return the trajectory of (F, 4, 4) poses of frames. If times do not increase, 0.1 s between frames is assumed."""
     if not (np.diff(times) > 0).all():
         times = np.arange(len(times), dtype=np.float64) * layout.FRAME_PERIOD_S
     return Trajectory(world_T_vehicle, times)
 
 
 def scan_poses(trajectory: Trajectory, recording: Recording, times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F, 4, 4) first_T_scan by frame number. Poses of the frames are taken as they are, others are interpolated.
+    """Return (F, 4, 4) first_T_scan by frame number. Poses with the times of frames are not changed, others are interpolated.
 
     Args:
         trajectory: poses of the vehicle, with times.
-        recording: says where the scan is on the vehicle.
+        recording: the recording, for the pose of the scan on the vehicle.
         times: (F,) seconds by frame number, by the same clock.
     """
     given = trajectory.world_T_vehicle
@@ -115,7 +115,7 @@ def scan_poses(trajectory: Trajectory, recording: Recording, times: NDArray[np.f
 
 
 def jitter(poses: NDArray[np.float64]) -> float:
-    """Return by how many metres (F, 4, 4) poses of frames jump about a smooth path: the noise of a receiver without a filter, for instance."""
+    """Return the noise of (F, 4, 4) poses of frames about a smooth path, metres: such as that of an unfiltered receiver."""
     places = poses[:, :3, 3]
     if len(places) < 2 * len(_SMOOTH):
         return 0.0
@@ -132,7 +132,7 @@ def jitter_note(poses: NDArray[np.float64]) -> str | None:
 
 @dataclass(frozen=True)
 class _ReadUsable:
-    """Reads what odometry uses of a scan, in a worker, while poses of the scans before it are estimated."""
+    """Reads the points of a scan for odometry, in a worker, while poses of earlier scans are estimated."""
 
     rig: Rig
 
@@ -157,9 +157,9 @@ def estimate_poses(
 
     Args:
         recording: its scans.
-        converter: says which points belong to the vehicle, and which are too far away.
+        converter: the converter, for the range of points to use.
         times: (F,) seconds by frame number.
-        step: is called for each frame.
+        step: called for each frame.
         run: how the reading of scans is spread.
 
     Returns:
@@ -216,6 +216,7 @@ def fill_gaps(frames: list[int], poses: NDArray[np.float64], recording: Recordin
             recording.location,
             expected="scans to estimate poses from",
             found="none that can be read and has enough points",
+            advice="copy the scans again",
         )
     lines = np.searchsorted(frames, np.arange(recording.frames[-1].number + 1), side="right") - 1
     return poses[np.clip(lines, 0, None)]
@@ -228,11 +229,11 @@ def check_poses(recording: Recording, converter: Converter, poses: NDArray[np.fl
 
     Args:
         recording: its scans.
-        converter: says which classes do not move.
+        converter: the converter, for the classes that do not move.
         poses: (F, 4, 4) first_T_scan by frame number.
 
     Raises:
-        FormatError: they do not; says which mistake the poses look like, and what to do.
+        FormatError: scans do not overlap; the message names the likely mistake, and what to do.
     """
     rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
 
@@ -240,7 +241,7 @@ def check_poses(recording: Recording, converter: Converter, poses: NDArray[np.fl
         try:
             scan = read_scan(recording.frames[index], rig, None)
         except (CarlascError, OSError):
-            return np.empty((0, 3))  # its conversion reports it
+            return np.empty((0, 3))  # the conversion of the frame reports the error
         return structure_of(scan.points[:, :3], scan.labels, None, converter.classes)
 
     diagnosis = diagnose_poses(structure, poses[[handle.number for handle in recording.frames]])
@@ -249,7 +250,7 @@ def check_poses(recording: Recording, converter: Converter, poses: NDArray[np.fl
         raise FormatError(
             recording.location,
             expected=expected,
-            found=f"{diagnosis.share_there:.0%} of a scan's structure on that of an earlier scan; they look like"
+            found=f"{diagnosis.share_there:.0%} of a scan's structure overlaps that of an earlier scan; the likely cause is"
             f" {diagnosis.correction.name} (with that corrected: {diagnosis.corrected_share:.0%})",
             advice=f"{diagnosis.correction.advice}, or {_ACCEPT}",
         )

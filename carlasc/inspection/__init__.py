@@ -1,4 +1,4 @@
-"""Reading data: what exists (`info`), how much of each class (`stats`), whether it is sound (`validate`, `audit`, `holdout`), how it was made (`report`), and all of that to publish (`card`); and what is installed (`doctor`)."""
+"""Inspecting data: contents (`info`), counts of classes (`stats`), checks (`validate`, `audit`, `holdout`), reports of grids (`report`), cards for publication (`card`), and the installation (`doctor`)."""
 
 import lazy_loader
 

@@ -1,8 +1,8 @@
-"""The agreement of scans with a grid: how many points lie in voxels of their class, which known mistake explains a low share, and how much of the ground lies below the grid.
+"""The agreement of scans with a grid: the share of points in voxels of their class, the known mistake that explains a low share, and the share of the ground below the grid.
 
-The share of labelled points that fall in voxels of their class is measured for the data as they are, for points whose axes are changed in
-the ways that are common mistakes, and for the grid shifted by one cell in each direction. Only points in known voxels count, so that a grid
-with unknown voxels is not rated lower than a full one.
+The share of labelled points in voxels of their class is measured for the data as they are, for points with axes that are changed by a
+common mistake, and for the grid shifted by one voxel in each direction. Only points in known voxels count, so that unknown voxels do not
+lower the share.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class Voxels:
     def count(
         self, points: NDArray[np.floating], labels: NDArray[np.integer], shifts: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Count points by what their voxels hold, in grids whose labels are `shifts` cells too far along the axes.
+        """Count points by the labels of their voxels, in grids whose labels are `shifts` cells too far along the axes.
 
-        The azimuth of a full turn is periodic. A point whose voxel is outside a shifted grid counts as it does in the grid as it is, and
-        a point outside that one does not count.
+        The azimuth of a full turn is periodic. A point outside of a shifted grid counts as in the grid without a shift. A point outside
+        of the grid without a shift does not count.
 
         Args:
             points: (N, 3) metres.
@@ -77,7 +77,7 @@ def _count(
     known: NDArray[np.bool_],
     counted: NDArray[np.int64],
 ) -> None:
-    """Add points to `counted`. They are given on the axes of the grid, and their cells are those of `GridSpec.index`."""
+    """Add points to `counted`. They have the axes of the grid, and their cells are computed as in `GridSpec.index`."""
     depth, width, height = size
     for point in range(len(axes)):
         first, second, third = axes[point, 0], axes[point, 1], axes[point, 2]
@@ -99,15 +99,15 @@ def _count(
                 counted[s, 2] += voxels[voxel] != 0
 
 
-# Of the ground points within a grid's other bounds. It is 0.0 % on the simulated drives, on flat ground, and 2.6 % on average (6.6 % in one
-# frame) on a real drive whose road falls off, both with the published bounds; 48 % on one with a sensor 0.2 m too high for them.
+# Share of the ground points within the other bounds of a grid. With the published bounds, it is 0.0 % on the simulated drives with flat ground,
+# 2.6 % on average (6.6 % in one frame) on a real drive with a sloping road, and 48 % on a drive whose sensor is 0.2 m too high for these bounds.
 _SHARE = 0.1
-_LOWEST = 0.02  # this share of the ground may be below the bound that is advised
+_LOWEST = 0.02  # share of the ground that may be below the advised bound
 
 
 @dataclass
 class GroundBelow:
-    """Counts, frame by frame, the ground points below a grid.
+    """Counts the ground points below a grid, frame by frame.
 
     Attributes:
         spec: geometry of the grid.
@@ -130,7 +130,7 @@ class GroundBelow:
         return float(np.mean(shares)) if shares else math.nan
 
     def findings(self, sequence: Sequence, grid: str) -> Iterator[Finding]:
-        """Yield a warning if a considerable share of the ground is below the grid; the bounds that it advises have the same height."""
+        """Yield a warning if much of the ground is below the grid. The advised bounds have the same height."""
         if not self.share > _SHARE:
             return
         z0, z1 = self.spec.lower[2], self.spec.upper[2]
@@ -139,24 +139,24 @@ class GroundBelow:
         if self.spec.coordinates == "cylindrical":
             bounds[2:] = np.degrees(bounds[2:]).tolist()
         text = ",".join(f"{value:.6g}" for value in (*bounds, lowest, lowest + z1 - z0))
-        found = f"{self.share:.0%} of the points on the ground below it, which are in no voxel"
+        found = f"{self.share:.0%} of the points on the ground below it, in no voxel"
         advice = f"make the grid again with lower bounds: `carlasc regrid --bounds={text}`"
-        expected = f"the ground above the lower bound of the grid, z = {z0:g} m"
+        expected = f"ground points above the lower bound of the grid, z = {z0:g} m"
         where = f"{sequence.location}/{grid}"
         yield Finding("warning", "ground-below-grid", sequence.path, where, expected, found, advice)
 
 
 _MIN_POINTS = 100
 _MAX_POINTS = 20_000
-# A mistake is reported if undoing it raises the share of right points by _GAIN and by more than chance could, and either reduces
-# the wrong points by the factor _FEWER_WRONG or raises the share by _LARGE_GAIN; and if it does so on the share _WINS of the frames.
+# A mistake is reported if correcting it raises the share of right points by _GAIN and by more than chance could, and either reduces
+# the wrong points by the factor _FEWER_WRONG or raises the share by _LARGE_GAIN, in at least the share _WINS of the frames.
 _GAIN = 0.01
 _FEWER_WRONG = 1.15
 _LARGE_GAIN = 0.05
 _WINS = 0.75
-_TIE = 0.005  # of two mistakes whose shares differ by less, the first is reported
+_TIE = 0.005  # if the shares of two mistakes differ by less, the first one is reported
 
-_AXES: tuple[tuple[str, NDArray[np.float64]], ...] = (  # description of the mistake, and the matrix that undoes it
+_AXES: tuple[tuple[str, NDArray[np.float64]], ...] = (  # description of the mistake, and the matrix that corrects it
     ("points with y mirrored against the grid", np.diag([1.0, -1, 1])),
     ("points with x mirrored against the grid", np.diag([-1.0, 1, 1])),
     ("points turned by half a turn against the grid", np.diag([-1.0, -1, 1])),
@@ -181,10 +181,10 @@ class GridDiagnosis:
 
     Attributes:
         share: mean share of the points in known voxels whose voxel has their class; NaN if no frame had enough points.
-        occupied_share: the same share, where a voxel of any class but free is right.
+        occupied_share: the same share, if every class but free is taken as right.
         frames: number of frames with enough points.
         mistake: description of the mistake that explains the share; None if the data fit best as they are.
-        corrected_share: the share with the mistake undone.
+        corrected_share: the share after the mistake is corrected.
     """
 
     share: float
@@ -196,7 +196,7 @@ class GridDiagnosis:
 
 @dataclass
 class GridEvidence:
-    """Measures, frame by frame, the agreement of scans with a grid: as they are, and with each known mistake undone."""
+    """Measures the agreement of scans with a grid frame by frame: as they are, and with each known mistake corrected."""
 
     spec: GridSpec
     # per frame, (1 + mistakes,) number of points in voxels of their class, and in known voxels; first for the data as they are
@@ -212,7 +212,7 @@ class GridEvidence:
             labels: (N,) class ids; points with id 0 are unlabelled and left out. None compares with any class but free.
             grid: the grid of this frame, with geometry `spec`.
         """
-        if labels is None:  # a voxel of any class but free is right
+        if labels is None:  # any class but free is right
             labels, chosen, right = np.zeros(len(points), np.uint8), np.arange(len(points)), OCCUPIED
         else:
             chosen, right = np.flatnonzero(labels), RIGHT
@@ -231,8 +231,8 @@ class GridEvidence:
     def diagnose(self) -> GridDiagnosis:
         """Return the share of right points over the frames added so far, and the mistake, if any, that explains it.
 
-        The data as they are and with each mistake undone are compared by the number of right points, divided by the largest number of points
-        in known voxels that any of them has: one that moves most points out of the grid does not win by the few that stay.
+        The data as they are, and with each mistake corrected, are compared by the number of right points, divided by the largest number of
+        points in known voxels among them. A correction that moves most points out of the grid is therefore not chosen for the few that stay.
         """
         if not self._right:
             return GridDiagnosis(float("nan"), float("nan"), 0)
@@ -256,7 +256,7 @@ class GridEvidence:
 
 
 def _mistake(column: int, spec: GridSpec) -> str:
-    """Return the description of a mistake by its place among all of them; 0 is none."""
+    """Return the description of the mistake that a column corrects; column 0 corrects none."""
     if column <= len(_AXES):
         return _AXES[column - 1][0]
     shift = _SHIFTS[column - 1 - len(_AXES)]
@@ -268,11 +268,14 @@ def _mistake(column: int, spec: GridSpec) -> str:
 
 
 def check_actors(sequence: Sequence, grid: str, actors: Series[ActorTrack]) -> Iterator[Finding]:
-    """Yield how many actors of a grid's report the data do not name: a warning if many of them are doubtful."""
+    """Yield how many actors of a grid's report were found by free space alone: a warning if many of them are doubtful."""
     found = [actor for actor in actors if actor.confidence < 1]
     if found:
         doubtful = sum(is_doubtful(actor.confidence) for actor in found)
         severity: Severity = "warning" if doubtful > max(_DOUBTFUL_ACTORS * len(found), 2) else "note"
-        what = f"{len(found)} actors that free space shows, {doubtful} of them doubtful"
-        expected, advice = "actors that surely move", "look at the actors in the report, or give labels, boxes or flow"
+        what = f"{len(found)} actors found by free space, {doubtful} of them doubtful"
+        expected, advice = (
+            "actors that move with certainty",
+            "check the actors in the report, or give labels, boxes or flow",
+        )
         yield Finding(severity, "actors", sequence.path, f"{sequence.location}/{grid}", expected, what, advice)

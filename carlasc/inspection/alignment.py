@@ -1,9 +1,9 @@
 """The agreement of poses with scans: how well scans overlap under the poses, and which known mistake explains a poor overlap.
 
-The structure of a scan, moved by the poses, must fall on the structure of an earlier scan. The share of its points that do is measured for
-the poses as they are, and for the poses with each known mistake undone. The mistake that, undone, gives the highest mean over all pairs of
-scans is reported, if it raises the share by more than chance could, and on most of the pairs on which it makes a difference at all: on a
-straight road, for instance, a mirrored y axis makes none.
+The structure of a scan, moved by the poses, must overlap the structure of an earlier scan. The share of its points that do is measured for
+the poses as they are, and for the poses with each known mistake corrected. The correction with the highest mean over all pairs of scans is
+reported, if it raises the share by more than chance could, and on most of the pairs that it changes: a mirrored y axis, for instance,
+changes nothing on a straight road.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from carlasc.inspection.structure import VOXEL_M, occupancy, overlap
 
 Poses: TypeAlias = NDArray[np.float64]
 
-_LEVER_M = 15.0  # motions are compared by what they do to a point at this distance
+_LEVER_M = 15.0  # motions are compared by how they move a point at this distance
 _DIFFERENT_M = 0.3
 _MIN_POINTS = 150
 _MAX_POINTS = 6000
 _OFFSET_POINTS = 1500
 _OFFSET_PAIRS = 12
-_OFFSET_SHARE = 0.3  # share of the pairs that must have an offset: the sensor may stand still for most of a drive
+_OFFSET_SHARE = 0.3  # share of the pairs that must have an offset: the sensor may be at rest for most of a drive
 _GOOD = 0.75  # no offset is searched for poses with this share of overlap
 _STRIDE_M = 2.0  # the scans of a pair are this far apart, or
-_STRIDE_RAD = np.deg2rad(10.0)  # turned by this angle: enough to see a mistake, little enough for the scans to overlap
+_STRIDE_RAD = np.deg2rad(10.0)  # turned by this angle: it shows a mistake, and the scans still overlap
 _REACH = 10  # the scans of a pair are at most this number of frames apart
 _GAIN = 0.02  # a correction must raise the mean share of overlap by this,
 _CERTAIN = 4.0  # and by this number of standard errors
 _WINS = 0.75  # on this share of the pairs on which it makes a difference,
-_JUDGED_M = 0.05  # which is a distance of the two motions greater than this
+_JUDGED_M = 0.05  # where the two motions differ by more than this
 _COMMON_AXES = 5  # the choices of axes that are listed first
 _SAME_M = 0.002  # motions that are nearer than this are the same
 _EXPLAINED = 0.2  # and the mean share must be at least this then
-# Vehicles that keep pace with the recording one look like scans that are all in one frame: in a street full of them, and without labels, the
-# share grows by a factor of 1.4, and by at least 1.8 where the scans are in one frame.
+# Vehicles that drive as fast as the ego vehicle look like scans that are all in one frame. In dense traffic, without labels, the share grows
+# by a factor of 1.4; it grows by at least 1.8 if the scans really are in one frame.
 _STANDING = 1.6
 _RARE = 0.02  # a rare mistake must raise the mean by this more than a common one
 _CLEAR_OFFSET = 0.1  # an offset must raise the share by this
@@ -51,14 +51,14 @@ _CLEAR_OFFSET = 0.1  # an offset must raise the share by this
 
 @dataclass(frozen=True)
 class Correction:
-    """A common mistake in poses, and how to undo it.
+    """A common mistake in poses, and its correction.
 
     Attributes:
         name: description of poses with this mistake.
         advice: how to correct the file.
         undo: maps (F, 4, 4) poses with the mistake to the poses without it.
-        rare: whether it is one of the many choices of axes that nobody makes often.
-        factor: undoing it must raise the share of overlap by this factor, over that with another mistake undone too.
+        rare: whether it is one of the unusual choices of axes.
+        factor: the correction must raise the share of overlap by this factor, also compared with other corrections.
     """
 
     name: str
@@ -75,12 +75,12 @@ class PoseDiagnosis:
     Attributes:
         share: mean share of a scan's structure that falls on the structure of an earlier scan under the poses as they are.
         pairs: number of pairs of scans with enough structure; with 0 there is no result.
-        correction: the mistake that, undone, raises the share clearly; None if there is none.
-        corrected_share: the share with the mistake undone, over the pairs on which this makes a difference.
+        correction: the mistake whose correction clearly raises the share; None without one.
+        corrected_share: the share after the correction, over the pairs that it changes.
         share_there: the share of the poses as they are, over the same pairs.
-        quality: how well neighbouring scans agree, and whether a lever arm or a delay explains what they do not agree in; None if there is
-            a known mistake.
-        offset_m: (x, y, z) median distance between where the poses put a scan and where it fits, if nothing else explains it; else None.
+        quality: how well neighbouring scans agree, and whether a lever arm or a delay explains the disagreement; None if there is a known
+            mistake.
+        offset_m: (x, y, z) median distance of scans from the position where they fit, if nothing else explains the overlap; otherwise None.
     """
 
     share: float
@@ -100,12 +100,12 @@ def diagnose_poses(
     seconds: NDArray[np.float64] | None = None,
     max_pairs: int = 24,
 ) -> PoseDiagnosis:
-    """Measure the overlap of scans under their poses, and under the poses with each known mistake undone.
+    """Measure the overlap of scans under their poses, and under the poses with each known mistake corrected.
 
     Args:
         structure: returns the (M, 3) structure of the i-th scan, metres, in the frame of the sensor (see `static_structure`).
         poses: (F, 4, 4) float64 first_T_sensor of each scan, in order of time; rigid.
-        points: returns (N, 3) all points of the i-th scan on things that stand; None takes its structure.
+        points: returns (N, 3) all points of the i-th scan on static things; None takes its structure.
         seconds: (F,) times of the scans, increasing; None for frames at 10 Hz.
         max_pairs: largest number of pairs of scans that are compared.
     """
@@ -156,12 +156,12 @@ def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
     spread = {candidates[i] for i in np.linspace(0, len(candidates) - 1, (max_pairs + 1) // 2).astype(int)}
     turns = [_angle(relative(poses, first, second)) for first, second in candidates]
     turning = [candidates[i] for i in np.argsort(turns)[::-1] if candidates[i] not in spread]
-    # neighbouring pairs are in the same turn: take every third of the sharpest
+    # neighbouring pairs are in the same turn, so only every third of the sharpest is taken
     return sorted(spread | set(turning[: 3 * (max_pairs // 2) : 3]))
 
 
 def known_corrections() -> tuple[Correction, ...]:
-    """Return the mistakes that are searched for, more common ones first: of equally good ones the first is reported."""
+    """Return the known mistakes, common ones first: if several fit equally well, the first is reported."""
     mistakes = enumerate(_axes_mistakes())
     axes = [
         Correction(name, advice, _in_axes(matrix), rank >= _COMMON_AXES) for rank, (name, advice, matrix) in mistakes
@@ -169,16 +169,16 @@ def known_corrections() -> tuple[Correction, ...]:
     others = [
         Correction(
             "transposed rotations",
-            "write R instead of its transpose; the matrices may have been read column by column",
+            "write R instead of its transpose (the matrices were probably read column by column)",
             _transpose,
         ),
         Correction(
             "inverted transforms (first frame to sensor)",
-            "write the transforms from the sensor to the first frame: invert them",
+            "invert the transforms: they must lead from the sensor to the first frame",
             invert,
         ),
         Correction(
-            "poses of a moving sensor beside scans that are all in one frame",
+            "scans that are all in one frame, with the poses of a moving sensor",
             "move each scan to the frame of its own sensor, or take the poses of this sequence",
             lambda p: np.tile(np.eye(4), (len(p), 1, 1)),
             factor=_STANDING,
@@ -234,7 +234,7 @@ def _common_offset(
         shares = np.array([overlap(occupied, translation(step), moved) for step in steps])
         if shares.max() > shares[len(steps) // 2] + _CLEAR_OFFSET:
             offsets.append((-steps[shares.argmax()], motion[:3, 3]))
-    # where the scan fits as if it had not moved, it is vehicles that keep pace that fit
+    # an offset that cancels the motion comes from vehicles that drive as fast as the ego vehicle
     offsets = [
         offset
         for offset, way in offsets
@@ -250,7 +250,7 @@ def _partner(poses: Poses, first: int) -> int:
     """Return the next scan that is far enough away, or the last within reach; one of the next scans if the poses do not move."""
     last = min(first + _REACH, len(poses) - 1)
     if _distance(poses[first], poses[last]) < _DIFFERENT_M:
-        # the sensor may have moved all the same: one frame apart shows a fast motion, four frames apart a slow one
+        # the sensor may have moved nevertheless: one frame apart shows a fast motion, four frames apart a slow one
         return min(first + (1, 4)[first % 2], last)
     for second in range(first + 1, last):
         motion = relative(poses, first, second)
@@ -308,7 +308,7 @@ def _transpose(poses: Poses) -> Poses:
 
 
 def _in_axes(stored_T_sensor: NDArray[np.float64]) -> Callable[[Poses], Poses]:
-    """Return what undoes a change of axes: the poses are stored in axes that `stored_T_sensor` (3, 3) maps the sensor's to."""
+    """Return the correction of a change of axes: `stored_T_sensor` (3, 3) maps the axes of the sensor to those of the stored poses."""
     change = np.eye(4)
     change[:3, :3] = stored_T_sensor
     return lambda poses: change.T @ poses @ change
@@ -323,7 +323,7 @@ def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
     mistakes = [
         (
             "poses with y mirrored against the scans",
-            "scans and poses must have the same handedness: mirror y in both (S @ P @ S with S = diag(1, -1, 1, 1)) or in neither",
+            "give scans and poses the same handedness: mirror y in both (S @ P @ S with S = diag(1, -1, 1, 1)) or in neither",
             mirrored,
         ),
         ("camera-frame poses (x right, y down, z forward)", camera_advice, camera_of_kitti),

@@ -123,7 +123,7 @@ def draw_frame_scores(evaluation: Evaluation, plot: Path) -> None:
 
 
 def _write(figure: Any, plot: Path) -> None:
-    """Write a chart that needs no font where it is shown: PDF files contain TrueType fonts, SVG files outlines of the letters."""
+    """Write a chart that needs no installed fonts: PDF files contain TrueType fonts, SVG files the outlines of the letters."""
     buffer = io.BytesIO()
     with import_extra("matplotlib", "plots").rc_context({"pdf.fonttype": 42, "svg.fonttype": "path"}):
         figure.savefig(buffer, format=plot.suffix[1:].lower(), dpi=150)

@@ -1,4 +1,4 @@
-"""Checks of the files of a sequence, alone and against each other: sizes, numbers of frames, values, and how certain a grid says that it is."""
+"""Checks of the files of a sequence, each alone and against each other: sizes, numbers of frames, values, and the evidence of grids."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ADVICE = "make the grid again with `carlasc regrid --keep-{}`"
 def check_evidence(
     sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]], classes: ClassTable | None
 ) -> Iterator[Finding]:
-    """Check the values of the fields of a grid that say how certain it is, and who is in it.
+    """Check the values of the fields of evidence and actors of a grid.
 
     Args:
         sequence: the sequence.
@@ -47,7 +47,7 @@ def check_evidence(
 
 
 def _mistakes(part: str, array: NDArray[Any], num_voxels: int, classes: ClassTable | None) -> Iterator[tuple[str, str]]:
-    """Yield what was expected and what was found instead, for each kind of mistake."""
+    """Yield what was expected and what was found, for each kind of mistake."""
     if part == "occupied":
         wrong = array[~((array >= 0) & (array <= 1))]  # NaN is wrong too
         if wrong.size:
@@ -112,7 +112,7 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
         yield Finding.from_error("params", sequence.path, where, error)
         return
     if not sequence.fields():
-        advice = "the sequence is empty or not complete: copy it again, or give another folder"
+        advice = "copy the sequence again, because it is empty or not complete, or give another folder"
         yield Finding("error", "empty", sequence.path, where, "scans or grids", "none", advice)
     elif not grids:
         advice = "make grids with `carlasc regrid`, or read those of eval_*.zip with `grids_source`"
@@ -135,7 +135,7 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
             expected = f"a {sequence.coordinates} grid, as the folder says"
             yield Finding("warning", "params", sequence.path, file, expected, f"a {spec.coordinates} one")
         if f"{name}/counts" not in sequence.fields() and sequence.predicted_by(name) is None:
-            folder, advice = f"{where}/{name}", "without counts, all voxels are taken to be known"
+            folder, advice = f"{where}/{name}", "copy the counts too; without them, all voxels are taken as known"
             yield Finding("warning", "frame-counts", sequence.path, folder, "counts beside the labels", "none", advice)
 
 
@@ -143,7 +143,7 @@ def _check_grid_folders(sequence: FolderSequence, grids: set[str]) -> Iterator[F
     """Check that each folder of grids has its params.json: a sequence does not list a folder without it."""
     for folder in sorted(Path(sequence.location).glob(f"{layout.EVALUATION}*/")):
         if folder.name not in grids and folder.is_dir():
-            file, advice = str(folder / layout.PARAMS), "the grid is ignored without it: copy the file"
+            file, advice = str(folder / layout.PARAMS), "copy the file: the grid is ignored without it"
             yield Finding("error", "params", sequence.path, file, "the grid's geometry", "no file", advice)
 
 
@@ -155,8 +155,8 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
         missing = int((np.diff(frames)[gaps] - 1).sum())
         first, then = int(frames[gaps[0]]), int(frames[gaps[0] + 1])
         found = f"{len(gaps)} gaps, {missing} frames missing; the first gap is between {first} and {then}"
-        advice = "histories of scans do not cross a gap; unless the frames were left out on purpose, copy them again"
-        # grids are often made for every fifth frame only, but gaps between scans are rarely wanted
+        advice = "copy the frames again, unless they were left out on purpose: histories of scans do not cross a gap"
+        # grids are often made for every fifth frame only, but gaps between scans are rarely intended
         severity: Severity = "warning" if "points" in fields else "note"
         yield Finding(
             severity, "frame-gaps", sequence.path, sequence.location, "consecutive frame numbers", found, advice
@@ -250,7 +250,7 @@ def _check_boxes(sequence: Sequence, table: NDArray[Any], where: str) -> Iterato
     far = np.flatnonzero(np.linalg.norm(boxes.centers, axis=1) > _FARTHEST_M)
     if len(far):
         found = f"track {boxes.tracks[far[0]]} at {boxes.centers[far[0]].round(1).tolist()}, and {len(far) - 1} others"
-        advice = "boxes are in the frame of the sensor, not in the world's"
+        advice = "write boxes in the frame of the sensor, not of the world"
         yield Finding("warning", "boxes", sequence.path, where, f"boxes within {_FARTHEST_M:.0f} m", found, advice)
 
 
@@ -269,7 +269,7 @@ def _check_grid(sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, 
     without_vote = int(np.count_nonzero((labels != 0) & ~(counts > 0)))
     if without_vote:
         found = f"{without_vote} voxels with a label but no vote"
-        advice = "labels and counts belong to different frames or runs: make the grid again"
+        advice = "make the grid again: labels and counts are from different frames or runs"
         yield Finding("error", "counts", sequence.path, file, "a vote in each voxel with a label", found, advice)
     if not (counts > 0).any():
         yield Finding("warning", "counts", sequence.path, file, "known voxels", "no vote in the whole grid")
@@ -294,7 +294,7 @@ def _check_classes(
     ids, counts = np.unique(labels, return_counts=True)
     unknown = [(int(i), int(n)) for i, n in zip(ids, counts, strict=True) if int(i) not in classes.names]
     found = ", ".join(f"{i} ({n} times)" for i, n in unknown[:5]) + (" and more" if len(unknown) > 5 else "")
-    advice = f"the file or the classes in {layout.METADATA} are wrong"
+    advice = f"correct the file, or the classes in {layout.METADATA}"
     yield Finding("error", "class-ids", sequence.path, where, f"class ids of {classes.name}", found, advice)
 
 

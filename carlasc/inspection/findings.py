@@ -17,13 +17,13 @@ class Finding:
     """One fault.
 
     Attributes:
-        severity: "error": reading fails or gives wrong values; "warning": probably a mistake; "note": not a fault, but worth knowing.
+        severity: "error": reading fails or gives wrong values; "warning": probably a mistake; "note": no fault, for information.
         check: short name of the check that found it, such as "file-size"; findings are grouped by it.
         sequence: path of the sequence in its Source.
         location: the file or the folder.
-        expected: what the file should hold.
-        found: what it holds.
-        advice: what to do about it; may be empty.
+        expected: the content that the file should have.
+        found: the content that it has.
+        advice: what to do; may be empty.
     """
 
     severity: Severity
@@ -41,8 +41,8 @@ class Finding:
         Args:
             check: short name of the check.
             sequence: path of the sequence in its Source.
-            location: the file or the folder, for an error that is only a sentence.
-            error: its parts become those of the finding.
+            location: the file or the folder, for an error without a location.
+            error: its parts become the parts of the finding.
             advice: for an error without advice.
         """
         advice = error.advice or advice
@@ -60,7 +60,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class SequenceReport:
-    """What was read of a sequence, and the shares that were measured.
+    """What was read and measured in a sequence.
 
     Attributes:
         path: the sequence's path in its Source.
@@ -70,11 +70,11 @@ class SequenceReport:
             have no labels). A grid for which it could not be measured is left out.
         pose_share: mean share of a scan's structure that falls on the structure of an earlier scan under the poses; None if it could not
             be measured.
-        disagreement_m: how far scans are from the surfaces that their neighbours saw, in metres, under the poses; None if nothing tells.
-        refined_m: the same under refined poses.
-        mounting: x, y, z, roll, pitch and yaw of the sensor in the frame of the poses, and how late these are, each with its standard
-            error, or "undetermined"; empty if nothing tells.
-        images: by camera, where its images lie on the scans, in pixels, and how late they are, or "undetermined"; empty without images.
+        disagreement_m: distance of scans from the surfaces that their neighbours saw, under the poses, metres; None if it is undetermined.
+        refined_m: the same distance under refined poses.
+        mounting: x, y, z, roll, pitch and yaw of the sensor in the frame of the poses, and the delay of the poses, each with its standard
+            error, or "undetermined"; empty if none could be measured.
+        images: by camera, the shift of its images against the scans, in pixels, and their delay, or "undetermined"; empty without images.
     """
 
     path: str

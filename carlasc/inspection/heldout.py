@@ -1,4 +1,4 @@
-"""Held-out rays, a score that needs no ground truth: scans are left out, and compared with the grids that the others give."""
+"""Held-out rays, a score without a reference: scans are left out and compared with the grids that are made from the other scans."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence, Source
 
 EVERY = 10
-"""Every so many scans, one is left out by default."""
-_NEARLY_WHOLE = 0.8  # share of the scans of a whole window that the window of a measured frame has
+"""Default of `every`: every tenth scan is left out."""
+_NEARLY_WHOLE = 0.8  # a frame is measured if its window has this share of the scans of a whole window
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class HoldoutResult:
     Attributes:
         location: what was measured.
         spec: geometry of the grids.
-        every: one of so many scans was left out.
+        every: every N-th scan was left out.
         sequences: the scores of each sequence, by its path.
-        given_poses: the scores under the given poses, of each sequence whose poses were refined.
+        given_poses: for each sequence with refined poses, the scores under the given poses.
         failures: frames that could not be measured.
         elapsed_s: duration, in seconds.
     """
@@ -89,7 +89,7 @@ class _HeldOutFrame:
     whole: Sequence
     frame: int
     plan: GridPlan
-    is_used: bool  # whether the poses are those that grids are made with
+    is_used: bool  # whether grids are made with these poses
 
 
 def holdout(
@@ -102,11 +102,11 @@ def holdout(
     frames: Frames = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> HoldoutResult:
-    """Leave every N-th scan out, make the grids at these frames from the other scans, and follow the rays of the scans through them.
+    """Leave out every N-th scan, make the grids at these frames from the other scans, and follow the rays of the left-out scans through them.
 
-    A scan that is left out neither votes nor shows how actors move, in any grid; it is used only where poses are refined. Where they are, the
-    same frames are measured under the given poses, too. Frames at the ends of a drive, whose window has less than
-    80 % of the scans of a whole one, are not measured, unless all windows are so. A frame that cannot be read is reported in the result.
+    A left-out scan does not vote in any grid and is not used to track actors; it is used only to refine poses. If poses are refined, the
+    same frames are also measured under the given poses. Frames at the ends of a drive are not measured if their window has less than
+    80 % of the scans of a whole window, unless all windows are like that. A frame that cannot be read is reported in the result.
     Nothing is written.
 
     Args:
@@ -114,9 +114,9 @@ def holdout(
         spec: geometry of the grids, Cartesian; None for the published one.
         observe: how scans are merged.
         voting: how votes are counted.
-        every: one of so many scans is left out.
+        every: leave out every N-th scan.
         frames: range of the frames that may be left out; None for all.
-        run: how the work is spread, and who is told of its progress.
+        run: how the work is spread, with a callback for progress.
 
     Raises:
         ArgumentError: `every` is less than 2, or the grid is cylindrical.
@@ -161,7 +161,7 @@ def holdout(
 
 @dataclass(frozen=True)
 class _HeldOutDrive:
-    """One sequence: which scans are left out, and at which of their frames the rays are followed."""
+    """One sequence: the scans that are left out, and the frames that are measured."""
 
     inputs: ScanSequence
     feed: ScanFeed
@@ -176,15 +176,14 @@ class _HeldOutDrive:
         enough = _NEARLY_WHOLE * max(len(whole.window_of(int(frame))) for frame in whole.frames)
         chosen = [frame for frame in hidden if frame in inputs.plan.frames]
         if not chosen:
-            raise MissingDataError(
-                inputs.location, expected=f"frames to leave out in {inputs.plan.frames}", found=f"only {hidden}"
-            )
+            expected, advice = f"frames to leave out in {inputs.plan.frames}", "choose a smaller `every`"
+            raise MissingDataError(inputs.location, expected=expected, found=f"only {hidden}", advice=advice)
         measured = [frame for frame in chosen if len(whole.window_of(frame)) >= enough] or chosen
         return cls(inputs, whole.without(hidden), tuple(measured))
 
     @property
     def steps(self) -> int:
-        """Number of scans that are read to find the actors, and of frames."""
+        """Number of steps: scans that are read to find the actors, and frames."""
         return self.feed.reads + len(self.frames)
 
     def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_HeldOutFrame]:

@@ -1,4 +1,4 @@
-"""How well grids predict scans that they were made without: counts of rays by class and distance, and what follows from them."""
+"""How well grids predict scans that did not take part in them: counts of rays by class and distance, and shares of these."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from carlasc.metrics.casting import follow_rays
 BANDS_M = (0.0, 10.0, 20.0, 30.0, np.inf)
 """Bounds of the distance bands, metres."""
 VEHICLE_M = ((-2.2, -0.75, -1.2), (2.2, 0.75, 0.0))
-"""Lower and upper corner of the space that the recording vehicle certainly fills, in the frame of its sensor (x forward)."""
+"""Lower and upper corner of a box that is inside of the recording vehicle, in the frame of its sensor (x forward), metres."""
 
 _RETURNS, _FREE, _UNKNOWN, _PASSED, _PASSED_OBJECT, _MISSED = range(6)
-_SOLID, _OBJECT = 1, 2  # bits of a voxel: it is occupied; its class is no ground
+_SOLID, _OBJECT = 1, 2  # bits of a voxel: it is occupied; its class is not ground
 _STEP_M, _STEPS = 0.02, 500  # histogram of the errors of the first hit; the last bin holds all larger ones
 
 
 @dataclass(frozen=True)
 class RayShares:
-    """What became of some held-out rays. Shares are of the returns inside the grid; None where nothing could be measured.
+    """Shares of some held-out rays, of the returns inside the grid; None if nothing could be measured.
 
     Attributes:
         returns: number of returns.
@@ -37,9 +37,9 @@ class RayShares:
         occupied: share of returns that lie in an occupied voxel.
         passed: share of rays that pass through an occupied voxel before their return; the voxel of the return and its 26 neighbours
             do not count.
-        passed_object: the same, where only voxels of classes other than ground count. Without labels, the lowest occupied voxel of each
-            column and the one above it are taken for ground.
-        missed: share of rays that meet no occupied voxel, neither before nor behind their return.
+        passed_object: the same for voxels of classes other than ground. Without labels, the lowest occupied voxel of each column and the
+            one above it are taken as ground.
+        missed: share of rays without an occupied voxel, both before and behind their return.
         error_median_m: median over the other rays of |first hit - measured range|, metres; the first hit is in the middle of the ray's
             path through its first occupied voxel.
         error_90_m: 90 % of these errors are at most this large, metres.
@@ -58,7 +58,7 @@ class RayShares:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutScores:
-    """The held-out rays of some frames, counted; `merge` adds those of other frames.
+    """Counts of the held-out rays of some frames; `merge` adds those of other frames.
 
     Attributes:
         classes: class table of the scans.

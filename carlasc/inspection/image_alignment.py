@@ -1,7 +1,8 @@
-"""Whether images and LiDAR agree: edges of depth against edges of the image, as a shift in pixels and a time between the two.
+"""The alignment of images with LiDAR scans: a shift in pixels and a delay in seconds, from edges of depth and edges of the image.
 
-Where the depth of a scan jumps between neighbouring points, something ends, and the image has an edge. Of all shifts of the image, the right one
-puts most contrast on these places. So does the right time, while the vehicle moves: an image of another time was taken elsewhere.
+Where the depth of a scan jumps between neighbouring points, an object ends, and the image has an edge. At the right shift of the image, the
+contrast at these points is highest. The same holds for the right time if the vehicle moves, because an image of another time was taken
+at another place.
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ _WRONG_PX, _WRONG_S = 4.0, 0.05
 
 @dataclass(frozen=True)
 class ImageAgreement:
-    """How the images of a camera lie on the scans.
+    """The alignment of the images of a camera with the scans.
 
     Attributes:
         camera: its name.
-        shift_px: columns by which images are to the right of where the scans say; None if it cannot be told.
-        late_s: seconds by which images are later than their times say; None if it cannot be told.
+        shift_px: columns by which the images are too far to the right; None if it is undetermined.
+        late_s: delay of the images against their times, seconds; None if it is undetermined.
     """
 
     camera: str
@@ -63,7 +64,7 @@ class ImageAgreement:
 
 
 def compare_images(sequence: Sequence) -> list[ImageAgreement]:
-    """Return how the images of each camera that has some lie on the scans; files that cannot be read are left out."""
+    """Return the alignment of each camera with images. Files that cannot be read are left out."""
     try:
         cameras = cameras_of(sequence)
     except CarlascError:
@@ -72,8 +73,8 @@ def compare_images(sequence: Sequence) -> list[ImageAgreement]:
 
 
 def judge_images(sequence: Sequence, images: list[ImageAgreement]) -> Iterator[Finding]:
-    """Yield what is probably wrong with images."""
-    where, expected = f"{sequence.location}/{layout.CAMERAS}", "images whose edges lie on those of the scans"
+    """Yield a finding for each camera whose calibration or times are probably wrong."""
+    where, expected = f"{sequence.location}/{layout.CAMERAS}", "images with edges where the scans have them"
     advice = "check the calibration and the times of the camera, and draw a grid over it with `carlasc render --camera`"
     for agreement in images:
         if agreement.is_wrong:
@@ -92,7 +93,7 @@ def _compare(sequence: Sequence, camera: CameraModel) -> ImageAgreement | None:
         except CarlascError:
             continue  # which is reported elsewhere
         views += [] if view is None else [view]
-    # The contrast by view, time and shift; what its thirds do not agree on is chance.
+    # The contrast by view, time and shift. A maximum counts only if all thirds of the views have it.
     found = [view.contrast(camera) for view in views]
     thirds = [np.sum(part, axis=0) for part in (found[0::3], found[1::3], found[2::3]) if part]
     if len(thirds) < 3 or min(third.max() for third in thirds) < _LEAST:
@@ -109,9 +110,9 @@ class _View:
     """An image, and the points of its scan.
 
     Attributes:
-        edges: (E, 3) where the depth of the scan jumps, metres, sensor frame.
+        edges: (E, 3) points where the depth of the scan jumps, metres, sensor frame.
         contrast_of: (H, W) change of brightness from column to column, from 0 to 1.
-        places: (T, 4, 4) where the camera was at each of `_TIMES_S` after the time of the image, in the frame of the scan.
+        places: (T, 4, 4) pose of the camera at each of `_TIMES_S` after the time of the image, in the frame of the scan.
         moves: whether the vehicle moved in this time.
     """
 
@@ -144,7 +145,7 @@ class _View:
         return cls(edges, contrast, moved @ place, bool(apart[:, 3].max() > _MOVED_M or apart[:, :3].max() > _TURNED))
 
     def contrast(self, camera: CameraModel) -> NDArray[np.float64]:
-        """Return (T, S) the contrast of the image on the edges of depth, in sum, for each time and each shift."""
+        """Return (T, S) the summed contrast of the image at the edges of depth, for each time and each shift."""
         found = np.zeros((len(_TIMES_S), len(_SHIFTS_PX)))
         for row, place in enumerate(self.places):
             pixels = camera.project(transform_points(invert(place), self.edges))
@@ -156,7 +157,7 @@ class _View:
 
 
 def _depth_edges(camera: CameraModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (E, 3) points between neighbours in the image of which one is much nearer, at its depth, all in the camera's frame."""
+    """Return (E, 3) points between neighbours in the image whose depths differ much, at the smaller depth, in the camera's frame."""
     pixels = camera.project(points)
     seen = camera.contains(pixels)
     pixels, depth = pixels[seen], points[seen, 2]
@@ -173,7 +174,7 @@ def _depth_edges(camera: CameraModel, points: NDArray[np.float64]) -> NDArray[np
 
 
 def _clearest(values: NDArray[Any], thirds: list[NDArray[np.float64]], apart: float) -> float | None:
-    """Return the value at which a curve is highest; None if its thirds do not agree on it, or it is not clearly higher than elsewhere."""
+    """Return the value at which a curve is highest; None if its thirds disagree, or if the maximum is not clear."""
     total = np.sum(thirds, axis=0)
     best = int(total.argmax())
     elsewhere = np.abs(np.arange(len(values)) - best) > len(values) // 6

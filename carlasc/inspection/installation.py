@@ -1,4 +1,4 @@
-"""`doctor`: what is installed, and what the machine offers, as a report that can be pasted into an issue."""
+"""`doctor`: the installed packages and the properties of the machine, as a report to paste into an issue."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from carlasc.running.pools import ONE_THREAD
 from carlasc.storage.files import is_durable
 
 FOR_DEVELOPERS = ("all", "dev", "docs", "faults", "study")
-"""Extras that are not listed: `all` is a set of others, and the rest is for those who work on the package."""
+"""Extras that are not listed: `all` consists of other extras, and the rest is for developers of the package."""
 
 _PACKAGE = Path(__file__).parents[1]  # the folder of carlasc
 _FEATURES = "sse4.2 avx avx2 fma bmi2 avx512f avx512bw avx512vl neon asimd sve sve2".split()
@@ -57,7 +57,7 @@ class Package:
 
     @property
     def problem(self) -> str:
-        """What is wrong with it; empty if nothing is."""
+        """What is wrong with it; empty if it is installed and new enough."""
         if self.version is None:
             return f"{self.name} is not installed"
         if _numbers(self.version) < _numbers(self.lowest):
@@ -85,7 +85,7 @@ class Extra:
     @property
     def command(self) -> str:
         """The command that installs it."""
-        return without_names(install_command(self.name)).replace("'~/", "~/'")  # a shell knows ~ outside quotes alone
+        return without_names(install_command(self.name)).replace("'~/", "~/'")  # shells expand ~ only outside quotes
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,9 @@ class Processor:
     Attributes:
         model: its name.
         cores: number of its cores, as the system counts them.
-        usable: number of cores that this process may use, which is the number of workers that commands start.
+        usable: number of cores that this process may use; commands start as many workers.
         target: the processor that Numba compiles for; empty if Numba does not load.
-        features: instructions that matter for speed, of those that Numba uses.
+        features: instruction sets that Numba uses and that matter for speed.
     """
 
     model: str
@@ -113,7 +113,7 @@ class CompiledCode:
 
     Attributes:
         folder: the folder.
-        writable: whether this process may write there; otherwise each process compiles anew.
+        writable: whether this process may write there; otherwise each process compiles again.
         files: number of files of compiled code in it.
         bytes: their size.
         compile_s: time for compiling a loop of one line, seconds.
@@ -147,7 +147,7 @@ class Disk:
 
 @dataclass(frozen=True)
 class Installation:
-    """What `doctor` found. Paths begin with `~` for the folder of the user, and hold no name of a user.
+    """What `doctor` found. Paths begin with `~` instead of the home folder, and contain no user name.
 
     Attributes:
         version: version of carlasc.
@@ -159,8 +159,8 @@ class Installation:
         processor: the processor.
         compiled: where compiled code is kept; None if Numba does not work.
         threads: the number of threads of Numba, and the variables of the environment that set threads, Numba and carlasc.
-        durable: whether files are synced before they get their names.
-        disk: how fast the folder is where it was measured.
+        durable: whether files are synced before they are renamed to their final names.
+        disk: how fast the measured folder is.
         problems: what is broken and needed; empty if carlasc works.
     """
 
@@ -179,15 +179,15 @@ class Installation:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing that is needed is broken. Missing extras do not count."""
+        """Whether everything that is always needed works. Extras may be missing."""
         return not self.problems
 
 
 def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
-    """Look at what is installed and at the machine. Takes a few seconds; nothing is sent anywhere.
+    """Check the installed packages and the machine. This takes a few seconds; nothing is sent anywhere.
 
     Args:
-        folder: where the speed of the disk is measured, in a temporary folder that is removed again; None: where temporary files go.
+        folder: folder whose disk speed is measured, in a temporary folder that is removed again; None: the folder for temporary files.
 
     Returns:
         What was found.
@@ -199,7 +199,7 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
     needed, extras = _read_requirements()
     problems = [package.problem for package in needed if package.problem]
     if not needed:
-        problems.append("carlasc is not installed, only found on the path: which packages it needs is not known")
+        problems.append("carlasc is on the path, but not installed, so its needs are not known: install it with pip")
     for package in needed:
         if package.version is not None:
             problems += _problems_of_import(package.name)
@@ -209,7 +209,7 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
             compiled = _look_at_compiled_code()
         except (RuntimeError, OSError) as error:
             problems.append(
-                f"Numba cannot compile or keep compiled code ({describe(error)}); NUMBA_CACHE_DIR=FOLDER says where"
+                f"Numba cannot compile, or cannot keep compiled code ({describe(error)}): set NUMBA_CACHE_DIR to a folder that is writable"
             )
     return Installation(
         version=carlasc_version(),
@@ -228,11 +228,11 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
 
 
 def without_names(text: str) -> str:
-    """Return a text with `~` for the folder of the user, and USER where the user's name stands as a word."""
+    """Return a text with `~` instead of the home folder, and USER instead of the user's name where it is a whole word."""
     home = str(Path.home())
     if len(home) > 1:
         text = re.sub(rf"{re.escape(home)}(?![\w-])", "~", text)
-    with suppress(OSError, KeyError, ImportError):  # what getpass raises for a user without a name
+    with suppress(OSError, KeyError, ImportError):  # raised by getpass for a user without a name
         text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(getpass.getuser())}(?![A-Za-z0-9])", "USER", text)
     return text
 
@@ -241,7 +241,7 @@ def measure_disk(folder: str | os.PathLike[str] | None) -> Disk:
     """Measure how fast files are written, synced and read in a temporary folder, which is removed again.
 
     Args:
-        folder: where to make it; None: where temporary files go.
+        folder: where to make it; None: the folder for temporary files.
 
     Raises:
         ArgumentError: `folder` is not a folder.
@@ -252,7 +252,7 @@ def measure_disk(folder: str | os.PathLike[str] | None) -> Disk:
         raise ArgumentError("folder", expected="a folder", found=str(place))
     try:
         with tempfile.TemporaryDirectory(dir=place, prefix="carlasc-doctor-") as scratch:
-            large, noise = Path(scratch, "large"), os.urandom(_MEGABYTE)  # noise: some file systems compress
+            large, noise = Path(scratch, "large"), os.urandom(_MEGABYTE)  # random: some file systems compress
             write_s = _time_writing(large, noise, _MEGABYTES)
             read_s = _time_reading(large)
             syncs_s = sorted(_time_writing(Path(scratch, str(n)), noise[:4096], 1) for n in range(_SMALL_FILES))
@@ -282,7 +282,7 @@ def _time_writing(path: Path, block: bytes, count: int) -> float:
 def _time_reading(path: Path) -> float:
     with path.open("rb") as file:
         if sys.platform == "linux":
-            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # forget what is in memory
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # drop the cached copy in memory
         start = time.perf_counter()
         while file.read(_MEGABYTE):
             pass
@@ -313,7 +313,7 @@ def _version(name: str) -> str | None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the numbers of a version up to the first part that is none, without zeros at their end: 2.0 is 2."""
+    """Return the numbers of a version up to the first part that is no number, without trailing zeros: 2.0 is 2."""
     numbers = [int(part) for part in re.match(r"[\d.]*", version)[0].split(".") if part]  # type: ignore[index]
     while numbers and not numbers[-1]:
         numbers.pop()
@@ -321,11 +321,11 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def _problems_of_import(name: str) -> Iterator[str]:
-    """Yield why a package that is always needed does not load; its module has the name of the package, with underscores."""
+    """Yield why a package that is always needed cannot be imported. The module has the name of the package, with underscores."""
     try:
         import_extra(name.replace("-", "_"), "")
     except DependencyError as error:
-        yield f"{name} does not load ({describe(error.__cause__ or error)})"
+        yield f"{name} cannot be imported ({describe(error.__cause__ or error)})"
 
 
 def _look_at_processor(numba_loads: bool) -> Processor:
@@ -357,8 +357,8 @@ def _look_at_compiled_code() -> CompiledCode:
     """Compile a loop of one line.
 
     Raises:
-        RuntimeError: Numba finds no folder for compiled code; then no module with a compiled loop can be imported.
-        OSError: the same, or the compiler does not work.
+        RuntimeError: Numba finds no folder for compiled code, so that no module with a compiled loop can be imported.
+        OSError: as RuntimeError, or the compiler does not work.
     """
     import numba
 

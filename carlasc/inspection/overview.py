@@ -1,4 +1,4 @@
-"""What a data set holds: splits, sequences, frames, fields and grids, from listings and text files alone."""
+"""The contents of a data set: splits, sequences, frames, fields and grids, from listings and text files only."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from carlasc.storage.protocol import Sequence, Source
 if TYPE_CHECKING:
     import pandas
 
-_SIZED = 3  # files of a field from which the size of all of them is estimated
+_SIZED = 3  # the size of a field is estimated from this number of files
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class GridOverview:
     Attributes:
         name: its folder.
         coordinates: "cartesian" or "cylindrical".
-        size: number of cells per axis.
+        size: number of voxels per axis.
         lower: lower bound per axis; metres, radians for azimuth.
         upper: upper bound per axis.
-        voxel_size: size of a cell per axis.
+        voxel_size: size of a voxel per axis.
         frames: number of frames.
         parts: which of labels, counts and votes exist.
         made: the record of how the grid was made; None for published data.
@@ -72,8 +72,8 @@ class SequenceOverview:
         classes: class table of its labels.
         sensor: the sensor that recorded the scans; None if it is not known.
         source: what the sequence was made from; None if it is not known.
-        bytes: estimated size; None where it would take long to find.
-        problem: the error that kept a part of it from being read; None if there was none.
+        bytes: estimated size; None for stores other than folders.
+        problem: the error because of which a part could not be read; None without one.
     """
 
     path: str
@@ -113,7 +113,7 @@ class Overview:
 
     Attributes:
         location: the source.
-        level: what it is: "data set", "split", "sequences", "sequence", "coordinates" (one `<coordinates>` folder) or "capture".
+        level: kind of the source: "data set", "split", "sequences", "sequence", "coordinates" (one `<coordinates>` folder) or "capture".
         store: how it is stored: "folder", "published" (a zip or a remote folder), or a kind of packed store.
         sequences: in sorted order.
         captures: in sorted order.
@@ -129,7 +129,7 @@ class Overview:
 
     @property
     def splits(self) -> dict[str, int]:
-        """Number of sequences by split; "none" counts those whose path names no split."""
+        """Number of sequences by split; "none" counts sequences without a split in their path."""
         found: dict[str, int] = {}
         for sequence in self.sequences:
             found[sequence.split or "none"] = found.get(sequence.split or "none", 0) + 1
@@ -155,7 +155,7 @@ class Overview:
 
 
 def info(source: str | os.PathLike[str] | Source) -> Overview:
-    """List what a data set holds. No frame is read.
+    """List the contents of a data set. No frame is read.
 
     Args:
         source: a path or URL that `carlasc.open` knows, a raw capture, or a Source.
@@ -166,7 +166,7 @@ def info(source: str | os.PathLike[str] | Source) -> Overview:
     captures = _captures_in(source)
     try:
         opened = as_source(source)
-        # raw/ has a bev/ folder, as a sequence has: it is a capture all the same
+        # raw/ has a bev/ folder, like a sequence, but is a capture
         sequences = {path: s for path, s in opened.sequences().items() if s.fields() or path not in captures}
     except MissingDataError:
         if not captures:
@@ -196,7 +196,7 @@ def _captures_in(source: str | os.PathLike[str] | Source) -> dict[str, Capture]:
 
 
 def _level(location: str, paths: list[str]) -> str:
-    """Return what kind of folder was given: the paths of its sequences tell."""
+    """Return the kind of the folder, by the paths of its sequences."""
     parts = [path.split("/") for path in paths]
     if paths == [""]:
         return "coordinates"

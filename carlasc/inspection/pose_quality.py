@@ -1,7 +1,7 @@
-"""Whether poses change as those of a vehicle, how well neighbouring scans agree under them, and whether they are those of another point, or late.
+"""Checks of poses: whether they move like a vehicle, how well neighbouring scans agree under them, and whether they have a lever arm or a delay.
 
-Some runs of scans are aligned with each other (`carlasc.motion.joint_alignment`): where the sensor turns and changes its speed most, which is where
-a lever arm and a delay can be seen, and in the middle of the drive. What the scans show is compared with the given poses.
+Some runs of scans are aligned with each other (`carlasc.motion.joint_alignment`) and compared with the given poses. The runs are in the middle
+of the drive, and where the sensor turns and accelerates most, because a lever arm and a delay have the largest effect there.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
 POOR_M = 0.03
-"""Scans that disagree by more than this have poses that cost quality, if the scans agree better under others."""
+"""If scans disagree by more than this, and agree better under other poses, the poses reduce the quality of grids."""
 
 _RUN = 30  # scans of a run
 _SHIFTS, _BETTER = (
@@ -35,12 +35,12 @@ _LEVER_M = 15.0  # a turn counts by what it moves at this distance
 
 @dataclass(frozen=True)
 class PoseQuality:
-    """What some runs of scans say about the poses of a drive.
+    """The quality of the poses of a drive, measured from some runs of scans.
 
     Attributes:
-        disagreement_m: how far scans are from the surfaces that their neighbours saw, under the given poses; None if nothing tells.
-        refined_m: the same under the poses that the scans show.
-        mounting: where the sensor is in the frame of the poses, and how late these are; None if nothing tells.
+        disagreement_m: distance of scans from the surfaces that their neighbours saw, under the given poses; None if it is undetermined.
+        refined_m: the same distance under refined poses.
+        mounting: pose of the sensor in the frame of the poses, and the delay of the poses; None if they are undetermined.
     """
 
     disagreement_m: float | None
@@ -59,10 +59,10 @@ def measure_poses(
     poses: NDArray[np.float64],
     seconds: NDArray[np.float64] | None = None,
 ) -> PoseQuality:
-    """Measure how well scans agree under their poses, and what explains what they do not agree in.
+    """Measure how well scans agree under their poses, and whether a lever arm or a delay explains the disagreement.
 
     Args:
-        points: returns (N, 3) points of the i-th scan on things that stand, metres, in the frame of the sensor.
+        points: returns (N, 3) points of the i-th scan on static things, metres, in the frame of the sensor.
         poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
         seconds: (F,) their times, increasing; None for frames at 10 Hz.
     """
@@ -93,7 +93,7 @@ def measure_poses(
 
 
 def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | None:
-    """Return what poses with this mounting look like, and what to do, for a message; None if they need no correction."""
+    """Return a description of poses with this mounting and an advice, for a message; None if they need no correction."""
     wrong, values, errors = mounting.wrong, mounting.values, mounting.errors
     found, advice = [], "write corrected poses with `carlasc refine`"
     if wrong[:6].any():
@@ -107,7 +107,7 @@ def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | 
             if is_wrong
         ]
         found.append(
-            f"poses that look like those of another point of the vehicle, which have the sensor at about {place}"
+            f"poses of another point of the vehicle: in their frame, the sensor is at about {place}"
             + (f", turned by {' and '.join(turned)}" if turned else "")
         )
         advice = f"write the poses of the sensor: inv(T) @ P @ T, with T the sensor's pose in the frame of the poses (from the calibration), or {advice}"
@@ -120,7 +120,7 @@ def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | 
 
 
 def _choose_runs(poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> list[int]:
-    """Return the first rows of up to three runs that do not overlap: the sharpest turns, the greatest changes of speed, the middle."""
+    """Return the first rows of up to three runs that do not overlap: the sharpest turn, the largest acceleration, the middle."""
     count = len(poses)
     if count <= _RUN:
         return [0] if count > 2 else []
@@ -150,7 +150,7 @@ def check_poses(sequence: Sequence) -> Iterator[Finding]:
     where, frames = f"{sequence.location}/{layout.POSES}", sequence.scan_frames()
     if layout.POSES not in sequence.documents():
         if "points" in sequence.fields():
-            advice = "scans cannot be merged without poses: copy the file, or estimate poses with KISS-ICP"
+            advice = "copy the file, or estimate poses with KISS-ICP: scans cannot be merged without poses"
             yield Finding("error", "poses", sequence.path, where, "a pose for each scan", "no file", advice)
         return
     try:
@@ -173,7 +173,7 @@ def check_times(sequence: Sequence) -> Iterator[Finding]:
     where = f"{sequence.location}/{layout.TIMES}"
     if layout.TIMES not in sequence.documents():
         if "points" in sequence.fields():
-            advice = "10 Hz is assumed where times are needed"
+            advice = "copy the file; without it, 10 Hz is assumed"
             yield Finding("warning", "times", sequence.path, where, "a time for each scan", "no file", advice)
         return
     try:
@@ -190,7 +190,7 @@ def check_times(sequence: Sequence) -> Iterator[Finding]:
 
 
 def _check_lines(sequence: Sequence, document: str, lines: int) -> Iterator[Finding]:
-    """Check that each frame has a line, and that there are no lines after that of the last frame."""
+    """Check that each frame has a line, and that the file ends with the line of the last frame."""
     frames, where = sequence.scan_frames(), f"{sequence.location}/{document}"
     if not len(frames):
         return
@@ -202,14 +202,14 @@ def _check_lines(sequence: Sequence, document: str, lines: int) -> Iterator[Find
         advice = "lines are missing: copy the file again"
         yield Finding("error", kind, sequence.path, where, expected, f"{lines} lines", advice)
     elif lines > last + 1:
-        advice = "scans are missing at the end, or the file belongs to another sequence"
+        advice = "check whether scans are missing at the end, or the file belongs to another sequence"
         yield Finding(
             "warning", kind, sequence.path, where, f"{last + 1} lines, up to frame {last}", f"{lines} lines", advice
         )
 
 
 def _has_lines(sequence: Sequence, lines: int) -> bool:
-    """Return whether each frame has a line in a file of `lines` lines, by the rule of the reader."""
+    """Return whether each frame has a line in a file of `lines` lines, as readers count them."""
     try:
         for frame in sequence.scan_frames().tolist():
             sequence.line_of(frame, lines, layout.POSES)
@@ -243,9 +243,9 @@ def _check_steps(sequence: Sequence, frames: NDArray[np.int64], where: str) -> I
     """Check the first pose, and that the sensor moves and turns between frames as a vehicle can."""
     poses = np.stack([sequence.read_pose(frame) for frame in frames.tolist()])
     if frames[0] == 0 and np.abs(poses[0] - np.eye(4)).max() > 1e-3:
-        advice = "the poses are relative to another frame, which is allowed: only relative poses are used"
+        advice = "nothing to do: the poses are relative to another frame, and only relative poses are used"
         yield Finding("note", "poses", sequence.path, where, "the identity as the first pose", "another pose", advice)
-    if len(frames) < 2 or not sequence.metadata.has_rays:  # frames of a cloud without a sensor are places, not instants
+    if len(frames) < 2 or not sequence.metadata.has_rays:  # frames of a cloud without a sensor have no order in time
         return
     steps = invert(poses[:-1]) @ poses[1:]
     period_s = _periods(sequence, frames)

@@ -1,4 +1,4 @@
-"""Reports and audits as one page for a browser: a file that loads nothing else, with charts in SVG and the worst frames drawn."""
+"""Reports and audits as self-contained HTML pages, with charts in SVG and pictures of the worst frames."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write_report_page(result: ReportResult, out: str | Path) -> None:
 
 
 def describe(report: Report) -> list[tuple[str, str]]:
-    """Return what a report says, as pairs of a name and a sentence or figure."""
+    """Return the content of a report, as pairs of a name and a text."""
     coverage, convergence, actors = report.coverage, report.convergence, report.actors
     frames = report.frames
     span = f" ({frames[0]} to {frames[-1]})" if frames else ""
@@ -53,10 +53,10 @@ def describe(report: Report) -> list[tuple[str, str]]:
         ("occupied", f"{coverage.occupied_share:.1%} of the known voxels"),
     ]
     if coverage.mean_votes is not None:
-        rows.append(("votes", f"{coverage.mean_votes:.1f} for each known voxel, on average"))
+        rows.append(("votes", f"{coverage.mean_votes:.1f} per known voxel, on average"))
     if convergence is not None:
         changed = f"{convergence.changed_share:.2%} of the known voxels change their label if {LEFT_OUT:.0%} of the scans are left out"
-        rows.append(("convergence", f"{changed} ({convergence.frames} frames)"))
+        rows.append(("convergence", f"{changed} ({count(convergence.frames, 'frame')})"))
     if actors is not None:
         rows.append(("actors", _count(actors)))
     if report.poses is not None:
@@ -74,18 +74,18 @@ def describe(report: Report) -> list[tuple[str, str]]:
 
 def _count(actors: Sequence[ActorTrack]) -> str:
     if not actors:
-        return "none that moves"
+        return "no moving actor"
     labels = [actor.label for actor in actors]
     kinds = ", ".join(f"{labels.count(label)} {label}" for label in dict.fromkeys(sorted(labels)))
     residuals = sorted(actor.residual_m for actor in actors if actor.residual_m is not None)
     middle = f"; the median residual is {residuals[len(residuals) // 2]:.2f} m" if residuals else ""
     doubtful = sum(is_doubtful(actor.confidence) for actor in actors)
-    return f"{len(actors)} that move ({kinds}){f', {doubtful} of them doubtful' if doubtful else ''}{middle}"
+    return f"{len(actors)} moving ({kinds}){f', {doubtful} of them doubtful' if doubtful else ''}{middle}"
 
 
 def _poses(facts: PoseFacts) -> str:
     if facts.before_m is None or facts.after_m is None:
-        return "as given: too few points tell whether scans agree"
+        return "as given: too few points to measure whether scans agree"
     if not any(facts.changed_m):
         return f"as given: neighbouring scans agree within {100 * facts.before_m:.1f} cm"
     text = (
@@ -106,8 +106,8 @@ def _held_out(values: Mapping[str, Any]) -> str:
     if not rays["returns"]:
         return "none"
     text = f"{rays['returns']} returns: {rays['free']:.2%} in free voxels, {rays['unknown']:.2%} in unknown ones"
-    text += f"; {rays['passed_object']:.2%} pass an object before"
-    text += "" if swept is None else f"; {swept:.2%} of the vehicle's own path is occupied"
+    text += f"; {rays['passed_object']:.2%} pass through an object before their return"
+    text += "" if swept is None else f"; {swept:.2%} of the voxels that the ego vehicle drove through are occupied"
     given = values.get("given_poses")
     return (
         text
@@ -133,7 +133,7 @@ def _section(name: str, report: Report) -> str:
         votes=_part("Known voxels by their number of votes", _bars(votes)) if votes else "",
         held_out=_part("Held-out rays", _held_out_table(held_out)) if held_out and held_out["by_distance"] else "",
         actors=_part(
-            "Moving actors, and the frames in which they are seen",
+            "Moving actors by frame",
             f"{_timeline(actors, report.frames)}\n{_actor_table(actors)}",
         )
         if actors
@@ -147,7 +147,7 @@ def _part(title: str, content: str) -> str:
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[object]], *, figures: bool = False) -> str:
-    """Return a table; with `figures`, all columns but the first hold numbers."""
+    """Return a table; with `figures`, all columns except the first hold numbers."""
 
     def line(cells: Sequence[object], tag: str) -> str:
         parts = []
@@ -171,7 +171,7 @@ def _bars(rows: Sequence[tuple[str, float]]) -> str:
 
 
 def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
-    """Return one line per actor, from its first to its last observation; it is the paler the more frames in between do not show it."""
+    """Return one bar per actor, from its first to its last frame; it is paler if fewer frames in between show the actor."""
     first = min([*(actor.first for actor in actors), *frames[:1]])
     last = max([*(actor.last for actor in actors), *frames[-1:]])
     scale = 560 / max(last - first, 1)
@@ -265,12 +265,12 @@ def write_audit_page(result: AuditResult, out: str | Path) -> None:
 
     Raises:
         StorageError: the file cannot be written.
-        CarlascError: a frame that is drawn cannot be read any more.
+        CarlascError: a frame in a picture can no longer be read.
     """
     parts = []
     for path, verdicts in result.verdicts.items():
         rows = "".join(map(_row, sorted(verdicts, key=lambda v: STATES.index(v.state))))
-        about = f"{result.frames[path]} frames; the frame of the grids: {escape(result.placed[path])}."
+        about = f"{count(result.frames[path], 'frame')}; coordinate frame of the grids: {escape(result.placed[path])}."
         head = "<tr><th>check</th><th>verdict</th><th>what was found</th><th>what to do</th></tr>"
         parts.append(f"<h2>{escape(path)}</h2><p>{about}</p><table>{head}{rows}</table>")
     failed = [f"{f.where}: frame {f.frame}: {f.message}" for f in result.failures]
@@ -294,10 +294,9 @@ def _pictures(result: AuditResult) -> str:
     figures = []
     for path, number, frame, wrong in result.worst:
         one, drawn = voxels_of(result, path, number, frame)
-        for kind in range(1, FALSE_FREE + 1):  # an error is drawn above what hides it, in the highest layer
+        for kind in range(1, FALSE_FREE + 1):  # errors are drawn in the highest layer, where nothing hides them
             drawn[:, :, -1] = np.where((drawn == kind).any(axis=2), kind, drawn[:, :, -1])
         picture = one.spec.seen_from_above(drawn, _PALETTE, left_handed=one.axes == "left")
-        figures.append(
-            f"<figure>{notebook.describe(f'{path}, scan {frame}: {wrong} wrong voxels', {}, picture)}</figure>"
-        )
+        title = f"{path}, scan {frame}: {count(wrong, 'wrong voxel')}"
+        figures.append(f"<figure>{notebook.describe(title, {}, picture)}</figure>")
     return "".join(figures)

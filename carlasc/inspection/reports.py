@@ -1,4 +1,4 @@
-"""The reports of grids: read where a run left them, or made from the files."""
+"""The reports of grids: read from the files of a run, or made from the grids."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ReportResult:
     """The reports of a data set.
 
     Attributes:
-        location: what was looked at.
+        location: location of the data set.
         reports: the report of each grid, by the path of its sequence and the name of the grid: "Val/Town/cartesian/evaluation".
         failures: frames that could not be read, for reports that were made.
     """
@@ -63,22 +63,22 @@ def report(
     save: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ReportResult:
-    """Return the report of each grid of a data set: the one that its run left, or one that is made from the files.
+    """Return the report of each grid of a data set: the report that its run wrote, or one that is made from the files.
 
-    A report that is made from files has the same content as that of the run, if the scans that the grids were made from lie beside them.
+    A report that is made from the files equals that of the run, if the scans that the grids were made from are in the same sequence.
 
     Args:
         source: anything that `carlasc.open` takes.
         grid: name of one grid; None for all.
-        remake: make the reports from the files, also where there are some.
-        holdout: add held-out scores (see `carlasc.inspection.holdout`) where there are none, for Cartesian grids that were made from scans.
+        remake: make all reports from the files, also where reports exist.
+        holdout: add held-out scores (see `carlasc.inspection.holdout`) if they are missing, for Cartesian grids that were made from scans.
         save: write the reports beside their grids: folders only, and only grids that carlasc made.
-        run: how the work is spread, and who is told of the progress of reports that are made.
+        run: how the work is spread, with a callback for the progress of reports that are made.
 
     Raises:
         MissingDataError: there is no data set, or no grid of this name.
         FormatError: a report is damaged; `remake` makes it again.
-        ArgumentError: `save` with a source that is no folder.
+        ArgumentError: `save` with a source that is not a folder.
         ConflictError: `save` with a grid that carlasc did not make.
     """
     opened = as_source(source)
@@ -89,7 +89,8 @@ def report(
         if grid in (None, name) and sequence.predicted_by(name) is None
     ]
     if not grids:
-        raise MissingDataError(opened.location, expected="a grid" if grid is None else f"the grid {grid}", found="none")
+        expected, advice = "a grid" if grid is None else f"the grid {grid}", "make grids with `carlasc regrid`"
+        raise MissingDataError(opened.location, expected=expected, found="none", advice=advice)
     if save:
         for _, sequence, name in grids:
             _check_writable(sequence, name)
@@ -117,7 +118,7 @@ _Measured = FrameFacts | FrameFailure
 
 
 def _measure_all(makers: list[_ReportMaker], run: Run) -> list[list[_Measured]]:
-    """Return what was measured of the frames of each report."""
+    """Return the measurements of the frames of each report."""
     steps = StepCounter(run.progress, sum(len(maker.frames) + maker.steps_before for maker in makers))
     steps(0)
     for maker in makers:
@@ -140,7 +141,7 @@ class _ReportedFrame:
     grid: str
     number: int
     scans: ScanFrame | None  # the scans that it was made from
-    plan: GridPlan | None  # to make it again without a tenth of the scans
+    plan: GridPlan | None  # to make the grid again without a tenth of the scans
 
 
 class _ReportMaker:
@@ -164,14 +165,14 @@ class _ReportMaker:
         return 0 if self.inputs is None else self.inputs.steps_before
 
     def find_actors(self, run: Run, steps: Callable[[int], None]) -> None:
-        """Refine poses, and find the actors, if the grid was made with them; the inputs are given up if a scan cannot be read."""
+        """Refine poses and find the actors, if the grid was made so. If a scan cannot be read, the grid is not made again."""
         if self.inputs is None:
             return
         try:
             self.inputs.refine(None, run, steps)
             if self.inputs.feed.needs_actors:
                 self.inputs.actors = find_actors(self.inputs.feed, run, steps)
-        except (CarlascError, OSError):  # measuring the frame reports the scan
+        except (CarlascError, OSError):  # the error is reported when the frame is measured
             self.inputs = None
 
     def tasks(self) -> list[_ReportedFrame]:
@@ -190,7 +191,7 @@ class _ReportMaker:
         ]
 
     def make(self, measured: list[_Measured]) -> Report:
-        """Make the report of what was measured."""
+        """Make the report from the measurements."""
         sequence = self.sequence
         names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(self.grid))
         documents = {name: sequence.read_document(name) for name in names if name in sequence.documents()}
@@ -221,7 +222,7 @@ class _ReportMaker:
 
 
 def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
-    """Return the scans that a grid was made from, if they lie beside it; None otherwise."""
+    """Return the scans that a grid was made from, if they are in the same sequence; None otherwise."""
     record = sequence.params(grid).get(RECORD)
     if not isinstance(record, dict) or "points" not in sequence.fields():
         return None
@@ -234,14 +235,14 @@ def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
         plan = GridPlan(sequence.grids[grid], grid, options, voting, FrameRange.of(None))
         inputs = ScanSequence(sequence, plan, options)
         return inputs if len(inputs.feed.frames) else None
-    except (CarlascError, ValueError, TypeError, OverflowError):  # the record of another version, or no valid poses
+    except (CarlascError, ValueError, TypeError, OverflowError):  # a record of another version, or invalid poses
         return None
 
 
 def _options_of(record: Mapping[str, Any]) -> FromScans:
-    """Return the options that the record of a run names; the others have their defaults."""
+    """Return the options in the record of a run; options that it does not name have their defaults."""
     given = {option.name: record[option.name] for option in fields(FromScans) if option.name in record}
-    # The record names all that motion was taken from; several sources are those that "auto" chose.
+    # The record names all sources of motion; several sources mean that "auto" chose them.
     if "+" in str(given.get("motion", "")) or given.get("dynamic") == "tube":
         del given["motion"]
     if "window" in given:

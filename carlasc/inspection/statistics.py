@@ -1,4 +1,4 @@
-"""How many points and voxels there are of each class, and the class weights computed from them."""
+"""The number of points and voxels of each class, and the class weights computed from them."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class Histogram:
         unknown: number of unknown voxels (count 0).
         scans: number of scans counted.
         grids: number of grids counted.
-        actor_voxels: number of voxels that belong to an actor, where grids say it.
-        moving_voxels: number of voxels that move, where grids say it.
+        actor_voxels: number of voxels that belong to an actor, in grids with the field `actors`.
+        moving_voxels: number of voxels that move, in grids with the field `actors`.
     """
 
     points: NDArray[np.int64]
@@ -195,7 +195,7 @@ def stats(
         remap: the remap to the classes of a second table: a remap or its name, None for no second table, or "auto", which takes the
             paper's 11 classes or SemanticKITTI's 19.
         every: count every N-th frame.
-        run: how the work is spread, and who is told of its progress.
+        run: how the work is spread, with a callback for progress.
 
     Returns:
         The histograms. Frames that could not be read are listed in `failures`.
@@ -211,7 +211,8 @@ def stats(
     sequences = opened.sequences()
     tasks = [task for sequence in sequences.values() for task in _tasks(sequence, grid, every)]
     if not tasks:
-        raise MissingDataError(opened.location, expected=f"labels of points or the grid {grid}", found="neither")
+        expected, advice = f"labels of points or the grid {grid}", "name another grid with `grid`"
+        raise MissingDataError(opened.location, expected=expected, found="neither", advice=advice)
     classes = _common_table(tasks, opened.location)
     chosen = _choose_remap(remap, classes)
     step = StepCounter(run.progress, sum(len(frames) for _, _, frames in tasks))
@@ -254,7 +255,7 @@ def _count(task: _Task, classes: ClassTable) -> tuple[Histogram, list[tuple[str,
 
 
 def _fail(task: _Task, message: str, classes: ClassTable) -> tuple[Histogram, list[tuple[str, str]]]:
-    """Return the result of frames that no worker could count."""
+    """Return the result of frames whose workers failed."""
     sequence, field, frames = task
     return Histogram.empty(classes), [(f"{sequence.path} {field} {frame:06d}", message) for frame in frames]
 
@@ -287,7 +288,7 @@ def _table_of(sequence: Sequence, field: str) -> ClassTable:
 
 
 def _common_table(tasks: Iterable[_Task], where: str) -> ClassTable:
-    """Return the grids' table, or the points' if there are no grids: points beside a prediction are counted in its classes."""
+    """Return the class table of the grids, or of the points if there are no grids: points beside a prediction are counted in its classes."""
     fields = {(sequence.path, field): _table_of(sequence, field) for sequence, field, _ in tasks}
     grids = [table for (_, field), table in fields.items() if field != "labels"]
     tables = {table.name: table for table in grids or fields.values()}

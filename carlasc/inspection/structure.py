@@ -1,7 +1,7 @@
-"""The structure of a scan: points on static, upright objects, from which the motion of the sensor can be seen, and how well that of one scan overlaps another's.
+"""The structure of a scan: points on static, upright objects, which show the motion of the sensor; and the overlap of two structures.
 
-Points on the ground are left out: the rings of a LiDAR on flat ground move with the sensor, so that they would match best under
-the poses of a sensor that does not move. Points on moving objects, and points so near that they may be on the own vehicle, are left out too.
+Points on the ground are left out: on flat ground, the rings of a LiDAR move with the sensor, so that they match best under
+the poses of a sensor that does not move. Points on moving objects, and points so near that they may be on the ego vehicle, are left out too.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MIN_RANGE_M = 3.0
 MAX_RANGE_M = 30.0
 _COLUMN_M = 0.4
 _UPRIGHT_M = 0.6  # points in a column that spans less height are ground
-_FOOT_M = 0.3  # height of the lowest part of an upright column, which is ground too
+_FOOT_M = 0.3  # lowest part of an upright column, which counts as ground
 VOXEL_M = 0.4
 """Size of the cells."""
 
@@ -75,7 +75,7 @@ def structure_of(
 
 @cached(error_model="python")
 def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDArray[np.bool_]:
-    """Return (N,) which of (N, 3) points have a distance from the sensor between two others. Points that are not finite have none."""
+    """Return (N,) which of (N, 3) points are between two distances from the sensor. Points that are not finite are not."""
     found = np.empty(len(points), np.bool_)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -84,7 +84,7 @@ def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDA
 
 
 def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[Any] | None:
-    """Return a field of the points; None if it is missing or cannot be read, which other checks report."""
+    """Return a field of the points; None if it is missing or cannot be read (other checks report that)."""
     if field not in sequence.fields():
         return None
     try:
@@ -95,7 +95,7 @@ def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArra
 
 
 def _rows(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which rows of an (N, 3) mask are all true: `mask.all(axis=1)`, which takes seven times as long."""
+    """Return which rows of an (N, 3) mask are all true: `mask.all(axis=1)` in a seventh of its time."""
     return mask[:, 0] & mask[:, 1] & mask[:, 2]
 
 

@@ -1,7 +1,7 @@
-"""The words of cards and reports: files in `templates/`, with `$names` that are filled in.
+"""The texts of cards and reports: files in `templates/`, with `$names` that are replaced by values.
 
-`string.Template` puts values in as they are and never reads them again, so that a `$` or a brace in the name of a data set is nothing but
-text. What a value needs so that Markdown or HTML shows it as it is, who fills it in does.
+`string.Template` inserts values unchanged, so that a `$` or a brace in the name of a data set stays text. The caller escapes values for
+Markdown or HTML.
 """
 
 from __future__ import annotations

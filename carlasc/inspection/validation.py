@@ -1,4 +1,4 @@
-"""Checking a data set for everything that is known to go wrong, and naming the likely cause; also whether the files of a grid are still those that its report was made from."""
+"""Checks of a data set for known mistakes, with their likely causes; and whether the files of a grid are unchanged since its report."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Freshness:
             return None
 
     def findings(self) -> Iterator[Finding]:
-        """Yield what differs from the reports."""
+        """Yield a finding for each difference from the reports."""
         yield from self._damaged
         for grid, report in self.reports.items():
             yield from self._settings(grid, report)
@@ -120,9 +120,9 @@ class Freshness:
 
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default
-_POOR_SHARE = 0.5  # a smaller share of points in voxels of their class is an error
+_POOR_SHARE = 0.5  # a smaller share of points in voxels of their class is an error,
 _DOUBTFUL_SHARE = 0.7  # and a smaller one than this a warning
-_COARSE_M = 0.75  # in coarser voxels several classes meet, and most of each is free: a small share is no mistake
+_COARSE_M = 0.75  # coarser voxels contain several classes and much free space, so that a small share is no mistake
 _NO_OVERLAP = 0.3  # a smaller overlap of scans under the poses is a warning
 
 Progress = Callable[[int, int], None]
@@ -137,12 +137,12 @@ def validate(
     """Check a data set: files against each other, values, poses, times, and scans against poses and grids.
 
     Names, numbers of frames, poses, times and the sizes of local files are checked for all frames; contents are read for some frames. A
-    file that cannot be read is a finding, and the other files are checked all the same.
+    file that cannot be read is a finding; the other files are still checked.
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
         every: read the contents of every N-th frame; 1 reads all, None about forty frames per sequence.
-        run: how the work is spread over the sequences, and who is told of its progress.
+        run: how the work is spread over the sequences, with a callback for progress.
 
     Returns:
         The findings; `ok` is True if none of them is an error.
@@ -172,7 +172,7 @@ def validate(
 
 @dataclass(frozen=True)
 class _CheckedFrames:
-    """Which frames of a sequence are checked, and how thoroughly."""
+    """The frames of a sequence that are checked, by kind of check."""
 
     sequence: Sequence
     frames: tuple[int, ...]  # the frames of any field
@@ -188,7 +188,7 @@ def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
     found = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]))
     frames = tuple(found.tolist())
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
-    # opening a local file is cheap; a frame of a packed store has to be decoded, and cannot have a wrong size
+    # opening a local file is cheap; a frame of a packed store must be decoded, and has the right size anyway
     return _CheckedFrames(sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read)
 
 
@@ -251,7 +251,7 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
 
 
 def _figures(quality: PoseQuality | None) -> tuple[float | None, float | None, dict[str, str]]:
-    """Return what a report says of the poses."""
+    """Return what a report says about the poses."""
     if quality is None:
         return None, None, {}
     return quality.disagreement_m, quality.refined_m, {} if quality.mounting is None else quality.mounting.describe()
@@ -299,7 +299,7 @@ def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArra
 
 
 def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
-    """Measure the overlap of scans under their poses; None if there are no scans, or no valid poses."""
+    """Measure the overlap of scans under their poses; None without scans or valid poses."""
     if "points" not in sequence.fields() or layout.POSES not in sequence.documents() or not sequence.metadata.has_rays:
         return None
     frames = sequence.frames("points").tolist()
@@ -338,21 +338,23 @@ def _judge_grid(sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDi
         return
     other_classes = diagnosis.occupied_share > max(_DOUBTFUL_SHARE, diagnosis.share + 0.2)
     if diagnosis.mistake is not None and not (other_classes and diagnosis.corrected_share < _POOR_SHARE):
-        found = f"{share}; the likely cause is {diagnosis.mistake}: with it undone, {diagnosis.corrected_share:.1%}"
-        advice = "correct what writes the points or the grid, or make the grid again with `carlasc regrid`"
+        found = f"{share}; the likely cause is {diagnosis.mistake}: after correction, {diagnosis.corrected_share:.1%}"
+        advice = "correct the program that writes the points or the grid, or make the grid again with `carlasc regrid`"
         yield Finding("error", "scan-in-voxels", sequence.path, where, expected, found, advice)
     elif diagnosis.share < _DOUBTFUL_SHARE and _largest_edge(spec) <= _COARSE_M:
         if other_classes:
             found = f"{share}, but {diagnosis.occupied_share:.1%} in occupied voxels; the likely cause is labels of another class table, or in another order"
         else:
-            found = f"{share}, and undoing no known mistake raises it; the likely cause is scans and grids of different frames"
+            found = (
+                f"{share}, and no known correction raises it; the likely cause is scans and grids of different frames"
+            )
         severity: Severity = "error" if diagnosis.share < _POOR_SHARE else "warning"
         advice = "draw both with `carlasc render`, or make the grid again with `carlasc regrid`"
         yield Finding(severity, "scan-in-voxels", sequence.path, where, expected, found, advice)
 
 
 def _largest_edge(spec: GridSpec) -> float:
-    """Return the length of a voxel's longest edge in metres; of a cylindrical one, at half the radius of the grid."""
+    """Return the length of the longest edge of a voxel in metres; in a cylindrical grid, at half its radius."""
     edges = spec.voxel_size.copy()
     if spec.coordinates == "cylindrical":
         edges[1] *= (spec.lower[0] + spec.upper[0]) / 2
@@ -366,22 +368,24 @@ def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Findi
     mounting = None if quality is None else quality.mounting
     described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)
     if diagnosis.correction is not None:
-        found = f"{diagnosis.share_there:.1%} of a scan's structure on that of an earlier scan; the likely cause is {diagnosis.correction.name}: with it undone, {diagnosis.corrected_share:.1%}"
+        found = f"{diagnosis.share_there:.1%} of a scan's structure overlaps that of an earlier scan; the likely cause is {diagnosis.correction.name}: after correction, {diagnosis.corrected_share:.1%}"
         yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, diagnosis.correction.advice)
     elif described is not None:
         yield Finding("warning", "poses-on-scans", sequence.path, where, expected, *described)
     elif quality is not None and quality.is_poor:
         found = f"scans that are {100 * (quality.disagreement_m or 0):.1f} cm from the surfaces that their neighbours saw; under refined poses {100 * (quality.refined_m or 0):.1f} cm"
-        advice = "grids are made with refined poses; `carlasc refine` writes them for those who stack scans"
+        advice = "write refined poses with `carlasc refine` before you stack scans yourself; `carlasc regrid` refines them anyway"
         yield Finding(
             "warning", "pose-jitter", sequence.path, where, "scans that agree with their neighbours", found, advice
         )
     elif diagnosis.offset_m is not None:
         x, y, z = diagnosis.offset_m
-        found = f"{diagnosis.share:.1%} of a scan's structure on that of an earlier scan; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from where the poses put them"
+        found = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from their poses"
         advice = "check that the poses belong to this sequence and to these frames"
         yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, advice)
     elif diagnosis.pairs and diagnosis.share < _NO_OVERLAP:
-        found = f"{diagnosis.share:.1%} of a scan's structure on that of an earlier scan, and undoing no known mistake raises it"
-        advice = "check that the poses belong to this sequence; `carlasc convert --poses kiss-icp` estimates poses from scans"
+        found = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan, and no known correction raises it"
+        advice = (
+            "check that the poses belong to this sequence, or estimate them with `carlasc convert --poses kiss-icp`"
+        )
         yield Finding("warning", "poses-on-scans", sequence.path, where, expected, found, advice)

@@ -42,7 +42,7 @@ ERRORS = ClassTable(
 """Names and colours of the outcomes of comparing a prediction with the ground truth."""
 
 STATIC = (188, 191, 196)
-_ACTORS = (  # by number, again and again
+_ACTORS = (  # by number, periodic
     *((10, 176, 245), (213, 70, 0), (10, 165, 88), (138, 86, 194), (240, 200, 40), (200, 20, 10)),
     *((22, 208, 192), (230, 103, 176), (16, 69, 190), (154, 106, 47), (122, 201, 67), (94, 82, 83)),
 )
@@ -122,7 +122,7 @@ class ClassColors:
         return colorblind_palette(self.table) if self.palette == "colorblind" else self.table.palette
 
     def tell_shapes(self, ids: NDArray[np.int64]) -> bool:
-        """Whether the colours of the (K,) ids that occur show anything; height does where there is nothing but what data without labels have."""
+        """Whether the colours of the (K,) ids that occur are useful. Without labels they are not, and colours by height are used."""
         without = {0, self.table.geometry_id, self.table.ground_id}
         return self.palette != "height" and (self.table.geometry_id not in ids or not {*ids.tolist()} <= without)
 
@@ -178,7 +178,7 @@ def as_color(rgb: NDArray[np.uint8]) -> Color:
 
 
 def _groups(table: ClassTable) -> dict[int, int]:
-    """Return which of the eleven classes each id belongs to; ids that belong to none count as Other."""
+    """Return which of the eleven classes each id belongs to; ids without one count as Other."""
     eleven = REMAPS["carlasc11"].mapping
     if table == CARLASC11:
         return {i: i for i in table.names}

@@ -1,4 +1,4 @@
-"""Finding what a scene shows: the sequence, its ground truth, grids and frames, and reading them in the class table that is wanted."""
+"""Finding the sequence, the ground truth, the grids and the frames of a scene, and reading them in one class table."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.folder import FolderSequence
 
 SceneSource = str | os.PathLike[str] | Source | Sequence
-"""What a scene is read from: anything that `carlasc.open` takes, a grid's folder, the file of one frame, a Source or a Sequence."""
+"""The source of a scene: anything that `carlasc.open` takes, a grid's folder, the file of one frame, a Source or a Sequence."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundSequence:
-    """A sequence, and what its path says beyond that.
+    """A sequence, and the grid or frame that its path names.
 
     Attributes:
         sequence: the sequence.
         grid: name of the grid, if the path is a grid's folder or a file in it.
         frame: frame number, if the path is the file of one frame.
         is_scan: whether the path is a file of a scan (points, labels, ...).
-        note: which of several sequences was taken, or None.
+        note: the choice among several sequences, or None.
     """
 
     sequence: Sequence
@@ -53,7 +53,7 @@ def find_sequence(source: SceneSource, name: str | None = None) -> FoundSequence
 
     Raises:
         MissingDataError: there is no sequence, or none of that name.
-        FormatError: the source is nothing that can be read.
+        FormatError: the source cannot be read.
     """
     if isinstance(source, Sequence):
         return FoundSequence(source)
@@ -67,7 +67,7 @@ def find_truth(truth: SceneSource, prediction: Sequence) -> FoundSequence:
 
     Raises:
         MissingDataError: no sequence matches.
-        FormatError: the source is nothing that can be read.
+        FormatError: the source cannot be read.
     """
     if isinstance(truth, Sequence):
         return FoundSequence(truth)
@@ -140,7 +140,7 @@ def table_of(classes: ClassTable | str | None) -> ClassTable | None:
 
 
 def choose_grid(found: FoundSequence, name: str | None) -> str:
-    """Return the grid that is asked for, the one that the path names, `evaluation`, or the first."""
+    """Return the requested grid, the grid in the path, `evaluation`, or the first grid."""
     names = list(found.sequence.grids)
     wanted = name or found.grid
     if wanted is None:
@@ -153,7 +153,7 @@ def choose_grid(found: FoundSequence, name: str | None) -> str:
 
 
 def common_table(data: RemappedSequence, truth: RemappedSequence | None, wanted: ClassTable | None) -> ClassTable:
-    """Return the class table that all labels are shown in: the wanted one, the data's, or the truth's."""
+    """Return the class table for all labels: the requested one, that of the data, or that of the ground truth."""
     stored = [data.stored_table] + ([] if truth is None else [truth.stored_table])
     candidates = stored if wanted is None else [wanted]
     for table in candidates[:-1]:
@@ -173,7 +173,7 @@ def _check_remaps(stored: Iterable[ClassTable], target: ClassTable) -> None:
 
 
 def frames_with(data: RemappedSequence, truth: RemappedSequence | None, contents: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return the frames that have everything that is shown."""
+    """Return the frames that have all contents."""
     own = {"scan": ("points",), "flow": ("points", "flow"), "truth": ()}
     needed = [(data.sequence, name) for c in contents for name in own.get(c, (f"{data.grid}/labels",))]
     if truth is not None and {"truth", "errors"} & set(contents):
@@ -211,8 +211,8 @@ class RemappedSequence:
     Attributes:
         sequence: where frames are read from.
         grid: name of the grid that is read; "" for none.
-        stored: class table of the labels in the sequence; None takes what the metadata of the grid and of the scans say.
-        shown: class table that labels are read in; None leaves them as they are stored.
+        stored: class table of the labels in the sequence; None takes those in the metadata of the grid and of the scans.
+        shown: class table in which labels are returned; None leaves them as they are stored.
     """
 
     sequence: Sequence

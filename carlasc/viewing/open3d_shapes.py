@@ -1,6 +1,6 @@
-"""Open3D: what a window draws as its geometry, meshes with light, lines and points; and how it is loaded.
+"""Open3D: how it is loaded, and how a window makes its geometry: meshes with light, lines and points.
 
-It needs libraries of the system: the error says which one is missing, and what to install.
+It needs libraries of the system: the error names the missing one, and what to install.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _EDGE = 0.8  # brightness of the edges of voxels, relative to their faces
 
 
 class Shapes:
-    """Makes geometry of Open3D. Colours are RGB, 0 to 255; the light of sun and sky is in those of meshes."""
+    """Makes geometry of Open3D. Colours are RGB, 0 to 255; the colours of meshes include the light of sun and sky."""
 
     def __init__(self, o3d: ModuleType) -> None:
         self._o3d: Any = o3d
@@ -92,7 +92,7 @@ def import_open3d() -> ModuleType:
     except (ImportError, OSError) as error:
         missing = missing_library(str(error))
         if missing is None and isinstance(error, ImportError):
-            return import_extra("open3d", "view")  # says that it is not installed, or what the loader said
+            return import_extra("open3d", "view")  # the package is not installed, or the loader failed
         problem = str(error) if missing is None else f"{missing} is missing"
         raise DependencyError("open3d", problem=f"cannot be loaded: {problem}", advice=advice(missing)) from error
 

@@ -1,4 +1,4 @@
-"""The images of the cameras of a sequence, where they were taken."""
+"""The images of the cameras of a sequence, with the poses of the cameras."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from carlasc.errors import FormatError, import_extra
 from carlasc.storage.camera_files import cameras_of, has_image, image_bytes, scan_T_camera
 from carlasc.storage.protocol import Sequence
 
-_PHOTO_PX, _FRUSTUM_M = 400, 1.0  # the width of an image, and the length of the lines that show where its camera looks
+_PHOTO_PX, _FRUSTUM_M = 400, 1.0  # width of an image, and length of the drawn frustum of its camera
 _QUALITY = 70  # of a JPEG: a third of the bytes of 90, and enough for an image of a few hundred pixels
 
 
@@ -25,7 +25,7 @@ class Photo:
 
     Attributes:
         camera: the camera.
-        ego_T_camera: (4, 4) where it was when it took the image, in the frame of the scan.
+        ego_T_camera: (4, 4) its pose when it took the image, in the frame of the scan.
         data: the image as the bytes of a JPEG or PNG.
     """
 
@@ -39,7 +39,7 @@ class Photo:
         return "png" if self.data.startswith(b"\x89PNG") else "jpeg"
 
     def frustum(self, depth_m: float) -> NDArray[np.float64]:
-        """Return (8, 2, 3) lines of what the camera sees up to a depth, in the frame of the scan: from its place to four corners, and between these."""
+        """Return (8, 2, 3) lines of the frustum of the camera up to a depth, in the frame of the scan."""
         width, height = self.camera.width, self.camera.height
         looks = self.camera.unproject([(0, 0), (width, 0), (width, height), (0, height)])
         corners = transform_points(self.ego_T_camera, depth_m * looks / np.linalg.norm(looks, axis=1, keepdims=True))
@@ -47,7 +47,7 @@ class Photo:
         return np.concatenate([np.stack([places, corners], 1), np.stack([corners, np.roll(corners, -1, 0)], 1)])
 
     def smaller(self, width: int) -> bytes:
-        """Return the image as a JPEG that is not wider than so many pixels.
+        """Return the image as a JPEG of at most `width` pixels.
 
         Raises:
             FormatError: the image is damaged.
@@ -67,7 +67,7 @@ class Photo:
 
 
 def photos_of(sequence: Sequence, frame: int, mirrored: bool) -> tuple[Photo, ...]:
-    """Read the images of a frame; of cameras without one, nothing.
+    """Read the images of a frame; cameras without one are left out.
 
     Args:
         sequence: the sequence.

@@ -1,6 +1,6 @@
-"""What to look at: frames of a sequence with a grid, its ground truth, points, boxes and pose, all in one class table.
+"""Scenes: frames of a sequence with a grid, its ground truth, points, boxes and pose, all in one class table.
 
-Pictures, pages, recordings and windows, and whatever else shows data, take a `Scene` and read it through a `SceneReader`.
+Pictures, pages, recordings and windows take a `Scene` and read it with a `SceneReader`.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ from carlasc.viewing.finding import (
 from carlasc.viewing.photos import Photo, photos_of
 
 CONTENTS = ("grid", "scan", "flow", "truth", "errors")
-"""What a picture can show of a frame."""
+"""The contents of a frame that a picture can show."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Which frames of which sequence are shown, and in which classes and colours. Nothing is read before `open`.
+    """The frames of a sequence to show, and the classes and colours. Nothing is read before `open`.
 
     Attributes:
         source: a path or URL that `carlasc.open` takes, a grid's folder, the file of one frame, a Source or a Sequence.
         sequence: path or name of the sequence in the source; None takes the first.
         frames: range of frame numbers; None takes all.
-        every: take every N-th frame of the range.
+        every: show every N-th frame of the range.
         grid: name of the grid; None takes `evaluation`, or the first grid.
         truth: ground truth to compare the grid with; anything that `source` may be.
         truth_grid: name of the ground truth's grid; None as for `grid`.
         classes: class table to show, such as "carlasc11"; None shows the grid's own classes, or those of the ground truth if
             only these are common to both.
-        source_classes: class table of the labels in `source`; None takes what its metadata say.
+        source_classes: class table of the labels in `source`; None takes the one in its metadata.
         palette: "class" (the colours of the class table), "colorblind", or "height" (by height; for pictures only).
 
     Raises:
@@ -174,11 +174,11 @@ class GridPanel:
 
 @dataclass(frozen=True)
 class FrameContent:
-    """What a viewer shows of one frame.
+    """The contents of one frame.
 
     Attributes:
-        grids: one for each panel of the scene. Where the panel is "errors", labels are outcomes (`carlasc.metrics.VoxelOutcome`); where
-            it is "actors", ids of `carlasc.viewing.colors.ACTORS`.
+        grids: one for each panel of the scene. In the panel "errors", labels are outcomes (`carlasc.metrics.VoxelOutcome`); in the panel
+            "actors", ids of `carlasc.viewing.colors.ACTORS`.
         scan: the points, with labels, flow and instances where the sequence has them; None if the frame has no points.
         time_s: seconds since the first frame, or None if the sequence has no times.
         boxes: tracked boxes, sensor frame; None where the frame was not annotated.
@@ -197,14 +197,14 @@ class SceneReader:
     """Reads the frames of a scene. It holds no open files and can be sent to other processes.
 
     Attributes:
-        data: the sequence that is shown.
-        truth: the ground truth that its grid is compared with, or None.
-        contents: what is shown, names from `CONTENTS`.
+        data: the sequence.
+        truth: the ground truth to compare its grid with, or None.
+        contents: names from `CONTENTS`.
         frames: the frame numbers.
         palette: "class", "colorblind" or "height".
-        notes: what was chosen where the scene left a choice, one sentence each.
-        mirrored: whether y is mirrored: what `right_handed` returns for left-handed data.
-        by_actor: whether the voxels of the grid are also shown by actor, in a panel of their own: what `with_actors` returns.
+        notes: choices that were made for options that were not given, one sentence each.
+        mirrored: whether y is mirrored (see `right_handed`).
+        by_actor: whether a further panel shows the voxels of the grid by actor (see `with_actors`).
     """
 
     data: RemappedSequence
@@ -225,12 +225,12 @@ class SceneReader:
 
     @property
     def path(self) -> str:
-        """Path of the sequence in its source, or where it is."""
+        """Path of the sequence in its source, or its location."""
         return self.data.sequence.path or self.data.sequence.location
 
     @property
     def axes(self) -> Axes:
-        """The handedness of everything that is read: "left" where y points to the right of the vehicle."""
+        """The handedness of all data: "left" if y points to the right of the vehicle."""
         return "right" if self.mirrored else self.data.sequence.metadata.axes
 
     @property
@@ -239,11 +239,11 @@ class SceneReader:
         return self.axes == "left"
 
     def right_handed(self) -> SceneReader:
-        """Return a reader of the same frames in right-handed axes, for programs that know no others: y points to the left."""
+        """Return a reader of the same frames in right-handed axes (y to the left), for programs that need these."""
         return replace(self, mirrored=True) if self.left_handed else self
 
     def with_actors(self) -> SceneReader:
-        """Return a reader of the same frames that also shows the voxels by actor, if the grid says who is in them."""
+        """Return a reader of the same frames that also shows the voxels by actor, if the grid has the field `actors`."""
         return replace(self, by_actor=self.has(f"{self.data.grid}/instance"))
 
     def has(self, field: str) -> bool:
@@ -299,11 +299,11 @@ class SceneReader:
 
     @property
     def has_motion(self) -> bool:
-        """Whether something says how things move: the flow of points, or the velocity of voxels."""
+        """Whether motion is known: the flow of points, or the velocity of voxels."""
         return self.has("flow") or self.has(f"{self.data.grid}/velocity")
 
     def read_motion(self, frame: int, scan: Scan | None) -> Scan | None:
-        """Return what moves in a frame, with flow: points of its scan, or the middles of voxels if points have no flow; None if neither says it.
+        """Return the moving points of a frame with flow, or the centres of moving voxels if points have no flow; None if motion is not known.
 
         Raises:
             FormatError: the data do not have the format.
@@ -333,7 +333,7 @@ class SceneReader:
         """Return (4, 4) first_T_sensor of a frame, or None if neither the sequence nor its ground truth has poses.
 
         Raises:
-            FormatError: the frame has no line in the file of poses, or its line is no rigid transform.
+            FormatError: the frame has no line in the file of poses, or its line is not a rigid transform.
         """
         found = (data.read_pose(frame) for data in (self.data, self.truth) if data is not None)
         pose = next((pose for pose in found if pose is not None), None)
@@ -355,13 +355,13 @@ class SceneReader:
         return self.data.sequence.read("bev", frame).tobytes()
 
     def _instances(self, frame: int) -> NDArray[np.uint32]:
-        """Return the number of the actor of each voxel, in the shape of the grid; zeros where the frame does not say it."""
+        """Return the number of the actor of each voxel, in the shape of the grid; 0 without one."""
         if frame not in self.data.frames_with(f"{self.data.grid}/instance"):
             return np.zeros(self.data.spec.size, np.uint32)
         return self.data.read_part("instance", frame)
 
     def read_photos(self, frame: int) -> tuple[Photo, ...]:
-        """Read the images of a frame; of cameras without one, nothing."""
+        """Read the images of a frame; cameras without one are left out."""
         return photos_of(self.data.sequence, frame, self.mirrored)
 
     def _read_grids(self, frame: int) -> tuple[Grid, ...]:

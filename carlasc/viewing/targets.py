@@ -14,7 +14,7 @@ MAX_FRAMES = 60
 
 @dataclass(frozen=True)
 class ViewResult:
-    """The page or the recording that was written.
+    """A page or a recording that was written.
 
     Attributes:
         out: the file, or the folder of a page.
@@ -22,8 +22,8 @@ class ViewResult:
         panels: titles of the grids in it.
         frames: the frames in it.
         size_bytes: size of the file, or of all files in the folder.
-        elapsed_s: how long it took, seconds.
-        notes: what was chosen where the scene left a choice.
+        elapsed_s: duration, seconds.
+        notes: choices that were made for options that were not given.
     """
 
     out: Path
@@ -43,7 +43,7 @@ def first_frames(frames: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[str, .
 
 
 def check_target(out: Path, endings: Sequence[str], overwrite: bool) -> None:
-    """Check that a file can be written: its ending, and what exists at its path.
+    """Check that a file can be written: its ending, and that its path is free.
 
     Raises:
         ArgumentError: another ending, or a folder.

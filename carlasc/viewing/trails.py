@@ -1,4 +1,4 @@
-"""The ways of actors up to a frame, which pages, recordings and windows draw."""
+"""The tracks of actors up to a frame, which pages, recordings and windows draw."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from carlasc.core.scans import Scan
 from carlasc.viewing.scene import FrameContent
 
 LONGEST = 50
-"""Frames that a trail reaches back: five seconds at the rate of the data."""
+"""Length of a trail in frames: five seconds at the rate of the data."""
 
-_LEAST_WAY_M = 1.0  # what moved less stands: boxes of parked cars move by decimetres
+_LEAST_WAY_M = 1.0  # an actor that moved less is static: boxes of parked cars move by decimetres
 _MOVING_M_S = 0.2
 
 
 class Trail(NamedTuple):
-    """The way of one actor up to a frame.
+    """The track of one actor up to a frame.
 
     Attributes:
-        actor: number of the track, or of the instance where there are no boxes.
+        actor: number of the track, or of the instance without boxes.
         label: class id.
         points: (K, 3) float64 metres in the world, the frame of the first scan; the last is in the present frame.
     """
@@ -37,20 +37,20 @@ class Trail(NamedTuple):
 
 @dataclass
 class Trails:
-    """Follows the actors of a sequence through its frames, forwards or backwards. It remembers the `LONGEST` frames around the last one."""
+    """Collects the positions of actors over the frames of a sequence, forwards or backwards. It keeps `LONGEST` frames around the last one."""
 
-    _seen: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)  # places of actors, by frame
+    _seen: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)  # positions of actors, by frame
 
     def follow(self, position: int, content: FrameContent, moving: Scan | None) -> tuple[Trail, ...]:
-        """Return the trails of the actors that a frame shows and that have moved; none without poses.
+        """Return the trails of the actors in a frame that have moved; empty without poses.
 
-        An actor is where its box is. In sequences without boxes, it is in the middle of the points of its instance, or of its voxels, if
+        The position of an actor is that of its box. Without boxes, it is the mean of the points of its instance, or of its voxels, if
         these move.
 
         Args:
-            position: place of the frame in the order of frames.
+            position: index of the frame in the order of frames.
             content: the frame.
-            moving: what moves in it, with flow, as `SceneReader.read_motion` returns it.
+            moving: the moving points or voxels, with flow, as `SceneReader.read_motion` returns them.
         """
         if content.pose is None:
             return ()

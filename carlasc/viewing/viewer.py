@@ -56,7 +56,7 @@ def write_recording(
 
 
 def estimate_size(reader: SceneReader, ending: str, max_points: int | None) -> int:
-    """Return about how many bytes a recording takes: the first, the middle and the last frame are written and thrown away.
+    """Return the approximate size of a recording in bytes, from temporary copies of the first, the middle and the last frame.
 
     Args:
         reader: the scene, right-handed.
@@ -89,7 +89,7 @@ def _write(
             writer.write(frame)
             step()
     except BaseException:
-        with suppress(OSError):  # what went wrong first is reported
+        with suppress(OSError):  # the first error is reported
             writer.close()
         raise
     writer.close()
@@ -131,14 +131,14 @@ def view(
     progress: Callable[[int, int], None] | None = None,
     report: Callable[[str], None] | None = None,
 ) -> ViewResult | None:
-    """Write a scene as a page for any browser or as a recording, or, without `out`, show it in a window until that is closed.
+    """Write a scene as a page for any browser or as a recording, or, without `out`, show it in a window until it is closed.
 
     Args:
         source: a `Scene`; or anything that a scene's `source` may be. Its palette is "class" or "colorblind". A file of a scene
             without `frames` shows the first 60 frames.
-        out: file name, whose ending decides: .html is a page in one file, .rrd a recording for Rerun, .mcap one for Foxglove. A name
-            without an ending is the folder of a page, which a web server serves: the browser fetches each frame when it is shown,
-            and without `frames` the page shows the whole sequence. None opens a window.
+        out: file name. Its ending gives the format: .html is a page in one file, .rrd a recording for Rerun, .mcap a recording for
+            Foxglove. A name without an ending is the folder of a page for a web server: the browser fetches frames when it shows them, and
+            without `frames` the page shows the whole sequence. None opens a window.
         thin_m: points in a page are thinned to one per cell of this side length, metres.
         beside: another run of the same sequence, which a page compares with `source` on both sides of a divider. Anything that a
             scene's `source` may be; of several sequences, the one with the same path or name is taken.
@@ -146,14 +146,14 @@ def view(
         full_points: whether a recording keeps all points; otherwise at most 30,000 of each frame.
         overwrite: whether an existing file is replaced.
         progress: called with (frames done, frames in all) while a file is written.
-        report: called with a line of text: for a recording with `full_points` first about how large it becomes; for a window with
-            the keys and the classes, then with what each key did.
+        report: called with lines of text: for a recording with `full_points`, its approximate size; for a window, the keys and the
+            classes, and after each key its effect.
 
     Returns:
-        What the file shows and where it is; None for a window.
+        The file and its contents; None for a window.
 
     Raises:
-        ArgumentError: an argument has no meaning.
+        ArgumentError: an argument has a wrong value.
         MissingDataError: a sequence, grid or frame does not exist.
         FormatError: the data do not have the format.
         ConflictError: `out` exists.

@@ -45,7 +45,7 @@ _RIM = (140, 148, 161)
 
 @dataclass
 class WindowState:
-    """What a window shows of its scene.
+    """The state of a window.
 
     Attributes:
         position: index of the frame in the scene's frames.
@@ -68,7 +68,7 @@ class Window:
     Attributes:
         reader: reads the scene.
         state: what is shown.
-        report: called with a line of text for what a key did.
+        report: called with a line of text after a key was pressed.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Window:
         Args:
             reader: reads the scene.
             size: (width, height) of the window, pixels.
-            report: called with a line of text for what a key did.
+            report: called with a line of text after a key was pressed.
 
         Raises:
             DependencyError: Open3D or a library that it needs is missing, or there is no screen.
@@ -100,7 +100,7 @@ class Window:
         self._draw()
 
     def tick(self) -> bool:
-        """Draw, and go to the next frame if one is due while playing; return False once the window is closed."""
+        """Draw, and go to the next frame when it is due while playing; return False after the window was closed."""
         if self.state.playing and time.monotonic() >= self._due:
             self._due = time.monotonic() + FRAME_PERIOD_S
             self.step(1)
@@ -109,7 +109,7 @@ class Window:
         return alive
 
     def step(self, by: int) -> None:
-        """Go forward by a number of frames; after the last frame follows the first."""
+        """Go forward by a number of frames; the first frame follows the last."""
         self.state.position = (self.state.position + by) % len(self.reader.frames)
         self._read()
         self._draw()
@@ -260,7 +260,7 @@ class Window:
         return self._shapes.mesh(mesh)
 
     def _points(self) -> Any:
-        """Return the points in the colours of their classes, or of their actors where the panel shows these."""
+        """Return the points in the colours of their classes, or of their actors if the panel shows actors."""
         scan = self._content.scan
         if scan is None:
             return None
@@ -281,7 +281,7 @@ class Window:
         return self._shapes.mesh(arrows(tails[inside], vectors[inside], palette.ARROW, 0.24)) if inside.any() else None
 
     def _within(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which of (N, 3) places are where something else is drawn: above or below the grid if points are not shown."""
+        """Return which of (N, 3) positions are in the drawn scene: above or below the grid if points are not shown."""
         if self._panel is None or "points" in self.state.layers:
             return np.ones(len(places), np.bool_)
         spec = self._panel.spec
@@ -297,7 +297,7 @@ class Window:
         return self._shapes.lines(ends, np.repeat(self.reader.colors.by_id[boxes.labels], len(ends) // len(boxes), 0))
 
     def _tracks(self) -> Any:
-        """Return the ways of the actors, in the colours of their classes."""
+        """Return the tracks of the actors, in the colours of their classes."""
         if not self._ways or self._content.pose is None:
             return None
         ends = np.concatenate([np.stack([way.points[:-1], way.points[1:]], axis=1) for way in self._ways])

@@ -22,13 +22,13 @@ from carlasc_converters.image_files import nearest_images
 from carlasc_converters.rigid import poses_of
 
 _SPLITS: dict[str, Split] = {"train": "Train", "val": "Val", "test": "Test"}
-_LEVELS = 4  # how deep below the given folder a log may be: root/sensor/train/LOG, and one more
+_LEVELS = 4  # depth of a log below the given folder: root/sensor/train/LOG, and one more
 _SENSORS = ("up_lidar", "down_lidar")  # lasers 0 to 31, and 32 to 63
 _LASERS = 32
 _AXLE_HEIGHT_M = 0.33  # the origin of the vehicle's frame is the rear axle: measured on the ground points of two logs
 _ASSUMED_M = (1.35, 0.0, 1.58)  # midway between the two LiDARs, which are 0.11 m apart, as calibrated in log 7fab2350
 _INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
-_NEAR_NS = 100_000_000  # an image farther from its frame belongs to another one
+_NEAR_NS = 100_000_000  # an image that is farther from a frame in time does not belong to it
 _QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 
@@ -67,8 +67,8 @@ class Argoverse2(Converter):
 class Argoverse2Log(Recording):
     """One log.
 
-    Frames are the sweeps that exist and those that are annotated, so a frame keeps its number if other files of the log are missing,
-    and the tracks of objects are as long as they were annotated. Times begin at the first frame.
+    Frames are the existing and the annotated sweeps. A frame therefore keeps its number if other files of the log are missing, and tracks
+    have their annotated length. Times begin at the first frame.
 
     Attributes:
         folder: its folder.
@@ -98,7 +98,7 @@ class Argoverse2Log(Recording):
 
     @cached_property
     def _missing(self) -> tuple[list[tuple[int, int]], int]:
-        """Number and timestamp of the annotated sweeps that have no file although sweeps before and after them have; how many others."""
+        """Number and timestamp of annotated sweeps without a file between sweeps with files; and the number of others without a file."""
         missing = [(number, at) for number, at in enumerate(self._timeline.tolist()) if at not in self._sweeps]
         sweeps = list(self._sweeps)
         between = [row for row in missing if sweeps and sweeps[0] < row[1] < sweeps[-1]]
@@ -225,7 +225,7 @@ class Argoverse2Log(Recording):
         return found
 
     def problems(self) -> list[tuple[int, str]]:
-        """Return the annotated sweeps that have no file, although sweeps before and after them have."""
+        """Return the annotated sweeps without a file that are between sweeps with files."""
         lidar = self.folder / "sensors" / "lidar"
         errors = (
             (number, MissingDataError(lidar / f"{at}.feather", expected="an annotated sweep", found="no such file"))
@@ -234,7 +234,7 @@ class Argoverse2Log(Recording):
         return [(number, str(error)) for number, error in errors]
 
     def notes(self) -> list[str]:
-        """Say what the log lacks."""
+        """Return notes on what is missing in the log."""
         notes = []
         if not self._calibration.is_file():
             place = ", ".join(f"{value:.2f}" for value in _ASSUMED_M)

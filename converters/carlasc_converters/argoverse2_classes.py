@@ -1,4 +1,4 @@
-"""The classes of Argoverse 2: the categories of its boxes, and what its points are outside of boxes."""
+"""The classes of Argoverse 2: the categories of its boxes, and two classes for points outside of boxes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from carlasc.core.classes import ClassTable, Color, Remap
 from carlasc.core.tables import CARLA
 
 # The ids are those of the data set's scene flow labels: the categories in alphabetical order, from 1.
-# Points have no labels, so the last two ids, which the data set does not have, are what they are outside of boxes.
+# Points have no labels. The last two ids, which the data set does not have, are for points outside of boxes.
 _CATEGORIES: tuple[tuple[str, Color, str], ...] = (  # name, colour, class of CARLA
     ("NONE", (255, 255, 255), "Free"),
     ("ANIMAL", (70, 130, 180), "Dynamic"),

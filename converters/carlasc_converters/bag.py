@@ -39,12 +39,12 @@ class Bag(Converter):
         source: Path,
         *,
         topics: Annotated[
-            str | None, "Topics of points, one a LiDAR, by commas; the messages of the first are the frames."
+            str | None, "Topics of points, one per LiDAR, with commas. The messages of the first are the frames."
         ] = None,
-        pose_topic: Annotated[str | None, "Topic of the poses, or /tf; otherwise the only one of its kind."] = None,
-        pose_frame: Annotated[str | None, "Frame whose poses these are, where the messages do not say it."] = None,
-        world_frame: Annotated[str | None, "Frame in which poses from /tf are: odom, map, world, or the root."] = None,
-        time_unit: Annotated[TimeUnit, "Unit of the times of points; auto: from how long a scan takes."] = "auto",
+        pose_topic: Annotated[str | None, "Topic of the poses, or /tf. Needed only if there are several."] = None,
+        pose_frame: Annotated[str | None, "Coordinate frame of the poses, if the messages do not name it."] = None,
+        world_frame: Annotated[str | None, "Reference frame of poses from /tf, such as odom, map or world."] = None,
+        time_unit: Annotated[TimeUnit, "Unit of the times of points. auto: from the duration of a scan."] = "auto",
         deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = False,
     ) -> None:
         super().__init__(source)
@@ -56,14 +56,14 @@ class Bag(Converter):
         Raises:
             MissingDataError: no bag exists, or one has no points.
             ArgumentError: one has several topics of points, and none is named.
-            FormatError: a file is no bag.
+            FormatError: a file is not a bag.
         """
         return [BagRecording(BagFiles(paths), self.options) for paths in find_bags(self.source)]
 
 
 @dataclass(frozen=True)
 class BagOptions:
-    """The options of `Bag`, which says what they mean."""
+    """The options of `Bag`; see there."""
 
     topics: str | None = None
     pose_topic: str | None = None
@@ -74,9 +74,9 @@ class BagOptions:
 
 
 class BagRecording(Recording):
-    """A bag. The messages of the first LiDAR are its frames; of other LiDARs, the message that is nearest in time belongs to a frame.
+    """A bag. The messages of the first LiDAR are its frames. Messages of other LiDARs belong to the nearest frame in time.
 
-    Its times begin at the first frame. The vehicle is the frame whose poses are given, or `base_link`, or the first LiDAR.
+    Its times begin at the first frame. The frame of the vehicle is the one with poses, or `base_link`, or the first LiDAR.
     """
 
     split = "Train"
@@ -101,7 +101,7 @@ class BagRecording(Recording):
 
     @cached_property
     def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
-        """The LiDARs, where the bag's transforms say that they are on the vehicle.
+        """The LiDARs, with their poses on the vehicle from the transforms of the bag.
 
         Raises:
             MissingDataError: there are several, and no transforms between them.
@@ -123,8 +123,8 @@ class BagRecording(Recording):
 
         Raises:
             ArgumentError: there are several topics of poses, and none is named.
-            MissingDataError: no transforms lead from the LiDAR to the frame whose poses these are, or from there to the world.
-            FormatError: a pose is none, or poses and scans were not recorded at the same time.
+            MissingDataError: no transforms lead from the LiDAR to the frame of the poses, or from there to the world.
+            FormatError: a pose is not valid, or poses and scans were not recorded at the same time.
         """
         topic = self._files.poses(self._options.pose_topic)
         if topic is None or topic.channel.type in TRANSFORMS:
@@ -142,9 +142,7 @@ class BagRecording(Recording):
                 raise FormatError(where, expected="poses", found="none that can be read")
             stamps, poses = track.values
         if self._unplaced and not force:
-            advice = (
-                "name a frame that the LiDAR has a path to with `pose_frame`, or accept both as one with `force=True`"
-            )
+            advice = "name a connected frame with `pose_frame`, or take both as the same frame with `force=True`"
             raise self._no_path(self._lidars[0].frame, self._unplaced, advice)
         own = self._lidars[0].stamps
         if stamps[-1] < own[0] or stamps[0] > own[-1]:
@@ -182,14 +180,14 @@ class BagRecording(Recording):
         return {name: camera.nearest(self._lidars[0].stamps) for name, camera in self._cameras.items()}
 
     def notes(self) -> list[str]:
-        """Say what is not whole, and what was assumed."""
+        """Return notes on incomplete files, and on what was assumed."""
         notes = [*self._files.notes(), *self._notes, *(note for lidar in self._lidars for note in lidar.notes)]
         if self._pose_note:
             assumed = self._pose_child == "" and not self._options.pose_frame
-            notes.append(self._pose_note + (", as assumed: the messages do not say it" if assumed else ""))
+            notes.append(self._pose_note + (", which is assumed: the messages do not name it" if assumed else ""))
         if self._pose_note and self._unplaced:
             notes.append(
-                f"{self.location}: no transforms lead from {self._lidars[0].frame} to {self._unplaced}: both are taken as one"
+                f"{self.location}: no transforms lead from {self._lidars[0].frame} to {self._unplaced}: both are taken as the same frame"
             )
         return list(dict.fromkeys(notes))
 
@@ -203,14 +201,14 @@ class BagRecording(Recording):
 
     @cached_property
     def _pose_child(self) -> str | None:
-        """The frame of the poses as their messages say it, empty if they do not; None if there is no topic of poses, or no single one."""
+        """The frame of the poses by their messages, empty if they do not name it; None without exactly one topic of poses."""
         try:
             topic = self._files.poses(self._options.pose_topic)
             if topic is None or topic.channel.type in TRANSFORMS:
                 return None
             return next((placed.child for placed in self._placed(topic)), "")
         except CarlascError:
-            return None  # `poses` says it, if poses are asked for
+            return None  # `poses` raises the error, if poses are needed
 
     @cached_property
     def _unplaced(self) -> str | None:
@@ -220,7 +218,7 @@ class BagRecording(Recording):
 
     @cached_property
     def _vehicle(self) -> str:
-        """The frame of the vehicle: that of the poses, if it is known where it is."""
+        """The frame of the vehicle: that of the poses, if transforms lead there."""
         lidar = self._lidars[0].frame
         bases = (base for base in _BASES if base != lidar and self._tree.connected(lidar, base))
         wanted = self._options.pose_frame or self._pose_child
@@ -238,7 +236,7 @@ class BagRecording(Recording):
             self._notes.append(f"{errors[0]}: so {len(errors)} of {len(places)} messages are left out")
 
     def _poses_of_tree(self, *, required: bool) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return times and poses of the vehicle in the world; None if the tree does not say how it moves."""
+        """Return times and poses of the vehicle in the world; None if the vehicle does not move in the tree."""
         line, wanted = self._tree.ancestors(self._vehicle), self._options.world_frame
         world = next((name for name in ((wanted,) if wanted else (*_WORLDS, line[-1])) if name in line), None)
         edges = [] if world is None else self._tree.edges(self._vehicle, world)

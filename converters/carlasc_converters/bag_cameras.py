@@ -1,4 +1,4 @@
-"""The cameras of a bag: CameraInfo says how they project, Image and CompressedImage of the same namespace are what they saw."""
+"""The cameras of a bag: projections from CameraInfo, and images from Image or CompressedImage in the same namespace."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class BagCamera:
     """A camera of a bag.
 
     Attributes:
-        info: where its first CameraInfo is.
-        topic: its images; None if the bag has none.
+        info: position of its first CameraInfo.
+        topic: topic of its images; None without one.
     """
 
     info: MessagePlace
@@ -57,7 +57,7 @@ class BagCamera:
 
     @cached_property
     def images(self) -> tuple[NDArray[np.int64], list[MessagePlace]]:
-        """(N,) increasing times of the images, nanoseconds, and where they are."""
+        """(N,) increasing times of the images, nanoseconds, and their positions."""
         places = [] if self.topic is None else list(self.topic.places())
         stamps = np.array([read_stamp(place.read(), place.channel, str(place)) for place in places], np.int64)
         times, first = np.unique(stamps, return_index=True)
@@ -111,7 +111,7 @@ class BagCamera:
         """Return the ending and the bytes of a file of an image.
 
         Raises:
-            FormatError: the image is cut short, or in an encoding that is not read.
+            FormatError: the image is cut short, or its encoding is not supported.
         """
         place = self.images[1][row]
         message, where = decode(place.read(), place.channel, str(place)), str(place)
@@ -131,7 +131,7 @@ class BagCamera:
 
 
 def find_cameras(files: BagFiles) -> list[BagCamera]:
-    """Return the cameras of a bag, by the name of their topics; of several topics of images, the compressed one is read, as it is a file already."""
+    """Return the cameras of a bag, by the name of their topics; of several topics of images, the compressed one is read, because its messages are files."""
     images, found = files.of_types(IMAGES), []
     for topic in files.of_types((CAMERA_INFO,)):
         space = topic.channel.topic.rpartition("/")[0] + "/"

@@ -17,9 +17,9 @@ from carlasc_converters.bag_messages import CloudMessage, read_cloud, read_stamp
 from carlasc_converters.bag_topics import MessagePlace, Topic
 from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds
 
-_PACKETS_HZ = 150  # no LiDAR turns so often: these are packets
-_OWN_CLOCK_S = 1.0  # times of points that are farther from that of the message are those of another clock
-_PROBES = 5  # messages from which the unit of the times of points is found
+_PACKETS_HZ = 150  # messages that are more frequent are packets, because no LiDAR turns so fast
+_OWN_CLOCK_S = 1.0  # times of points that differ more from the time of the message are from another clock
+_PROBES = 5  # number of messages from which the unit of the times of points is found
 
 
 class LidarTopic:
@@ -38,12 +38,12 @@ class LidarTopic:
                 f"{topic.parts[0][0]}: {self.name}",
                 expected="a message for each turn of the LiDAR",
                 found=f"{len(topic)} messages, {1 / max(period, 1e-9):.0f} per second, of a packet each",
-                advice="set the driver to publish whole turns, and play its packets again",
+                advice="set the driver to publish full turns, and replay its packets",
             )
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.int64], list[MessagePlace]]:
-        """The time and place of each message, by time. One that cannot be read comes after the one before it: its frame says why."""
+        """The time and position of each message, by time. An unreadable message follows the one before it; reading its frame reports the error."""
         found, places = list[int | None](), list(self._topic.places())
         for place in places:
             try:
@@ -55,7 +55,7 @@ class LidarTopic:
         for stamp in found:
             stamps.append(stamps[-1] + 1 if stamp is None else stamp)
         del stamps[0]
-        known = np.array(stamps, np.int64) if any(found) else self._topic.times  # nobody filled them
+        known = np.array(stamps, np.int64) if any(found) else self._topic.times  # the fields were not filled in
         times, first = np.unique(known, return_index=True)
         if len(times) < len(stamps):
             self.notes.append(
@@ -70,7 +70,7 @@ class LidarTopic:
 
     @property
     def places(self) -> list[MessagePlace]:
-        """Where each message is."""
+        """The position of each message."""
         return self._read[1]
 
     @cached_property
@@ -82,7 +82,7 @@ class LidarTopic:
         """Yield the first messages that can be read.
 
         Raises:
-            FormatError: none can.
+            FormatError: no message can be read.
         """
         problem, count = None, 0
         for place in self.places:
@@ -118,7 +118,7 @@ class LidarTopic:
         return "auto"
 
     def nearest(self, stamps: NDArray[np.int64]) -> list[MessagePlace | None]:
-        """Return the message nearest to each time; None where it is farther away than the time between two messages."""
+        """Return the message nearest to each time; None if it is farther away than the interval of messages."""
         own = self.stamps
         reach = float(np.median(np.diff(own))) if len(own) > 1 else float("inf")
         rows = np.searchsorted((own[:-1] + own[1:]) // 2, stamps)
@@ -130,12 +130,12 @@ class LidarTopic:
 
 @dataclass(frozen=True)
 class CloudPlace:
-    """What a LiDAR saw for a frame.
+    """The points of a LiDAR for a frame.
 
     Attributes:
         sensor: index of the LiDAR.
         place: its message.
-        unit: of the times of points.
+        unit: unit of the times of points.
     """
 
     sensor: int
@@ -149,7 +149,7 @@ class BagFrame(FrameHandle):
 
     Attributes:
         stamp_ns: its time.
-        clouds: where the points of each LiDAR are.
+        clouds: the messages with the points of each LiDAR.
     """
 
     number: int
@@ -158,7 +158,7 @@ class BagFrame(FrameHandle):
     clouds: tuple[CloudPlace, ...]
 
     def read(self) -> Sequence[Cloud]:
-        """Read the points of each LiDAR. Those that are no numbers or at the origin are no returns, and left out."""
+        """Read the points of each LiDAR. Points that are NaN or at the origin are no returns, and left out."""
         return [self._read(cloud) for cloud in self.clouds]
 
     def _read(self, cloud: CloudPlace) -> Cloud:

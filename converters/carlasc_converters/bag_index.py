@@ -1,6 +1,6 @@
-"""Where each message of a bag's file is: found once, in one pass over the records, so that any message is read alone afterwards.
+"""The index of the messages in a file of a bag, from one pass over the records, so that any message can be read alone.
 
-The pass needs neither the index at the end of a file nor its end: a file that was cut short gives what is before the cut.
+The pass does not need the index at the end of a file: of a file that was cut short, all messages before the cut are read.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from carlasc.errors import FormatError, import_extra
 
 EXTRA = "bags"
 PLACE = np.dtype([("time", "<i8"), ("chunk", "<i8"), ("offset", "<i8")])
-"""Where a message is: when it was recorded, nanoseconds; where its chunk begins, -1 if it is in none; its place in the chunk or file."""
+"""The position of a message: time of its recording, nanoseconds; start of its chunk, -1 without one; its place in the chunk or file."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """What the messages of a topic are.
+    """The topic and the type of messages.
 
     Attributes:
         topic: its name.
@@ -43,7 +43,7 @@ class FileIndex:
     Attributes:
         path: the file.
         channels: by their numbers.
-        lost: what is not whole, in a few words; None if all is.
+        lost: what is incomplete, in a few words; None if the file is complete.
     """
 
     path: str

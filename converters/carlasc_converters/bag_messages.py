@@ -1,4 +1,4 @@
-"""Messages of bags that hold points, poses or transforms: which types there are, and what is read of them.
+"""Messages of bags with points, poses or transforms: the types, and how they are read.
 
 Definitions: sensor_msgs, nav_msgs and geometry_msgs of ROS as rosbags has them; tf2_msgs/TFMessage of
 https://docs.ros.org/en/noetic/api/tf2_msgs/html/msg/TFMessage.html; CustomMsg and CustomPoint of Livox of the read-me pages of
@@ -61,7 +61,7 @@ class CloudMessage:
         frame: of the sensor.
         columns: (N,) values by the names of its fields.
         pose: (4, 4) from the points to the frame; None if they are in it.
-        time_unit: of the times of points; None if its type does not say it.
+        time_unit: unit of the times of points; None if its type does not define it.
     """
 
     stamp_ns: int
@@ -72,7 +72,7 @@ class CloudMessage:
 
 
 def is_readable(channel: Channel) -> bool:
-    """Return whether messages of a type in CLOUDS, POSES, TRANSFORMS or IMAGES have an encoding in which it exists."""
+    """Return whether a type in CLOUDS, POSES, TRANSFORMS or IMAGES exists in an encoding."""
     return _ENCODINGS.get(channel.encoding) == ("foxglove" if channel.type.startswith("foxglove.") else "ros")
 
 
@@ -80,7 +80,7 @@ def read_cloud(data: bytes, channel: Channel, where: str) -> CloudMessage:
     """Return a message of one of the types `CLOUDS`.
 
     Raises:
-        FormatError: it is none.
+        FormatError: the data are not such a message.
     """
     message = decode(data, channel, where)
     with reading(where, f"a message of type {channel.type}"):
@@ -98,7 +98,7 @@ def read_stamp(data: bytes, channel: Channel, where: str) -> int:
     """Return the time of a message that begins with a header, in nanoseconds, without its content.
 
     Raises:
-        FormatError: it is cut short.
+        FormatError: the message is cut short.
     """
     with reading(where, f"a message of type {channel.type}"):
         if channel.encoding == "ros1":
@@ -114,7 +114,7 @@ def read_placed(data: bytes, channel: Channel, where: str) -> list[PlacedFrame]:
     """Return the poses or transforms of a message of one of the types `POSES` and `TRANSFORMS`.
 
     Raises:
-        FormatError: it is none.
+        FormatError: the data are not such a message.
     """
     message = decode(data, channel, where)
     with reading(where, f"a message of type {channel.type}"):
@@ -149,7 +149,7 @@ def decode(data: bytes, channel: Channel, where: str) -> Any:
     """Return a message with its fields as attributes.
 
     Raises:
-        FormatError: it is none.
+        FormatError: the data are not such a message.
     """
     with reading(where, f"a message of type {channel.type}"):
         if _ENCODINGS.get(channel.encoding) == "foxglove":
@@ -161,7 +161,7 @@ def decode(data: bytes, channel: Channel, where: str) -> Any:
 
 @cache
 def _store(encoding: str) -> Any:
-    """Return rosbags' types of messages, and those that it does not have."""
+    """Return the message types of rosbags, with added types that it does not have."""
     types = import_extra("rosbags.typesys", EXTRA)
     store = types.get_typestore(types.Stores.ROS1_NOETIC if encoding == "ros1" else types.Stores.ROS2_HUMBLE)
     for name, text in _TEXTS.items():

@@ -1,4 +1,4 @@
-"""The topics of a bag: what its files hold together, and which of them are used."""
+"""The topics of a bag: the topics in all of its files, and the choice of those to use."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _KINDS = (ros1_bag, mcap_file, db3_file)
 _ENDINGS = (".bag", ".bag.active", ".mcap", ".db3")
 _PACKED = (".db3.zstd", ".mcap.zstd")
 _LEVELS = 3  # how deep below the given folder a bag may be
-_ZSTD = b"\x28\xb5\x2f\xfd"  # a message of ROS 2 that was compressed alone: CDR never begins so
+_ZSTD = b"\x28\xb5\x2f\xfd"  # start of a single compressed message of ROS 2; CDR never begins like this
 _PART = re.compile(r"_(\d+)$")
 _EXPECTED = "a bag: .bag, .db3, .mcap"
 
 
 @dataclass(frozen=True)
 class MessagePlace:
-    """Where a message is: all that a worker needs to read it.
+    """The position of a message, so that a worker can read it.
 
     Attributes:
         path: the file.
-        channel: what the message is.
+        channel: its topic and type.
         chunk: the position of its chunk, -1 if it is in none.
         offset: its place in the chunk or file.
     """
@@ -47,7 +47,7 @@ class MessagePlace:
         """Return the content of the message.
 
         Raises:
-            FormatError: the file does not hold it.
+            FormatError: the file does not contain it.
         """
         kind = _kind_of(Path(self.path))
         with opening(self.path, f"a message of {self.channel.topic}"):
@@ -63,7 +63,7 @@ class Topic:
     """The messages of a topic, in the order of the files.
 
     Attributes:
-        channel: what they are.
+        channel: topic and type.
         parts: the path of each file, the channel there, and (N,) `PLACE` of its messages.
     """
 
@@ -72,20 +72,20 @@ class Topic:
 
     @cached_property
     def times(self) -> NDArray[np.int64]:
-        """(N,) when each message was recorded, nanoseconds."""
+        """(N,) times at which the messages were recorded, nanoseconds."""
         return np.concatenate([np.empty(0, np.int64), *(rows["time"] for _, _, rows in self.parts)])
 
     def __len__(self) -> int:
         return len(self.times)
 
     def places(self) -> Iterator[MessagePlace]:
-        """Yield where each message is."""
+        """Yield the position of each message."""
         for path, channel, rows in self.parts:
             for _, chunk, offset in rows.tolist():
                 yield MessagePlace(path, channel, chunk, offset)
 
     def __str__(self) -> str:
-        """Say the name, type, count and rate."""
+        """Return name, type, count and rate."""
         span = float(np.ptp(self.times)) / 1e9 if len(self) > 1 else 0.0
         rate = f", {(len(self) - 1) / span:.3g} Hz" if span else ""
         kind = self.channel.type.rpartition("/")[2] + (
@@ -99,8 +99,8 @@ class BagFiles:
 
     Attributes:
         paths: the files.
-        indexes: what each holds.
-        topics: those that have messages, by name.
+        indexes: the index of each file.
+        topics: topics with messages, by name.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -128,14 +128,14 @@ class BagFiles:
         return [topic for _, topic in found if topic.channel.type in types and is_readable(topic.channel)]
 
     def clouds(self, names: str | None) -> list[Topic]:
-        """Return the topics of points: those that are named, or the only one that there is.
+        """Return the named topics of points, or the only one.
 
         Args:
             names: separated by commas; None for the only one.
 
         Raises:
-            MissingDataError: there is none.
-            ArgumentError: there are several, or one that is named does not exist or does not hold points.
+            MissingDataError: the bag has no topic of points.
+            ArgumentError: the bag has several and none is named, or a named one does not exist or does not hold points.
         """
         found = self.of_types(CLOUDS)
         if names:
@@ -146,22 +146,22 @@ class BagFiles:
                 self.location,
                 expected="a topic of points: PointCloud2, CustomMsg of Livox, or PointCloud of Foxglove",
                 found="; ".join([_listed(list(self.topics.values())), *lost]),
-                advice="" if lost else "packets of a LiDAR become points where its driver replays them",
+                advice="" if lost else "if the bag holds packets of a LiDAR, replay them with its driver",
             )
         if len(found) > 1:
             raise ArgumentError(
                 "topics",
                 expected=f"one or several of {_listed(found)} in {self.location}",
                 found="none",
-                advice="name the LiDARs, first the one whose messages are the frames, separated by commas",
+                advice="name the LiDARs, separated by commas; the messages of the first become the frames",
             )
         return found
 
     def poses(self, name: str | None) -> Topic | None:
-        """Return the topic of poses: the one that is named, or the only one that there is; None if there is none.
+        """Return the named topic of poses, or the only one; None without one.
 
         Raises:
-            ArgumentError: there are several, or the one that is named does not exist or does not hold poses.
+            ArgumentError: the bag has several and none is named, or the named one does not exist or does not hold poses.
         """
         found = self.of_types(POSES)
         if name:
@@ -172,7 +172,7 @@ class BagFiles:
         return found[0] if found else None
 
     def notes(self) -> list[str]:
-        """Say which files are not whole."""
+        """Return notes on files that are incomplete."""
         lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
         if len(self.paths) > 1:
             lost.append(f"{len(self.paths)} files are parts of one recording: {self.paths[0].name} and the next")
@@ -190,7 +190,7 @@ def find_bags(source: Path) -> list[list[Path]]:
     """Return the files of each recording in a file or a folder: parts _0, _1, ... of one bag belong together.
 
     Raises:
-        MissingDataError: there is none.
+        MissingDataError: no file exists.
     """
     if source.is_file():
         return [[source]]
@@ -203,7 +203,7 @@ def find_bags(source: Path) -> list[list[Path]]:
             source,
             expected=_EXPECTED,
             found=packed or ("none" if source.is_dir() else "no such folder"),
-            advice=f"unpack it with `zstd -d {packed}`" if packed else "",
+            advice=f"unpack it with `zstd -d {packed}`" if packed else "check the path",
         )
     groups: dict[tuple[Path, str], list[tuple[int, Path]]] = {}
     for path in bags:
@@ -222,7 +222,7 @@ def _kind_of(path: Path) -> ModuleType:
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it is no bag.
+        FormatError: it is not a bag.
     """
     with opening(path, _EXPECTED), path.open("rb") as file:
         head = file.read(16)

@@ -1,4 +1,4 @@
-"""Where the LiDARs are on a vehicle, from a YAML or JSON file, and the axes in which data are given."""
+"""The poses of the LiDARs on a vehicle, from a YAML or JSON file, and the axes of data."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def read_calibration(path: Path) -> dict[str, Transform]:
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it has no sensors, or a pose is no rigid transform.
-        DependencyError: it is YAML, and PyYAML is not installed.
+        FormatError: it has no sensors, or a pose is not a rigid transform.
+        DependencyError: the file is YAML, and PyYAML is not installed.
     """
     text = read_text(path, _EXPECTED)
     with opening(path, _EXPECTED, "see the page docs/sets/scans.md for an example"):
@@ -60,7 +60,7 @@ def axes_named(name: str) -> Transform:
             left-handed ones of CARLA and Unreal, "rfu" have y forward, "rdf" are a camera's.
 
     Raises:
-        ArgumentError: these are no three directions at right angles.
+        ArgumentError: the letters are not three directions at right angles.
     """
     columns = np.array([_DIRECTIONS.get(letter, (0, 0, 0)) for letter in name.lower()], np.float64).T
     if (
@@ -79,5 +79,5 @@ def axes_named(name: str) -> Transform:
 
 
 def in_axes(transform: Transform, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (..., 4, 4) poses whose frames, the one they lead from and the one they lead to, are given in other axes."""
+    """Return (..., 4, 4) poses after a change of the axes of both their frames."""
     return transform @ poses @ transform.T

@@ -115,7 +115,7 @@ class CarlaOccRecording(Recording):
         """Return poses/lidar.txt: the number of a frame and 16 numbers per line, right-handed.
 
         Raises:
-            FormatError: a line has other values, a transform is not rigid, frames do not increase, or one has no pose.
+            FormatError: a line has other values, a transform is not rigid, frames do not increase, or a frame has no pose.
         """
         path = self.folder / "poses" / "lidar.txt"
         if not path.is_file():
@@ -166,7 +166,7 @@ class CarlaOccFrame(FrameHandle):
         """Read points, tags, and the numbers of actors of classes that move.
 
         Raises:
-            FormatError: the file is no PLY file of a semantic LiDAR, or it is incomplete.
+            FormatError: the file is not a PLY file of a semantic LiDAR, or it is incomplete.
         """
         rows = PlyVertices.open(self.location, _PROPERTIES).read()
         if not len(rows):
@@ -180,10 +180,10 @@ class CarlaOccFrame(FrameHandle):
         return (Cloud(points, labels, instances),)
 
     def read_voxels(self) -> VoxelContent | None:
-        """Read the frame's grid: what meshes fill has a class, everything else is free. All voxels are known.
+        """Read the grid of the frame: voxels in meshes have a class, all others are free. All voxels are known.
 
         Raises:
-            FormatError: the file is no grid, or its geometry is not that of the others.
+            FormatError: the file is not a grid, or its geometry differs from that of the others.
         """
         if self.grid is None:
             return None
@@ -205,7 +205,7 @@ def _numbered(folder: Path, suffix: str) -> dict[int, Path]:
 
 
 def _read_splits(root: Path) -> dict[str, Split]:
-    """Return the split of each sequence: the one that lists most of its frames, in lines "town sequence frame"."""
+    """Return the split of each sequence: the one with most of its frames, by lines "town sequence frame"."""
     counts: dict[str, Counter[Split]] = {}
     names: tuple[tuple[str, Split], ...] = (("train", "Train"), ("val", "Val"), ("test", "Test"))
     for file, split in names:

@@ -18,7 +18,7 @@ _EXPECTED = "a bag of ROS 2: a database with topics and messages"
 
 
 def index_file(path: Path) -> FileIndex:
-    """Return where the messages of a file are; of one that is cut short, those that SQLite still gives."""
+    """Return the index of the messages of a file; of a file that is cut short, those that SQLite can still read."""
     index, rows, size = FileIndex(str(path)), array("q"), path.stat().st_size
     with path.open("rb") as file:
         head = file.read(32)
@@ -46,7 +46,7 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
     """Return the content of a message, whose number is `offset`.
 
     Raises:
-        FormatError: the file does not hold it.
+        FormatError: the file does not contain it.
     """
     with _database(path) as database:
         row = database.execute("SELECT data FROM messages WHERE id = ?", (offset,)).fetchone()
@@ -66,12 +66,12 @@ def _is_whole(database: sqlite3.Connection, number: int) -> bool:
 
 @contextmanager
 def _database(path: str) -> Iterator[sqlite3.Connection]:
-    """Open a database, which is not changed."""
+    """Open a database for reading only."""
     mode = "mode=ro" if Path(f"{path}-wal").exists() else "immutable=1"
     try:
         database = sqlite3.connect(f"{Path(path).resolve().as_uri()}?{mode}", uri=True)
         try:
-            database.execute("PRAGMA writable_schema = ON")  # without it, SQLite does not open a file that is cut short
+            database.execute("PRAGMA writable_schema = ON")  # otherwise, SQLite does not open files that are cut short
             yield database
         finally:
             database.close()

@@ -32,7 +32,7 @@ def read_columns(path: Path, names: Sequence[str], texts: Sequence[str] = ()) ->
     if not path.is_file():
         raise MissingDataError(path, expected="a Feather file", found="nothing", advice="download it again")
     with opening(path, "a Feather file"):
-        table = feather.read_table(str(path), use_threads=False)  # frames are read side by side already
+        table = feather.read_table(str(path), use_threads=False)  # frames are already read in parallel
         table.validate(full=True)
     if lacking := [name for name in (*names, *texts) if name not in table.column_names]:
         found = ", ".join(table.column_names) or "no columns"

@@ -1,4 +1,4 @@
-"""Reading the files of other data sets: what the system or another library says of them becomes an error that names the file."""
+"""Reading the files of other data sets: errors of the system or of other libraries become errors that name the file."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from carlasc.storage.arrays import ArrayFormat, open_npz
 
 COPY = "the file may be cut short: copy it again"
 _OF_THE_LAYOUT = {*layout.scan_folders(), *layout.SPLITS, *layout.COORDINATES, layout.EVALUATION}
-_MISSING = "check the path, or unpack the archive of the data set that has it"
+_MISSING = "check the path, or unpack the archive that contains it"
 
 
 @contextmanager
 def opening(path: str | os.PathLike[str], expected: str, advice: str = COPY) -> Iterator[None]:
-    """Turn whatever goes wrong in a block that opens and interprets one file into an error of carlasc.
+    """Turn errors in a block that opens and reads one file into errors of carlasc.
 
     Args:
         path: the file.
-        expected: what it should hold.
+        expected: content that it should have.
         advice: what to do if it does not.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it cannot be read, or does not hold what it should.
+        FormatError: the file cannot be read, or has another content.
     """
     with reading(path, expected, advice):
         try:
@@ -41,21 +41,21 @@ def opening(path: str | os.PathLike[str], expected: str, advice: str = COPY) -> 
 
 
 def sequence_name(name: str) -> str:
-    """Return a name that the layout can have for a sequence, from that of a file or a folder."""
+    """Return a valid name of a sequence in the layout, from the name of a file or a folder."""
     name = re.sub(r"[^\w-]+", "_", name)
     return f"{name}_recording" if name in _OF_THE_LAYOUT else name
 
 
 Version = tuple[int, int]
-"""What tells a file from one that was written in its place: nanoseconds of its last change, and bytes."""
+"""The version of a file: nanoseconds of its last change, and its size in bytes."""
 
 
 def version_of(path: str | os.PathLike[str], expected: str = "a file") -> Version:
-    """Return the version of a file: part of the key under which a process keeps what it read of it.
+    """Return the version of a file, for the keys of caches.
 
     Raises:
-        MissingDataError: it does not exist.
-        FormatError: it cannot be looked at.
+        MissingDataError: the file does not exist.
+        FormatError: its metadata cannot be read.
     """
     with opening(path, expected):
         status = Path(path).stat()
@@ -89,12 +89,12 @@ def read_arrays(path: str | Path, formats: Mapping[str, ArrayFormat], advice: st
 
     Args:
         path: the file.
-        formats: what each array that it must have is, by its name.
+        formats: type and shape of each required array, by its name.
         advice: what to do if the file is missing or damaged.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it is no .npz file, is damaged, or lacks an array; or an array has another type, shape or size.
+        FormatError: it is not an .npz file, is damaged, or lacks an array; or an array has another type, shape or size.
     """
     try:
         with open_npz(path) as arrays:

@@ -1,6 +1,6 @@
 """Foxglove's own messages of points and poses, as protobuf or JSON: https://docs.foxglove.dev/docs/sdk/schemas.
 
-Protobuf is decoded by a table of the fields that are needed, with their published numbers, so that no library is.
+Protobuf is decoded with a table of the needed fields and their published numbers, without a library.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def read_message(data: bytes, kind: str, encoding: str) -> Any:
         encoding: "protobuf" or "json".
 
     Raises:
-        ValueError, struct.error, LookupError: it is none.
+        ValueError, struct.error, LookupError: the data are not such a message.
     """
     return _from_json(json.loads(data), kind) if encoding == "json" else _from_protobuf(memoryview(data), kind)
 

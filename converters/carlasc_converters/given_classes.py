@@ -1,4 +1,4 @@
-"""The class table of somebody's labels: one that carlasc or a converter has by name, or that of a JSON file."""
+"""The class table of given labels: a table of carlasc or of a converter, by name, or from a JSON file."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from carlasc.storage.predictions import read_table
 
 
 def classes_given(name: str) -> tuple[ClassTable, Remap | None]:
-    """Return a class table, and how its ids become CarlaSC's; None if nothing says so, or if they are CarlaSC's.
+    """Return a class table, and the map of its ids to CarlaSC's; None if no map exists, or if they are CarlaSC's.
 
     Args:
         name: the name of a table, or the path of a JSON file with a table as carlasc.json has it, or of a carlasc.json.
 
     Raises:
-        ArgumentError: no table has the name, and no file.
-        FormatError: the file holds no class table.
+        ArgumentError: neither a table nor a file has this name.
+        FormatError: the file does not hold a class table.
     """
     table = _table(name)
     remaps = remaps_to_carla(table)
@@ -33,7 +33,7 @@ def _table(name: str) -> ClassTable:
     for converter in converter_names():
         try:
             table = load_converter(converter).classes
-        except (DependencyError, AttributeError):  # of another distribution, broken or without a table of its own
+        except (DependencyError, AttributeError):  # a broken converter, or one without a class table
             continue
         if table.name == name:
             return table

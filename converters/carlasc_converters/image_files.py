@@ -1,4 +1,4 @@
-"""Which image of a camera belongs to each frame: the nearest in time."""
+"""The image of a camera for each frame: the nearest in time."""
 
 from __future__ import annotations
 

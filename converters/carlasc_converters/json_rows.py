@@ -1,4 +1,4 @@
-"""Rows of large JSON tables, one after the other, so that a table of a gigabyte needs no more memory than what is kept of it."""
+"""Rows of large JSON tables, one after the other, so that only the values that are kept need memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from carlasc_converters.files import opening
 
 _CHUNK = 1 << 20  # characters read at a time
 _LONGEST_ROW = 4 * _CHUNK
-_TOO_LARGE = 2**63  # of a number in a table: it does not fit into 64 bits
+_TOO_LARGE = 2**63  # numbers from here on do not fit into 64 bits
 _GAP = re.compile(r"[\s,]*")
 _EXPECTED = "a JSON list of objects"
 _OTHER = "the file is damaged, or belongs to another version of the data set"
@@ -28,14 +28,14 @@ def read_rows(
     Args:
         path: the file, in UTF-8.
         keys: keys that each object must have. Others are ignored.
-        kinds: the type of the value of a key, or a number for a list of so many numbers; text if a key is not in it.
+        kinds: the type of the value of a key, or N for a list of N numbers; text for other keys.
 
     Yields:
         The values in the order of `keys`.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it is not a list of objects, breaks off, or an object lacks a key or has another value than it must.
+        FormatError: the file is not a list of objects or is cut short, or an object lacks a key or has a wrong value.
     """
     wanted = [(kinds or {}).get(key, str) for key in keys]
     for number, row in enumerate(_objects(path)):
@@ -53,7 +53,7 @@ def read_rows(
 
 
 def _is_of(value: object, kind: type | int) -> bool:
-    """Return whether a value is of a type, or a list of so many numbers."""
+    """Return whether a value is of a type, or a list of the given length of numbers."""
     if kind in (int, float):
         return _is_number(value) and isinstance(value, int | float if kind is float else int)
     if isinstance(kind, type):

@@ -96,7 +96,7 @@ class KittiRecording(Recording):
         return Trajectory(poses, where=str(path))
 
     def _pose_files(self) -> tuple[Path, ...]:
-        """Return where poses may be: in the sequence, or, for KITTI odometry, in poses/ beside sequences/."""
+        """Return the possible files of poses: in the sequence, or, for KITTI odometry, in poses/ beside sequences/."""
         return self.folder / "poses.txt", self.folder.parent.parent / "poses" / f"{self.folder.name}.txt"
 
     def _calibration(self, poses: Path, *, force: bool) -> Transform:
@@ -184,7 +184,7 @@ class KittiFrame(FrameHandle):
         labels = both.astype(np.uint16)  # keeps the low 16 bits
         actors = both >> 16
         # SemanticKITTI numbers the instances of each class from 1, so the class is part of an actor's number.
-        # A moving car and the same car standing get the same number.
+        # A car gets the same number whether it moves or not.
         return labels, np.where(actors > 0, _CLASS_PART[labels] | actors, np.uint32(0))
 
     def read_voxels(self) -> VoxelContent | None:
@@ -224,4 +224,4 @@ def _split_of(name: str) -> Split:
 _CLASS_PART = np.arange(1 << 16, dtype=np.uint32) << 16
 _CLASS_PART[list(SEMANTICKITTI.standing)] = _CLASS_PART[list(SEMANTICKITTI.standing.values())]
 CLASS_PARTS = np.unique(_CLASS_PART[[label for label in SEMANTICKITTI.names if label]])
-"""What the classes of actors add to the numbers of SemanticKITTI."""
+"""Offsets of the classes of actors for the instance numbers of SemanticKITTI."""

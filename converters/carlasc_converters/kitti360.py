@@ -1,4 +1,4 @@
-"""KITTI-360: scans that are not corrected for motion, poses of some frames, labels of accumulated clouds. See `docs/sets/kitti360.md`."""
+"""KITTI-360: scans without motion correction, poses of some frames, labels from accumulated clouds. See `docs/sets/kitti360.md`."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from carlasc_converters.kitti_files import (
     sweep_seconds,
 )
 
-_TEST = ("2013_05_28_drive_0008_sync", "2013_05_28_drive_0018_sync")  # drives whose labels are held back
+_TEST = ("2013_05_28_drive_0008_sync", "2013_05_28_drive_0018_sync")  # drives whose labels are not published
 _SCANS = "velodyne_points"
 _IMAGE_SIZE = (1408, 376)  # of the rectified images
-_TICK_S = 1e-4  # points of so short a time have the same pose
+_TICK_S = 1e-4  # points within this time share a pose
 
 
 class Kitti360(KittiConverter):
@@ -129,7 +129,7 @@ class Kitti360Drive(Recording):
         return FrameTimes.read(self.files.scans / "timestamps.txt", self._numbers)
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
-        """Return the poses of the LiDAR at the times of the frames that have one; the car stands in the others."""
+        """Return the poses of the LiDAR at the times of frames with a pose; the car is at rest in the others."""
         return read_trajectory(self.files, self._times.seconds, force=force) if self.files.poses.is_file() else None
 
     def times(self) -> NDArray[np.float64] | None:
@@ -137,7 +137,7 @@ class Kitti360Drive(Recording):
         return self._times.seconds
 
     def cameras(self) -> Sequence[CameraModel]:
-        """Return the two rectified cameras that look ahead; none without their calibration. The model of the fisheyes is not ours."""
+        """Return the two rectified front cameras; empty without their calibration. The layout has no model of the fisheye cameras."""
         folder = self.files.calibration
         if not (folder / "perspective.txt").is_file() or not (folder / "calib_cam_to_velo.txt").is_file():
             return ()
@@ -159,7 +159,7 @@ class Kitti360Drive(Recording):
         )
 
     def notes(self) -> list[str]:
-        """Return which labels are missing, and how they were found."""
+        """Return notes on missing labels, and on how labels were found."""
         if not self.has_labels:
             return [f"labels cannot be given to scans without {self.files.poses}"] if self._windows else []
         without = sum(window_at(self._windows, number) is None for number in self._numbers)
@@ -215,7 +215,7 @@ def read_trajectory(files: Kitti360Files, times: NDArray[np.float64], *, force: 
     Args:
         files: of the drive.
         times: (F,) seconds by frame number.
-        force: take the poses for those of the LiDAR if a calibration is missing.
+        force: if a calibration is missing, take the poses as those of the LiDAR.
 
     Raises:
         MissingDataError: a calibration is missing.
@@ -230,7 +230,7 @@ def read_trajectory(files: Kitti360Files, times: NDArray[np.float64], *, force: 
             advice="copy it and timestamps.txt again",
         )
     world_T_lidar = world_T_imu @ _imu_T_lidar(files.calibration, force)
-    # Frames have no pose where the car stands, also at the beginning and the end of a drive.
+    # Frames have no pose while the car is at rest, also at the beginning and the end of a drive.
     before = frames[:1] - 1 if frames[0] > 1 else frames[:0]
     after = frames[-1:] + 1 if frames[-1] < len(times) - 2 else frames[:0]
     held = np.concatenate([world_T_lidar[: len(before)], world_T_lidar, world_T_lidar[-1:][: len(after)]])

@@ -1,6 +1,6 @@
-"""Labels of KITTI-360's scans, from its accumulated point clouds: scans have none of their own.
+"""Labels of KITTI-360's scans, from its accumulated point clouds, because scans have no labels.
 
-A cloud covers a window of frames. `static/` holds what stands; `dynamic/` holds what moves, with the frame of each point as its time stamp.
+A cloud covers a window of frames. `static/` holds static points; `dynamic/` holds moving points, with the frame of each as its time stamp.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from carlasc_converters.ply import PlyVertices
 MAX_DISTANCE_M = 0.2  # a point farther than this from every labelled one stays unlabelled
 _WINDOW = re.compile(r"(\d{10})_(\d{10})\.ply")
 _PER_CLASS = 1000  # instance = 1000 * class + number in the class, 0 for none
-_MAX_CLASS = 65535  # what does not fit into 16 bits is no class: it is reported as this one
+_MAX_CLASS = 65535  # values that do not fit into 16 bits are no classes, and are reported as this one
 _COLUMNS = ("x", "y", "z", "semantic", "instance")
 
 
@@ -51,14 +51,14 @@ class Labelled:
         spatial = import_extra("scipy.spatial", "kitti")
         points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
         check_finite(points, where)
-        # An unbalanced tree is built several times faster, and as fast to search where points lie on surfaces.
+        # An unbalanced tree is built several times faster, and searched as fast if points are on surfaces.
         tree = spatial.cKDTree(points, leafsize=32, compact_nodes=False, balanced_tree=False) if len(rows) else None
         labels = np.clip(rows["semantic"], 0, _MAX_CLASS).astype(np.uint16)
         numbered = np.clip(rows["instance"], 0, None).astype(np.uint32)
         return cls(tree, labels, np.where(numbered % _PER_CLASS > 0, numbered, 0).astype(np.uint32))
 
     def nearest(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the distance and the index of the nearest point to each of (M, 3); infinite if none is near enough."""
+        """Return the distance and the index of the nearest point for each of (M, 3) points; infinite if none is near enough."""
         if self.tree is None:
             return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
         finite = np.asarray(np.isfinite(points).all(axis=1))
@@ -77,7 +77,7 @@ def windows_of(static: Path) -> dict[str, tuple[int, int]]:
 
 
 def window_at(windows: dict[str, tuple[int, int]], frame: int) -> str | None:
-    """Return the window in which a frame is farthest from both ends, because windows overlap; None if it is in none."""
+    """Return the window in which a frame is farthest from both ends, because windows overlap; None without a window."""
     depths = {name: min(frame - first, last - frame) for name, (first, last) in windows.items()}
     best = max(depths, key=lambda name: depths[name], default=None)
     return best if best is not None and depths[best] >= 0 else None
@@ -88,7 +88,7 @@ def label_points(
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint32]]:
     """Return the class and the instance of each point of a scan: those of the nearest labelled point within `MAX_DISTANCE_M`.
 
-    Points that stand count in all frames of the window, points that move only in their own frame.
+    Static points are used in all frames of the window, moving points only in their own frame.
 
     Args:
         folder: the folder that holds static/ and dynamic/.
@@ -113,7 +113,7 @@ def label_points(
     return labels, instances
 
 
-@lru_cache(maxsize=1)  # one window per process: frames are read in their order
+@lru_cache(maxsize=1)  # one window per process, because frames are read in order
 def _standing(path: str, version: Version) -> Labelled:
     return Labelled.of(PlyVertices.open(path, _COLUMNS).read(), path)
 

@@ -34,7 +34,7 @@ KITTI = ClassTable(
 )
 KITTI_TO_CARLA = Remap("kitti_to_carla", KITTI, CARLA, {i: carla for i, (_, _, carla) in enumerate(_CLASSES)})
 
-ONLY_IN_VIEW = "boxes exist in the view of the front camera only: no box elsewhere does not mean that nothing is there"
+ONLY_IN_VIEW = "boxes exist only in the view of the front camera: elsewhere, objects have no boxes"
 _OTHER_NAMES = {"Person": "Person_sitting", "Person (sitting)": "Person_sitting"}
 _TYPES = {name: index for index, name in KITTI.names.items() if index in KITTI.movable}
 
@@ -82,7 +82,7 @@ class BoxRows:
         """Return the boxes by frame.
 
         Raises:
-            FormatError: a box has no size or no place, or a track has two boxes in a frame.
+            FormatError: a box has no valid size or position, or a track has two boxes in a frame.
         """
         return {frame: self._of_frame(frame) for frame in self._rows}
 

@@ -26,7 +26,7 @@ def rectified_cameras(
 ) -> list[CameraModel]:
     """Return the cameras whose projections a calibration has, in the frame of the LiDAR.
 
-    The scans' times are those of the images, which the scanner triggers. The size of the images is that of the first one that exists.
+    Scans and images have the same times, because the scanner triggers the cameras. The size of the images is that of the first existing one.
 
     Args:
         calibration: a file with lines of 12 numbers.
@@ -34,10 +34,10 @@ def rectified_cameras(
         projections: name of each camera -> name of its projection.
         image_of: returns the path of a camera's image of a frame.
         frames: numbers of the frames.
-        size: columns and rows of the images, where none exists.
+        size: columns and rows of the images, if none exists.
 
     Raises:
-        FormatError: a projection is none.
+        FormatError: a projection is not valid.
     """
     found = []
     for name, key in projections.items():
@@ -73,7 +73,7 @@ def _size_of(path: Path) -> tuple[int, int]:
     """Return columns and rows of a PNG from its header.
 
     Raises:
-        FormatError: it is none.
+        FormatError: the file is not a PNG.
     """
     head = path.open("rb").read(24) if path.stat().st_size >= 24 else b""
     if not head.startswith(b"\x89PNG\r\n\x1a\n"):

@@ -1,4 +1,4 @@
-"""What the data sets of the KITTI family have in common: the car and its scanner, and the files of scans, calibrations and time stamps."""
+"""The common parts of the KITTI data sets: the car and its scanner, and the files of scans, calibrations and time stamps."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def read_lines(path: Path, expected: str, content: str) -> list[str]:
 
     Args:
         path: the file.
-        expected: what the file is for, in the error if it does not exist.
-        content: what it holds, in the error if it is not text.
+        expected: purpose of the file, for the error if it does not exist.
+        content: content of the file, for the error if it is not text.
 
     Raises:
         MissingDataError: the file does not exist.
@@ -83,10 +83,10 @@ def read_scan(path: str) -> NDArray[np.float32]:
 def sweep_seconds(points: NDArray[np.float32], period_s: float) -> NDArray[np.float32]:
     """Return (N,) the time of each point after the time of its scan, from its azimuth.
 
-    The scanner turns once in `period_s`. A sweep begins behind the car and passes the left side, the front, where its time is that of the
-    scan, and the right side: clockwise, seen from above. This is how KITTI-360's tools correct scans for motion (`CurlVelodyneData`). The
-    documentation of KITTI's raw data says that the scanner turns counter-clockwise; under that, scans of a drive fit each other worse
-    than without any correction, and under this they fit best.
+    The scanner turns once in `period_s`. A sweep begins behind the car and passes the left side, the front (at the time of the scan) and
+    the right side: clockwise, seen from above. KITTI-360's tools correct scans for motion in the same way (`CurlVelodyneData`). The
+    documentation of KITTI's raw data says that the scanner turns counter-clockwise; with that direction, the scans of a drive agree less
+    than without any correction, and with this one they agree best.
     """
     return (np.arctan2(points[:, 1], points[:, 0]) * (-period_s / (2 * np.pi))).astype(np.float32)
 
@@ -117,7 +117,7 @@ class Calibration:
 
         Args:
             path: the file.
-            expected: what the file is for, in the error if it does not exist.
+            expected: purpose of the file, for the error if it does not exist.
 
         Raises:
             MissingDataError: the file does not exist.
@@ -137,7 +137,7 @@ class Calibration:
         """Return the (4, 4) transform of the first of some names that exists: three rows of four numbers.
 
         Raises:
-            FormatError: none exists, the number of its values is wrong, or it is not rigid.
+            FormatError: no name exists, the number of its values is wrong, or the transform is not rigid.
         """
         return self._rigid(np.reshape(self._numbers(12, *names), (3, 4)), names[0])
 
@@ -206,8 +206,8 @@ class FrameTimes:
     def read(cls, path: Path, frames: Sequence[int]) -> FrameTimes:
         """Read a file of time stamps, of which line i belongs to frame i. Time 0 is the first one.
 
-        A file with exactly one line per scan goes by their order. Times that are absent are interpolated: only frames without a scan may
-        lack theirs.
+        In a file with exactly one line per scan, lines are in the order of the scans. Missing times of frames without a scan are
+        interpolated.
 
         Args:
             path: timestamps.txt.

@@ -145,12 +145,12 @@ class RawDrive(Recording):
         return rectified_cameras(cameras, rectified_T_lidar, projections, image_of, self._numbers)
 
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the boxes of tracklet_labels.xml. They exist in the view of the camera only."""
+        """Return the boxes of tracklet_labels.xml. They exist only in the view of the camera."""
         path = self.folder / "tracklet_labels.xml"
         return read_tracklets(path, self._numbers) if path.is_file() else None
 
     def notes(self) -> list[str]:
-        """Return which packets are missing, and what the boxes cover."""
+        """Return notes on missing packets, and on the area that the boxes cover."""
         found = []
         if self._packets and (without := sorted(set(self._numbers) - set(self._packets))):
             found.append(

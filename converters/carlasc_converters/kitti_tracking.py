@@ -1,4 +1,4 @@
-"""KITTI's tracking benchmark: scans and tracked boxes, poses where OXTS is there. See `docs/sets/kitti-tracking.md`."""
+"""KITTI's tracking benchmark: scans and tracked boxes, and poses from OXTS files if they exist. See `docs/sets/kitti-tracking.md`."""
 
 from __future__ import annotations
 
@@ -140,9 +140,9 @@ class TrackingSequence(Recording):
         return rectified_cameras(calibration, _camera_T_lidar(calibration), projections, image_of, self._numbers)
 
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the boxes of label_02/ in the frame of the LiDAR; tracks count from 1, so that they are those of the file plus 1.
+        """Return the boxes of label_02/ in the frame of the LiDAR; tracks count from 1: those of the file plus 1.
 
-        They exist in the view of the camera only.
+        Boxes exist only in the view of the camera.
         """
         path = self._file("label_02")
         return self._read_boxes(path) if path.is_file() else None
@@ -172,7 +172,7 @@ class TrackingSequence(Recording):
         return rows.boxes()
 
     def notes(self) -> list[str]:
-        """Return what was assumed, and what the boxes cover."""
+        """Return notes on what was assumed, and on the area that the boxes cover."""
         times = f"the benchmark has no times: {PERIOD_S} s between frames is assumed, the mean of KITTI's raw data"
         view = [ONLY_IN_VIEW] if self._file("label_02").is_file() else []
         return [times, *view]

@@ -23,7 +23,7 @@ _ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 
 
 def index_file(path: Path) -> FileIndex:
-    """Return where the messages of a file are."""
+    """Return the index of the messages of a file."""
     walk, size = _McapRecords(path), path.stat().st_size
     at, ended = len(MAGIC), False
     with path.open("rb") as file:
@@ -64,7 +64,7 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
     """Return the content of a message.
 
     Raises:
-        FormatError: the file does not hold one there.
+        FormatError: the file has no message there.
     """
     if chunk < 0:
         with Path(path).open("rb") as file:
@@ -87,8 +87,8 @@ class _McapRecords:
         index: the messages.
         schemas: names of types by number.
         channels: topic, number of the schema and encoding, by number.
-        loose: when each message outside of chunks was recorded and where it is, by channel.
-        chunk: where the last chunk begins; -1 before the first.
+        loose: time and position of each message outside of chunks, by channel.
+        chunk: position of the last chunk; -1 before the first.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,7 +124,7 @@ class _McapRecords:
         except FormatError:
             if not (whole and entries):
                 raise
-            self._add(chunk, entries)  # the channels may be known later; its frames say that it is damaged
+            self._add(chunk, entries)  # the channels may be known later; reading its frames reports the damage
             return
         for kind, begin, end in _records(data):
             if kind == _MESSAGE:
@@ -151,7 +151,7 @@ class _McapRecords:
 
 @lru_cache(maxsize=2)
 def _read_chunk(path: str, at: int, version: Version) -> bytes:
-    """Return the content of a chunk; the last two are kept, because frames come in their order."""
+    """Return the content of a chunk; the last two are cached, because frames are read in order."""
     try:
         with Path(path).open("rb") as file:
             file.seek(at)

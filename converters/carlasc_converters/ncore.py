@@ -17,7 +17,7 @@ from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor,
 from carlasc.core import CameraModel
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, check_rigid, invert, multiply, quaternions_of
-from carlasc.errors import FormatError, MissingDataError
+from carlasc.errors import FormatError, MissingDataError, count
 from carlasc_converters.files import opening, sequence_name
 from carlasc_converters.kitti_boxes import BoxRows
 from carlasc_converters.ncore_cameras import NcoreCamera
@@ -30,7 +30,7 @@ _COMPONENT = "v1"
 _KINDS = ("lidars", "poses", "cuboids", "cameras", "intrinsics")
 _RIG, _WORLD = "rig", "world"
 _NS = 1000  # nanoseconds in a microsecond
-_ALONE_US = 50_000.0  # how far from a single frame what belongs to it may be
+_ALONE_US = 50_000.0  # greatest distance in time from a single frame to the data that belong to it
 
 
 class Ncore(Converter):
@@ -44,7 +44,7 @@ class Ncore(Converter):
         """Return the sequences that have a LiDAR, by name.
 
         Raises:
-            MissingDataError: there is none.
+            MissingDataError: no sequence exists.
             FormatError: a store has another version.
         """
         stores = defaultdict[tuple[Path, str], list[NcoreStore]](list)  # those of one sequence lie in one folder
@@ -60,6 +60,7 @@ class Ncore(Converter):
                 self.source,
                 expected=f"stores of NCore: {' or '.join(f'*{suffix}' for suffix in SUFFIXES)}",
                 found="none",
+                advice="check the path, or unpack the archives",
             )
         return list(found)
 
@@ -98,7 +99,7 @@ class NcoreRecording(Recording):
         return found
 
     def _component(self, kind: str) -> tuple[NcoreStore, str] | None:
-        """Return the component of a kind that is named default, as in NCore, or else the first; None if there is none."""
+        """Return the component of a kind with the name default, as in NCore, otherwise the first; None without one."""
         found = self._components[kind]
         return found.get("default") or next(iter(found.values()), None)
 
@@ -125,7 +126,7 @@ class NcoreRecording(Recording):
 
     @cached_property
     def _slack_us(self) -> float:
-        """Half of the time between frames: what is farther from a frame does not belong to it."""
+        """Half of the time between frames: data that are farther from a frame do not belong to it."""
         ends = self._first[:, 1]
         return float(np.median(np.diff(ends))) / 2 if len(ends) > 1 else _ALONE_US
 
@@ -221,7 +222,7 @@ class NcoreRecording(Recording):
             return [(self._frame_at(int(entry["timestamp_us"])), entry) for entry in given]
 
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the cuboids of each frame in which any was observed, in the frame of the rig at its time; None if there are none."""
+        """Return the cuboids of each frame with observations, in the frame of the rig at its time; None without any."""
         if not self._observations:
             return None
         annotated = sorted({frame for frame, _ in self._observations} - {-1})
@@ -260,7 +261,7 @@ class NcoreRecording(Recording):
         return {camera.name: camera.nearest(self._first[:, 1], self._slack_us) for camera in self._cameras}
 
     def cameras(self) -> Sequence[CameraModel]:
-        """Return the cameras whose model is one of the layout's, and that the poses place on the vehicle."""
+        """Return the cameras with a model of the layout and with poses that lead to the vehicle."""
         found, at = [], self._first[:1, 1] * _NS
         for camera in self._cameras:
             if camera.unknown is None and self._tree.connected(camera.name, self._vehicle):
@@ -276,7 +277,7 @@ class NcoreRecording(Recording):
         return None if row is None else next(own for own in self._cameras if own.name == camera.name).read(row)
 
     def notes(self) -> list[str]:
-        """Return what of the recording was left out, and which classes of objects are not known."""
+        """Return notes on what was left out of the recording, and on unknown classes of objects."""
         notes = [
             f"the camera {camera.name} was left out: {camera.unknown or f'no poses lead to {self._vehicle}'}"
             for camera in self._cameras
@@ -285,20 +286,20 @@ class NcoreRecording(Recording):
         for kind in ("poses", "cuboids", "intrinsics"):
             chosen, found = self._component(kind), self._components[kind]
             if others := [name for name, component in found.items() if component != chosen]:
-                notes.append(f"of several {kind}, others than the one that was read: {', '.join(others)}")
+                notes.append(f"several {kind}: only one was read, not {', '.join(others)}")
         if idle := sorted(self._components["lidars"].keys() - self._lidars.keys()):
             notes.append(f"LiDARs without frames were left out: {', '.join(idle)}")
         if far := sum(frame < 0 for frame, _ in self._observations):
-            notes.append(f"{far} observations of boxes are at no frame, and were left out")
+            notes.append(f"{count(far, 'observation')} of boxes left out, not near any frame")
         unknown = {
             str(entry["class_id"]) for _, entry in self._observations if class_of_name(entry["class_id"]) is None
         }
         if unknown:
-            notes.append(f"objects of classes that are not known became Other object: {', '.join(sorted(unknown))}")
+            notes.append(f"objects of unknown classes became Other object: {', '.join(sorted(unknown))}")
         return notes
 
     def _frame_at(self, stamp_us: int) -> int:
-        """Return the frame within which a time is, or which is nearest to it; -1 if none is near."""
+        """Return the frame that contains a time, or the nearest one; -1 if none is near."""
         away = np.maximum(self._first[:, 0] - stamp_us, 0) + np.maximum(stamp_us - self._first[:, 1], 0)
         frame = int(np.argmin(away))
         return frame if away[frame] <= self._slack_us else -1

@@ -30,7 +30,7 @@ class NcoreCamera:
         name: its name, which is that of its frame of coordinates too: x to the right, y down, z ahead.
         store: the store of its images.
         group: the group of its images there.
-        lens: `camera_model_type`, `camera_model_parameters` and what else the component "intrinsics" says of it.
+        lens: `camera_model_type`, `camera_model_parameters` and the other values of the component "intrinsics".
     """
 
     name: str
@@ -56,7 +56,7 @@ class NcoreCamera:
             return np.array(given, np.int64).reshape(-1, 2)
 
     def nearest(self, ends: NDArray[np.int64], within: float) -> list[int | None]:
-        """Return the row of the image whose middle is nearest to each of (F,) times, microseconds; None if none is so near."""
+        """Return the row of the image whose middle is nearest to each of (F,) times, microseconds; None if none is near enough."""
         if not len(self.spans):
             return [None] * len(ends)
         middles = self.spans.mean(axis=1).astype(np.int64)
@@ -68,7 +68,7 @@ class NcoreCamera:
         """Return the camera; `times` are those of the images of each frame, seconds.
 
         Raises:
-            FormatError: numbers are missing, or do not fit.
+            FormatError: numbers are missing, or do not fit the model.
         """
         where = f"{self.store.path}: intrinsics of {self.name}"
         with opening(where, "a camera of NCore"):
@@ -94,7 +94,7 @@ class NcoreCamera:
         """Return the ending and the bytes of the file of an image.
 
         Raises:
-            FormatError: it is in another format.
+            FormatError: the image is not in a supported format.
         """
         name = f"{self.group}/frames/{self.spans[row, 1]}/image"
         kind = str(self.store.attributes(name).get("format"))

@@ -1,6 +1,6 @@
 """Stores of NCore, version 4: zarr hierarchies of version 2, in a folder or in a tar archive with an index (.zarr.itar).
 
-The format: https://nvidia.github.io/ncore/data/formats.html. An archive ends with a block that says where its index is: names, places and
+The format: https://nvidia.github.io/ncore/data/formats.html. An archive ends with a block with the position of its index: names, positions and
 sizes of its members, as CBOR compressed by LZMA. The metadata of a store are collected in one member, in the same form.
 """
 
@@ -102,7 +102,7 @@ class NcoreStore:
         """Return a whole array.
 
         Raises:
-            MissingDataError: there is none of this name.
+            MissingDataError: the array does not exist.
             FormatError: a chunk is damaged, or its codec is unknown.
             DependencyError: numcodecs is not installed.
         """
@@ -128,7 +128,7 @@ class NcoreStore:
                 key = about.get("dimension_separator", ".").join(map(str, index)) or "0"
                 data = self._read(f"{name}/{key}")
                 if data is None:
-                    continue  # a chunk of nothing but the value that fills
+                    continue  # an absent chunk holds the fill value only
                 raw = data if codec is None else codec.decode(data)
                 part = np.frombuffer(raw, values.dtype).reshape(chunks)
                 place = tuple(
@@ -140,7 +140,7 @@ class NcoreStore:
 
 
 def open_store(path: str) -> NcoreStore:
-    """Return a store; one process reads its index and metadata once, and again if it was written again."""
+    """Return a store; a process reads its index and metadata once, and again after the store changed."""
     file = Path(path)
     changed = file / _METADATA if file.is_dir() and (file / _METADATA).exists() else file
     return _open(path, version_of(changed, "a store of NCore"))

@@ -22,11 +22,11 @@ from carlasc_converters.nuscenes_frames import NuScenesFrame
 from carlasc_converters.nuscenes_tables import CHANNEL, Annotations, SceneRow, Tables
 from carlasc_converters.rigid import poses_of
 
-_NEAR_US = 50_000  # between an image and the scan that it belongs to
+_NEAR_US = 50_000  # greatest time between an image and its scan
 
 
 class NuScenes(Converter):
-    """Reads nuScenes with its point labels and instances (lidarseg and panoptic), as far as they are installed."""
+    """Reads nuScenes with its point labels and instances (lidarseg and panoptic), if they are installed."""
 
     title: ClassVar[str] = "nuScenes, with lidarseg and panoptic labels where they are installed"
     license = "CC BY-NC-SA 4.0"
@@ -42,18 +42,18 @@ class NuScenes(Converter):
         source: Path,
         *,
         version: Annotated[str | None, "Folder of the tables, if there are several, such as v1.0-mini."] = None,
-        sweeps: Annotated[bool, "Read all scans, 20 a second; without it, key frames only, 2 a second."] = True,
+        sweeps: Annotated[bool, "Read all scans, 20 per second; without it, only key frames, 2 per second."] = True,
     ) -> None:
         super().__init__(source)
         self.version, self.sweeps = version, sweeps
 
     def sequences(self) -> list[Recording]:
-        """Return the scenes of which there are files, by name. This reads the tables.
+        """Return the scenes with files, by name. This reads the tables.
 
         Raises:
-            ArgumentError: an option has a value that it cannot have.
-            MissingDataError: there are no tables, a table does not exist, or no scene has files.
-            FormatError: a table does not hold what it must.
+            ArgumentError: an option has a wrong value.
+            MissingDataError: a table does not exist, or no scene has files.
+            FormatError: a table does not have the format.
         """
         tables = Tables(self._version())
         tables.check_categories()
@@ -121,7 +121,7 @@ class NuScenesScene(Recording):
             tables: the tables.
             scene: the scene.
             present: files of points that exist.
-            all_scans: whether scans between key frames are frames too, if there are any.
+            all_scans: whether scans between key frames are frames, too.
         """
         self.tables, self.scene = tables, scene
         self.name, self.location = f"NUSC_{scene.name}", f"{tables.folder}: {scene.name}"
@@ -152,7 +152,7 @@ class NuScenesScene(Recording):
 
     @cached_property
     def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
-        """The LiDAR on the roof. The frame of the vehicle lies on the ground."""
+        """The LiDAR on the roof. The origin of the vehicle is on the ground."""
         mounts = [self.tables.mounts[token] for token in sorted({scan.mount for scan in self.scene.scans})]
         if any(not np.allclose(mount, mounts[0]) for mount in mounts):
             raise FormatError(
@@ -243,7 +243,7 @@ class NuScenesScene(Recording):
         return [(number, str(error)) for number, error in errors]
 
     def notes(self) -> list[str]:
-        """Say what the scene lacks."""
+        """Return notes on what is missing in the scene."""
         if self._asked_for_all and not self._between and any(scan.sample < 0 for scan in self.scene.scans):
             return [
                 f"{self.location}: no scan between key frames exists in sweeps/: the frames are the key frames, 2 a second"

@@ -37,7 +37,7 @@ _CLASSES: tuple[tuple[str, Color, str], ...] = (  # name in category.json, colou
     ("static.manmade", (222, 184, 135), "Building"),
     ("static.other", (255, 228, 196), "Other"),
     ("static.vegetation", (0, 175, 0), "Vegetation"),
-    ("vehicle.ego", (255, 240, 245), "Free"),  # the vehicle that carries the LiDAR is no part of the scene
+    ("vehicle.ego", (255, 240, 245), "Free"),  # the recording vehicle does not belong to the scene
 )
 CLASS_IDS = {name: index for index, (name, _, _) in enumerate(_CLASSES)}
 """Class id of each category."""

@@ -19,7 +19,7 @@ from carlasc_converters.nuscenes_classes import NUSCENES
 _COLUMNS = 5  # x, y, z, intensity, ring
 _PER_CLASS = 1000  # panoptic labels are 1000 * class + number of the object
 _UNMATCHED = 1 << 16  # added to the panoptic label of objects without a box: above the number of any track
-_SURFACE_M = 0.01  # points on the surface of a box count as inside, whatever was rounded
+_SURFACE_M = 0.01  # points on the surface of a box count as inside, in spite of rounding
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ class NuScenesFrame(FrameHandle):
 def number_instances(
     panoptic: NDArray[np.uint16], points: NDArray[np.float32], boxes: Boxes | None
 ) -> NDArray[np.uint32]:
-    """Return the number of each point's object: that of the box of the object's class which holds most of its points.
+    """Return the number of the object of each point: that of the box with the class of the object that holds most of its points.
 
-    The data set made its panoptic labels from the boxes, so each object has one. An object without a box gets a number of its own above
+    The data set made its panoptic labels from the boxes, so that each object has a box. An object without a box gets a unique number above
     those of the tracks, the same in all frames.
 
     Args:

@@ -1,4 +1,4 @@
-"""The tables of nuScenes: what LiDAR scans, poses and boxes its scenes have. Each table is read once, row by row."""
+"""The tables of nuScenes: the LiDAR scans, poses and boxes of its scenes. Each table is read once, row by row."""
 
 from __future__ import annotations
 
@@ -136,17 +136,17 @@ class Tables:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._pose_rows: dict[str, int] = {}  # row in `poses` by token: `scenes` finds out which poses are needed
+        self._pose_rows: dict[str, int] = {}  # row in `poses` by token; `scenes` collects the needed poses
 
     def path(self, table: str) -> Path:
         """Return the file of a table."""
         return self.folder / f"{table}.json"
 
     def check_categories(self) -> None:
-        """Check that classes have the names, and those of point labels the numbers, that they have in our table.
+        """Check that classes have the same names as in our table, and those of point labels the same numbers.
 
         Raises:
-            FormatError: they do not: the tables belong to another version.
+            FormatError: they differ, so that the tables belong to another version.
         """
         path = self.path("category")
         for (name,) in read_rows(path, ("name",)):
@@ -160,7 +160,7 @@ class Tables:
     def _refuse_categories(self, found: str) -> None:
         expected = f"the {len(CLASS_IDS)} categories of nuScenes v1.0, with the numbers of nuScenes-lidarseg"
         raise FormatError(
-            self.path("category"), expected=expected, found=found, advice="these are tables of another version"
+            self.path("category"), expected=expected, found=found, advice="use the tables of nuScenes v1.0"
         )
 
     @cached_property

@@ -1,4 +1,4 @@
-"""OXTS: the packets of the inertial and satellite navigation system of KITTI's car, and the poses that they give."""
+"""OXTS: the packets of the inertial and satellite navigation system of KITTI's car, and the poses from them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def world_T_imu(packets: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (K, 4, 4) poses of the IMU (x forward, y left, z up) in a world with x to the east, y to the north and z up, metres.
 
     As in KITTI's development kit: the Mercator projection, scaled by the cosine of the first latitude, and the rotation
-    Rz(yaw) Ry(pitch) Rx(roll). The world begins at the place of the first packet.
+    Rz(yaw) Ry(pitch) Rx(roll). The origin of the world is the position of the first packet.
     """
     latitude, longitude, altitude = packets[:, 0], packets[:, 1], packets[:, 2]
     scale = np.cos(np.radians(latitude[0])) * _EARTH_M

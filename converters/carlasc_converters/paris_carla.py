@@ -1,7 +1,7 @@
-"""Paris-CARLA-3D: the towns of CARLA 0.9.10 that a tilted LiDAR scanned, one PLY file of about 100 million points per town.
+"""Paris-CARLA-3D: towns of CARLA 0.9.10, scanned by a tilted LiDAR, one PLY file of about 100 million points per town.
 
-The points of a file are in world coordinates, right-handed. Each has the position that the LiDAR had when it was taken, its time, and the
-number of its scan. Only the rows of one scan are in memory at a time.
+The points of a file are in right-handed world coordinates. Each point has the position of the LiDAR, its time, and the number of its scan.
+Only the rows of one scan are in memory at a time.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from carlasc_converters.ply import PlyVertices
 _POINT, _LIDAR = ("x", "y", "z"), ("x_lidar_position", "y_lidar_position", "z_lidar_position")
 _PROPERTIES = (*_POINT, *_LIDAR, "timestamp", "index_frame", "instance", "semantic")
 _SPLITS: dict[str, Split] = {"Town01": "Test", "Town06": "Val", "Town07": "Test"}  # as in the paper; all others: Train
-_HEADING_M = 1.0  # the heading comes from positions at least so far apart
-_HEADING_FRAMES = 20  # and at most so many frames before and after
+_HEADING_M = 1.0  # the heading is computed from positions that are at least this far apart
+_HEADING_FRAMES = 20  # and at most this number of frames before and after
 _MOST_RUNS = 1_000_000  # of consecutive rows of one scan: the index of a file stays small
 
 
@@ -47,7 +47,7 @@ class ParisCarla3D(Converter):
 
         Raises:
             MissingDataError: no file exists.
-            FormatError: a file is no binary PLY file with the properties of this data set, or it is incomplete.
+            FormatError: a file is not a binary PLY file with the properties of this data set, or it is incomplete.
         """
         source = self.source
         files = [source] if source.is_file() else sorted(p for p in source.rglob("*.ply") if p.stem.startswith("Town"))
@@ -96,7 +96,7 @@ class ParisCarlaTown(Recording):
 
     @cached_property
     def _poses(self) -> NDArray[np.float64]:
-        """(F, 4, 4) world_T_scan: the position of the LiDAR, upright, headed where the vehicle drives."""
+        """(F, 4, 4) world_T_scan: the position of the LiDAR, upright, with the direction of motion as heading."""
         positions, times = self._middles
         if (wrong := np.flatnonzero(~(np.diff(times) > 0))).size:
             scan, later = self._scans[int(wrong[0])][0], self._scans[int(wrong[0]) + 1][0]
@@ -125,9 +125,9 @@ class ParisCarlaTown(Recording):
         return self._middles[1]
 
     def notes(self) -> list[str]:
-        """Return what the licence forbids, and where poses come from."""
+        """Return notes on the licence, and on the source of poses."""
         return [
-            "Paris-CARLA-3D has the licence CC BY-NC-ND 3.0: what is converted from it must not be passed on",
+            "Paris-CARLA-3D has the licence CC BY-NC-ND 3.0: converted data must not be shared",
             "poses are the positions of the LiDAR at the middle of each scan, upright, with the direction of motion as heading,"
             " because the data have no rotations",
         ]
@@ -154,7 +154,7 @@ class ParisCarlaFrame(FrameHandle):
     seconds: float
 
     def read(self) -> Sequence[Cloud]:
-        """Read points, the places where their rays began, their times, tags, and the actors of classes that move."""
+        """Read points, the origins of their rays, their times, tags, and the actors of classes that move."""
         rows = np.concatenate([self.ply.rows(start, stop) for start, stop in self.ranges])
         scan_T_world = invert(self.world_T_scan)
 
@@ -178,8 +178,8 @@ class ParisCarlaFrame(FrameHandle):
 def headings(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (F,) direction of motion, radians about z, at each of (F, 3) positions.
 
-    It is that from an earlier to a later position, as many frames before as after, which are at least a metre apart. A vehicle that
-    stands keeps its last heading.
+    It is the direction from an earlier to a later position, the same number of frames before and after, at least a metre apart. A vehicle at
+    rest keeps its last heading.
     """
     count = len(positions)
     found, frames = np.full(count, np.nan), np.arange(count)
@@ -190,7 +190,7 @@ def headings(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     known = np.flatnonzero(~np.isnan(found))
     if not known.size:
         return np.zeros(count)
-    last = np.maximum(np.searchsorted(known, frames, side="right") - 1, 0)  # before the first known one: that one
+    last = np.maximum(np.searchsorted(known, frames, side="right") - 1, 0)  # the first known one also holds before it
     return found[known[last]]
 
 
@@ -228,4 +228,4 @@ def _middle_row(ranges: tuple[tuple[int, int], ...]) -> int:
         if left < stop - start:
             return start + left
         left -= stop - start
-    raise AssertionError  # half of the rows are fewer than all of them
+    raise AssertionError  # not reached: the middle row is in one of the ranges

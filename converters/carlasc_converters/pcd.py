@@ -16,16 +16,16 @@ from carlasc.errors import FormatError
 from carlasc_converters.files import COPY, opening
 
 _MAX_LINE = 4096
-_LONGEST_LITERAL = 32  # LZF: a control byte below this says that one more than so many bytes follow as they are
+_LONGEST_LITERAL = 32  # LZF: after a control byte n below this value, n + 1 literal bytes follow
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 @dataclass(frozen=True)
 class PcdHeader:
-    """What the header of a PCD file says.
+    """The header of a PCD file.
 
     Attributes:
-        row: structured type of a point; `_` are fields without a meaning, which have another name here.
+        row: structured type of a point; fields without a meaning (`_` in the file) have another name here.
         points: number of points.
         encoding: "ascii", "binary" or "binary_compressed".
     """
@@ -40,7 +40,7 @@ def read_pcd(path: str | Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it is no PCD file, or is cut short.
+        FormatError: it is not a PCD file, or is cut short.
     """
     with opening(path, "a PCD file"), Path(path).open("rb") as file:
         header = _read_header(file, str(path))
@@ -115,7 +115,7 @@ def _unpacked(body: bytes, row: np.dtype[np.void], count: int, where: str) -> by
 
 @cached
 def _lzf(packed: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
-    """Write what LZF packed to `out`, and return the number of bytes; -1 if the data are damaged.
+    """Decompress LZF data into `out`, and return the number of bytes; -1 if the data are damaged.
 
     The format: http://oldhome.schmorp.de/marc/liblzf.html.
     """

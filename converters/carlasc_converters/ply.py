@@ -1,4 +1,4 @@
-"""Vertices of PLY files, in rows: ASCII, and binary of either byte order. Only what is asked for is read into memory.
+"""Vertices of PLY files, in rows: ASCII, and binary of either byte order. Only requested rows are read into memory.
 
 The format: https://paulbourke.net/dataformats/ply/. A text header lists elements and their properties; the rows of the elements follow.
 """
@@ -25,7 +25,7 @@ _TYPES = {
 }  # fmt: skip
 _BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CUT = "the file is incomplete: copy it again"
-_MAX_LINE = 4096  # bytes of a header line; more means that the file is no PLY file
+_MAX_LINE = 4096  # largest size of a header line; longer lines mean that the file is not a PLY file
 _CHUNK = 1 << 20
 
 
@@ -57,7 +57,7 @@ class PlyVertices:
 
         Raises:
             MissingDataError: the file does not exist.
-            FormatError: it is no PLY file, its vertices have a list property or lack a required one, or it is shorter than its header says.
+            FormatError: it is not a PLY file, its vertices have a list property or lack a required one, or it is shorter than its header says.
         """
         with opening(path, "a PLY file"), Path(path).open("rb") as file:
             kind, elements = _read_header(file, str(path))
@@ -69,7 +69,7 @@ class PlyVertices:
                 path,
                 expected=f"vertices with {', '.join(missing)}",
                 found=", ".join(dtype.names or ("none",)),
-                advice="it belongs to another data set, or to another version of this one",
+                advice="check the data set: the file belongs to another one, or to another version",
             )
         if kind == "ascii":
             return cls(str(path), dtype, elements["vertex"][0], offset, sum(elements[name][0] for name in before))
@@ -90,7 +90,7 @@ class PlyVertices:
         """Return all vertices: an array of `dtype`, mapped from a binary file, read from a text file.
 
         Raises:
-            FormatError: a text file has fewer vertices than its header says, or something else than numbers.
+            FormatError: a text file has fewer vertices than in its header, or values that are not numbers.
         """
         if self.lines is None:
             return self.rows(0, self.count)
@@ -99,7 +99,7 @@ class PlyVertices:
     def rows(self, start: int, stop: int) -> NDArray[np.void]:
         """Return the vertices `start:stop` of a binary file, mapped from it.
 
-        Memory is used for what is read from them, and only as long as the result exists.
+        They need memory only when they are read, and only as long as the result exists.
 
         Raises:
             FormatError: the file is a text file, whose rows cannot be found without reading all rows before them.
@@ -115,7 +115,7 @@ class PlyVertices:
         """Yield all vertices in their order, at most `size` at a time. Only one chunk is in memory if the caller keeps none.
 
         Raises:
-            FormatError: the file does not hold what its header says.
+            FormatError: the file does not match its header.
         """
         if self.lines is None:
             for start in range(0, self.count, size):
@@ -133,7 +133,7 @@ class PlyVertices:
         """Return the vertices of the next `count` lines.
 
         `numpy.loadtxt` with a structured type is the fastest parser without another package: 1.2 million rows of six values per
-        second, where `split` and `fromstring` reach 0.7 to 0.8 million.
+        second, compared with 0.7 to 0.8 million for `split` and `fromstring`.
         """
         try:
             lines = list(islice(text, count))

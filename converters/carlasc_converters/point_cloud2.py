@@ -1,4 +1,4 @@
-"""Points that are packed one after the other, as in ROS' PointCloud2 and in Foxglove's PointCloud: any layout, to a column per field."""
+"""Packed points, as in ROS' PointCloud2 and in Foxglove's PointCloud: any layout, to a column per field."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def read_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
     """Return the fields of a sensor_msgs/PointCloud2 by name; the points of all rows, one row after the other.
 
     Raises:
-        FormatError: the data do not have the layout that the message says.
+        FormatError: the data do not have the layout in the message.
     """
     order = ">" if message.is_bigendian else "<"
     fields = [
@@ -44,8 +44,8 @@ def unpack_fields(
 
     Args:
         data: the points, one after the other.
-        fields: the name, the first byte, the type, and how many values a point has, of each field. Those of several values, of no name or
-            of an unknown type are left out.
+        fields: name, first byte, type and number of values per point of each field. Fields of several values, without a name or of an
+            unknown type are left out.
         step: bytes of a point.
         where: the message, for errors.
 

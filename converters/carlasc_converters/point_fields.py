@@ -24,7 +24,7 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "instance": ("instance", "instances", "instance_id", "object_id", "track_id"),
 }
 _NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_SCAN_S = (0.004, 0.6)  # how long a LiDAR takes for a scan: 2 to 200 Hz
+_SCAN_S = (0.004, 0.6)  # duration of a scan: 2 to 200 Hz
 _ABSOLUTE_S = 1e6  # a time of a clock, not one within a scan
 
 
@@ -36,11 +36,11 @@ def named_fields(columns: Mapping[str, NDArray[Any]], where: str) -> dict[str, N
         where: the file or the message, for errors.
 
     Returns:
-        `points` (N, 4) float32, x, y, z and the intensity (0 if there is none), and those of `time` and `ring` (N,), as they were, and
-        `label` and `instance` (N,) uint32, that exist.
+        `points` (N, 4) float32, x, y, z and the intensity (0 without one); if they exist, `time` and `ring` (N,), unchanged, and `label`
+        and `instance` (N,) uint32.
 
     Raises:
-        FormatError: x, y or z does not exist, or a class or an instance is no whole number from 0 to 2^32 - 1.
+        FormatError: x, y or z does not exist, or a class or an instance is not a whole number from 0 to 2^32 - 1.
     """
     lower = {name.lower(): values for name, values in columns.items()}
     found = {field: next((lower[name] for name in names if name in lower), None) for field, names in _NAMES.items()}
@@ -67,7 +67,7 @@ def whole_numbers(values: NDArray[Any], where: str) -> NDArray[np.uint32]:
     """Return (N,) ids as uint32.
 
     Raises:
-        FormatError: a value is no whole number from 0 to 2^32 - 1.
+        FormatError: a value is not a whole number from 0 to 2^32 - 1.
     """
     with np.errstate(invalid="ignore"):
         whole = values.astype(np.uint32)
@@ -81,8 +81,8 @@ def point_seconds(times: NDArray[Any], unit: TimeUnit, where: str) -> tuple[NDAr
     """Return the times of the points of a scan in seconds.
 
     Args:
-        times: (N,) times in the unit of the file: after the time of the scan, or those of a clock.
-        unit: "auto" finds it from how long a scan takes: 4 ms to 0.6 s.
+        times: (N,) times in the unit of the file: after the time of the scan, or times of a clock.
+        unit: "auto" finds the unit from the duration of the scan: 4 ms to 0.6 s.
         where: the file or the message, for errors.
 
     Returns:
@@ -90,7 +90,7 @@ def point_seconds(times: NDArray[Any], unit: TimeUnit, where: str) -> tuple[NDAr
         the unit.
 
     Raises:
-        FormatError: a time is not finite, or no unit gives a scan of a usual length.
+        FormatError: a time is not finite, or the scan has no usual duration in any unit.
     """
     if not len(times):
         return np.empty(0), None, "s" if unit == "auto" else unit
@@ -99,7 +99,7 @@ def point_seconds(times: NDArray[Any], unit: TimeUnit, where: str) -> tuple[NDAr
     first, last = times.min(), times.max()
     span = int(last) - int(first) if times.dtype.kind in "iu" else float(last) - float(first)
     if span == 0 and first == 0:
-        return np.zeros(len(times)), None, "s" if unit == "auto" else unit  # a column that nobody filled
+        return np.zeros(len(times)), None, "s" if unit == "auto" else unit  # a column that was not filled in
     if unit == "auto":
         low, high = _SCAN_S
         usual = next((name for name, scale in _NANOSECONDS.items() if low <= span * scale / 1e9 <= high), None)

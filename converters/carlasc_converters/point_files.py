@@ -22,7 +22,7 @@ _ARRAY = ArrayFormat(NUMBERS, None, records=True)
 
 
 def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:
-    """Return the values of the points of a file, (N,) each, by the names that the file or the caller gives.
+    """Return the values of the points of a file, (N,) each, by their names in the file or in `columns`.
 
     Args:
         path: the file; its suffix says its format.
@@ -31,7 +31,7 @@ def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: the file does not hold what its format says, or has no points, or other columns.
+        FormatError: the file does not have its format, or has no points, or other columns.
         ArgumentError: `columns` is needed.
         DependencyError: laspy is needed, and not installed.
     """

@@ -25,7 +25,7 @@ _TUM, _KITTI = 8, 12  # numbers in a line
 _PLACES = (("x", "y", "z"), ("tx", "ty", "tz"), ("px", "py", "pz"), ("p_rs_r_x", "p_rs_r_y", "p_rs_r_z"))
 _TURNS = (("qw", "qx", "qy", "qz"), ("q_rs_w", "q_rs_x", "q_rs_y", "q_rs_z"))
 _TIMES = ("timestamp", "time", "t", "stamp", "seconds", "sec", "nsec", "timestamp_ns", "time_ns")
-# A number above one of these counts milliseconds, microseconds or nanoseconds since 1970, or the time of a recording of years.
+# A number above one of these is in milliseconds, microseconds or nanoseconds; in seconds, it would be a recording of years.
 _UNITS = ((Decimal(10) ** 17, 1), (Decimal(10) ** 14, 10**3), (Decimal(10) ** 11, 10**6))
 
 
@@ -36,7 +36,7 @@ class PoseRows:
     Attributes:
         world_T_body: (K, 4, 4) float64.
         stamps: (K,) int64 nanoseconds, None if the file has no times.
-        of: what has these poses, as far as the format says it.
+        of: whose poses these are, if the format defines it.
     """
 
     world_T_body: NDArray[np.float64]
@@ -45,11 +45,11 @@ class PoseRows:
 
 
 def read_poses(path: Path) -> PoseRows:
-    """Read a file of poses. Its format is recognised: by its suffix (.npy), its header, or the numbers in its lines.
+    """Read a file of poses. The format is found by its suffix (.npy), its header, or the number of values in its lines.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it has none of the formats, a pose is not rigid, a quaternion has not length 1, or times do not increase.
+        FormatError: the format is unknown, a pose is not rigid, a quaternion does not have length 1, or times do not increase.
     """
     if path.suffix.lower() == ".npy":
         poses = read_npy(path, ArrayFormat(NUMBERS, None)).astype(np.float64)
@@ -79,11 +79,11 @@ def read_poses(path: Path) -> PoseRows:
 
 
 def read_stamps(path: Path) -> NDArray[np.int64]:
-    """Return the (F,) nanoseconds of a file of times: one number a line, or the first of several; seconds, or a unit seen from its size.
+    """Return the (F,) nanoseconds of a file of times: one number per line, or the first of several; seconds, or a unit by its magnitude.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: a line is no number.
+        FormatError: a line is not a number.
     """
     lines = [line.strip() for line in read_text(path, "a time per line").splitlines()]
     return _stamps([_split(line)[0] for line in lines if line and not line.startswith("#")], path, increasing=False)
@@ -93,7 +93,7 @@ def nanoseconds(word: str) -> int:
     """Return the nanoseconds of a number: seconds, or, if it is too large for these, milliseconds, microseconds or nanoseconds.
 
     Raises:
-        ValueError: it is no finite number.
+        ValueError: it is not a finite number.
     """
     try:
         value = Decimal(word)

@@ -1,4 +1,4 @@
-"""Poses from quaternions and translations, as several data sets give them."""
+"""Poses from quaternions and translations, the form of several data sets."""
 
 from __future__ import annotations
 

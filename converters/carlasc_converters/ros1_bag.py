@@ -26,7 +26,7 @@ _Fields = dict[bytes, bytes]
 
 
 def index_file(path: Path) -> FileIndex:
-    """Return where the messages of a file are."""
+    """Return the index of the messages of a file."""
     index, size = FileIndex(str(path)), path.stat().st_size
     at, chunk, entries, closed = len(MAGIC), -1, list[tuple[int, NDArray[np.void]]](), False
     with path.open("rb") as file:
@@ -53,7 +53,7 @@ def index_file(path: Path) -> FileIndex:
                 break
             at = end
     if index.lost is None and not closed:
-        index.lost = "its recorder did not close it, and what was not written yet is lost"
+        index.lost = "its recorder did not close it, and data that were not written yet are lost"
     try:
         _add_chunk(index, chunk, entries)
     except FormatError:
@@ -66,7 +66,7 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
     """Return the content of a message.
 
     Raises:
-        FormatError: the file does not hold one there.
+        FormatError: the file has no message there.
     """
     data = _read_chunk(path, chunk, version_of(path))
     try:
@@ -89,7 +89,7 @@ def _add_chunk(index: FileIndex, chunk: int, entries: list[tuple[int, NDArray[np
         except FormatError:
             if not entries:
                 raise
-            # The connections may be known later; its frames say that it is damaged.
+            # The connections may be known later; reading its frames reports the damage.
     for number, rows in entries:
         index.add(number, chunk, rows["s"].astype(np.int64) * 10**9 + rows["ns"], rows["offset"])
 
@@ -118,7 +118,7 @@ def _learn(index: FileIndex, fields: _Fields, data: bytes) -> None:
 
 @lru_cache(maxsize=2)
 def _read_chunk(path: str, at: int, version: Version) -> bytes:
-    """Return the content of a chunk; the last two are kept, because frames come in their order."""
+    """Return the content of a chunk; the last two are cached, because frames are read in order."""
     with Path(path).open("rb") as file:
         fields, begin, end = _record_at(file, at)
         file.seek(begin)

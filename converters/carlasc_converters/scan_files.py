@@ -22,7 +22,7 @@ from carlasc_converters.point_files import read_columns
 
 @dataclass(frozen=True)
 class ScanOptions:
-    """The options of `Scans`, which says what they mean."""
+    """The options of `Scans`; see there."""
 
     columns: tuple[str, ...] | None
     pose_file: Path | None
@@ -45,7 +45,7 @@ class ScanFile(FrameHandle):
         paths: a file for each LiDAR.
         labels: the file of the classes of its points, of the first LiDAR.
         fields: fields that each file must have, those of the first one.
-        options: what the caller said of the files.
+        options: the options for the files.
         unit: unit of the times of points; empty if they have none.
         stamp: nanoseconds of the scan, where times of points are those of a clock.
     """
@@ -64,7 +64,7 @@ class ScanFile(FrameHandle):
         return self.paths[0]
 
     def read(self) -> Sequence[Cloud]:
-        """Read the points; those that are not finite are left out: a ray that hit nothing."""
+        """Read the points. Points that are not finite are left out, because they are rays without a return."""
         return [self._read(index, path) for index, path in enumerate(self.paths)]
 
     def _read(self, index: int, path: str) -> Cloud:
@@ -102,7 +102,7 @@ def read_labels(path: Path, count: int) -> NDArray[np.uint32]:
     """Return the (N,) class ids of a file: .label (uint32, of which the lower 16 bits count), .npy, or .txt with one per line.
 
     Raises:
-        FormatError: it has not `count` of them, or others than whole numbers.
+        FormatError: the file does not hold `count` whole numbers.
     """
     if path.suffix == ".label":
         values, _ = load(path)

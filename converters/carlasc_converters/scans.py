@@ -24,10 +24,10 @@ from carlasc_converters.point_files import FORMATS, read_columns
 from carlasc_converters.pose_files import PoseRows, nanoseconds, read_poses, read_stamps
 from carlasc_converters.scan_files import ScanFile, ScanOptions
 
-_TABLES = (".csv", ".txt")  # suffixes that files of poses and times have too
-_STAMPED = re.compile(r"\d{9,}(\.\d+)?|\d+\.\d{6,}")  # the name of a file that is the time of its scan
+_TABLES = (".csv", ".txt")  # suffixes of scans that files of poses and times may have, too
+_STAMPED = re.compile(r"\d{9,}(\.\d+)?|\d+\.\d{6,}")  # a file name that is the time of its scan
 _LABELS = (".label", ".npy", ".txt")
-_SLACK_NS = 10**9  # a scan so long before the first pose or after the last one gets a pose
+_SLACK_NS = 10**9  # scans up to this time before the first pose or after the last one get a pose
 
 
 class Scans(Converter):
@@ -41,16 +41,16 @@ class Scans(Converter):
         self,
         source: Path,
         *,
-        columns: Annotated[str | None, "Columns of files that do not name them, by commas: x,y,z,intensity."] = None,
+        columns: Annotated[str | None, "Names of the columns, if files do not contain them: x,y,z,intensity."] = None,
         pose_file: Annotated[str | None, "File of poses: TUM, KITTI, EuRoC, CSV with a header, .npy (N, 4, 4)."] = None,
         pose_of: Annotated[
-            Literal["auto", "sensor", "vehicle"], "What has these poses; auto: the sensor, with EuRoC the vehicle."
+            Literal["auto", "sensor", "vehicle"], "Whose poses these are. auto: the sensor; with EuRoC, the vehicle."
         ] = "auto",
         calibration: Annotated[str | None, "YAML or JSON file with the poses of the LiDARs on the vehicle."] = None,
         time_file: Annotated[str | None, "File with the time of each scan, one per line."] = None,
-        time_unit: Annotated[TimeUnit, "Unit of the times of points; auto: from how long a scan takes."] = "auto",
+        time_unit: Annotated[TimeUnit, "Unit of the times of points. auto: from the duration of a scan."] = "auto",
         deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = False,
-        label_dir: Annotated[str | None, "Folder with a .label, .npy or .txt file of classes for each scan."] = None,
+        label_dir: Annotated[str | None, "Folder with one .label, .npy or .txt file of classes per scan."] = None,
         source_classes: Annotated[
             str | None, "Class table of the labels: a name such as semantickitti, or a JSON file."
         ] = None,
@@ -77,7 +77,7 @@ class Scans(Converter):
         )
 
     def sequences(self) -> list[Recording]:
-        """Return the recording, which is one.
+        """Return the recording.
 
         Raises:
             MissingDataError: there are no scans, or a LiDAR of the calibration has none.
@@ -95,7 +95,7 @@ class Scans(Converter):
         return [ScanFolder(self.source, files, lidars, options)]
 
     def _folder(self) -> Path:
-        """Return the folder of the scans: the source, or the only folder with scans in it."""
+        """Return the folder of the scans: the source, or the only folder in it with scans."""
         if not self.source.is_dir():
             raise MissingDataError(self.source, expected="a folder of scans", found="no such folder")
         inner = [path for path in sorted(self.source.iterdir()) if path.is_dir() and self._scans_in(path)]
@@ -112,7 +112,7 @@ class Scans(Converter):
         return inner[0] if inner else self.source
 
     def _scans_in(self, folder: Path) -> list[Path]:
-        """Return the files of a folder that may be scans: those of poses and times are none."""
+        """Return the files of a folder that may be scans, without those of poses and times."""
         others = {path.resolve() for path in (self.options.pose_file, self.options.time_file) if path is not None}
         found = folder.iterdir() if folder.is_dir() else iter(())
         return [path for path in found if path.suffix.lower() in FORMATS and path.resolve() not in others]
@@ -123,7 +123,8 @@ class Scans(Converter):
         kinds = Counter(path.suffix.lower() for path in found)
         scans = {kind: count for kind, count in kinds.items() if kind not in _TABLES} or dict(kinds)
         if not scans:
-            raise MissingDataError(folder, expected=f"scans: files with the suffix {', '.join(FORMATS)}", found="none")
+            expected, advice = f"scans: files with the suffix {', '.join(FORMATS)}", "give the folder of the scans"
+            raise MissingDataError(folder, expected=expected, found="none", advice=advice)
         if len(scans) > 1:
             counts = ", ".join(f"{count} {kind}" for kind, count in sorted(scans.items()))
             raise FormatError(folder, expected="scans of one format", found=counts, advice="move the others away")
@@ -132,7 +133,7 @@ class Scans(Converter):
     def _check_counts(self, files: dict[str, list[Path]]) -> None:
         if len({len(paths) for paths in files.values()}) > 1:
             counts = ", ".join(f"{len(paths)} of {name}" for name, paths in files.items())
-            raise FormatError(self.source, expected="as many scans of each LiDAR: they go by order", found=counts)
+            raise FormatError(self.source, expected="the same number of scans of each LiDAR", found=counts)
 
 
 class ScanFolder(Recording):
@@ -159,7 +160,7 @@ class ScanFolder(Recording):
 
     @cached_property
     def _clock(self) -> tuple[str, int | None]:
-        """The unit of the times of points, and when the first scan began, if these are times of a clock."""
+        """The unit of the times of points, and the start of the first scan, if these are times of a clock."""
         times = self._first.get("time")
         if times is None:
             return "", None
@@ -172,7 +173,7 @@ class ScanFolder(Recording):
 
     @cached_property
     def _stamps(self) -> tuple[NDArray[np.int64] | None, str]:
-        """The (F,) nanoseconds of the scans, and where they are from."""
+        """The (F,) nanoseconds of the scans, and their source."""
         count = len(self._paths)
         if self._options.time_file is not None:
             stamps = read_stamps(self._options.time_file)
@@ -235,7 +236,7 @@ class ScanFolder(Recording):
 
     @cached_property
     def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
-        """The LiDARs, at the places that the calibration says; a single one without calibration is its vehicle."""
+        """The LiDARs, with their poses from the calibration; without one, the frame of the LiDAR is that of the vehicle."""
         deskewed = self._options.deskewed or "time" not in self._first
         return [
             Sensor(
@@ -248,16 +249,16 @@ class ScanFolder(Recording):
         ]
 
     def times(self) -> NDArray[np.float64] | None:
-        """Return seconds after the first scan; None if nothing says when scans were taken."""
+        """Return seconds after the first scan; None if the times of scans are not known."""
         stamps, _ = self._stamps
         return None if stamps is None else (stamps - stamps[0]) / 1e9
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
-        """Return the poses of the file, by their times where scans have times, else by their order; None without a file.
+        """Return the poses of the file, by their times if scans have times, otherwise by their order; None without a file.
 
         Raises:
-            MissingDataError: they are poses of the vehicle, and no calibration says where the sensor is on it.
-            FormatError: there are more or fewer poses than scans, or they were recorded at another time.
+            MissingDataError: they are poses of the vehicle, and no calibration has the pose of the sensor on it.
+            FormatError: the numbers of poses and scans differ, or they were recorded at different times.
         """
         rows = self._poses
         if rows is None:
@@ -280,7 +281,7 @@ class ScanFolder(Recording):
                     where,
                     expected=f"a pose for each of {len(self._paths)} scans",
                     found=f"{len(world_T_vehicle)} poses",
-                    advice="poses and scans without times go by order: give `time_file`, and poses with times",
+                    advice="give `time_file`, and poses with times: without times, poses are matched by their order",
                 )
             return Trajectory(world_T_vehicle, where=where)
         if stamps[0] < rows.stamps[0] - _SLACK_NS or stamps[-1] > rows.stamps[-1] + _SLACK_NS:
@@ -288,23 +289,23 @@ class ScanFolder(Recording):
                 where,
                 expected=f"poses over the time of the scans, {_span(stamps)}",
                 found=f"poses over {_span(rows.stamps)}",
-                advice="check that both have one clock",
+                advice="check that both use the same clock",
             )
         return Trajectory(world_T_vehicle, (rows.stamps - stamps[0]) / 1e9, where)
 
     def notes(self) -> list[str]:
-        """Return what was found out and assumed."""
+        """Return notes on what was found and assumed."""
         options, notes = self._options, list[str]()
         if self._stamps[0] is not None and options.time_file is None:
             notes.append(f"the times of scans are from {self._stamps[1]}")
         if self._clock[0] and options.time_unit == "auto":
-            notes.append(f"the times of points are in {self._clock[0]}: that gives a scan of a usual length")
+            notes.append(f"the times of points are in {self._clock[0]}, because scans then have a usual duration")
         if "time" in self._first and not options.deskewed:
             notes.append(
-                "points have times, so they were corrected for the motion of the vehicle; `deskewed=True` keeps them"
+                "points have times, so that they were corrected for the motion of the vehicle; give `deskewed=True` to keep them"
             )
         if "label" in self._first and not options.has_classes:
-            notes.append("points have a field of classes, which was not read: `source_classes` says what they mean")
+            notes.append("points have a field of classes, which was not read: give `source_classes` to read it")
         return notes
 
 
@@ -313,7 +314,7 @@ def _path(name: str | None) -> Path | None:
 
 
 def _natural(path: Path) -> list[Any]:
-    """Return a key that sorts names as people do: scan2 before scan10."""
+    """Return a key for natural sorting: scan2 before scan10."""
     return [int(part) if part.isdigit() else part.lower() for part in re.split(r"(\d+)", path.name)]
 
 

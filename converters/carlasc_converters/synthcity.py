@@ -1,7 +1,7 @@
 """SynthCity: a simulated mobile-mapping cloud of a city, in Parquet tables, one per area of about 40 million points.
 
-The cloud has no trajectory, so it has no scans either. Each area is cut into tiles, each as large as a voxel grid, and a frame is one tile.
-Nobody knows where its points were seen from: voxels with points are known, everything else is unknown.
+The cloud has no trajectory, and therefore no scans. Each area is cut into tiles of the size of a voxel grid, and a frame is one tile. The
+positions of the sensor are not known, so that voxels with points are known, and all others are unknown.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ CLASSES = ClassTable(
     movable=frozenset({2}),
     ground=frozenset({3, 4, 6, 9}),
 )
-_SYNONYMS = {  # names of columns, in lower case, letters only: those of the published tables are not known for certain
+_SYNONYMS = {  # possible names of columns, in lower case, letters only, because the published names are not certain
     "x": {"x", "xcoord", "xcoordinate", "posx"},
     "y": {"y", "ycoord", "ycoordinate", "posy"},
     "z": {"z", "zcoord", "zcoordinate", "posz"},
     "label": {"label", "labels", "labelid", "class", "classes", "classid", "classification", "category", "semantic"},
 }
 _COLUMNS = "x=NAME,y=NAME,z=NAME,label=NAME"
-_HEIGHT_M = 1.8  # of the origin of a frame above its ground: about that of the LiDAR in CarlaSC
-_GROUND_RADIUS_M, _GROUND_POINTS = 5.0, 20  # the ground is that around the middle of a tile, if it has so many points
+_HEIGHT_M = 1.8  # height of the origin of a frame above its ground: about that of the LiDAR in CarlaSC
+_GROUND_RADIUS_M, _GROUND_POINTS = 5.0, 20  # around the middle of a tile, and least number of ground points there
 _BATCH = 1 << 18  # rows in memory
 _ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("label", "u1")])  # x and y from the middle of the tile
 
@@ -66,9 +66,9 @@ class SynthCity(Converter):
         source: Path,
         *,
         columns: Annotated[
-            str | None, "Names of columns that are not found by themselves: x=X_noise,y=Y_noise,label=Class."
+            str | None, "Names of columns, if they are not found automatically: x=X_noise,y=Y_noise,label=Class."
         ] = None,
-        grid: Annotated[Literal["coarse", "fine"], "Published grid whose size and voxels tiles have."] = "coarse",
+        grid: Annotated[Literal["coarse", "fine"], "Published grid with the size and voxels of tiles."] = "coarse",
     ) -> None:
         super().__init__(source)
         self.columns, self.grid = columns, grid
@@ -78,14 +78,15 @@ class SynthCity(Converter):
 
         Raises:
             MissingDataError: no table exists.
-            FormatError: a file is no Parquet table, or its columns are not found.
+            FormatError: a file is not a Parquet table, or its columns are not found.
             ArgumentError: an option has a wrong value.
             DependencyError: pyarrow is not installed.
         """
         named = {} if self.columns is None else _parse_columns(self.columns)
         files = [self.source] if self.source.is_file() else sorted(self.source.rglob("*.parquet"))
         if not files:
-            raise MissingDataError(self.source, expected="Parquet tables, one per area", found="none")
+            advice = "give their folder, or one of the tables"
+            raise MissingDataError(self.source, expected="Parquet tables, one per area", found="none", advice=advice)
         return [SynthCityArea(path, _find_columns(path, named), GridSpec.published(self.grid)) for path in files]
 
 
@@ -147,22 +148,22 @@ class SynthCityArea(Recording):
         return (np.array(self._cut[1], np.float64) + 0.5) * self._step
 
     def poses(self, *, force: bool = False) -> Trajectory:
-        """Return where the tiles are in the city: 1.8 m above their ground, x along the x of the city."""
+        """Return the poses of the tiles in the city: 1.8 m above their ground, with the axes of the city."""
         heights = [frame.height_m for frame in self.frames if isinstance(frame, SynthCityFrame)]
         poses = np.array([translation((x, y, z)) for (x, y), z in zip(self._centers, heights, strict=True)])
         return Trajectory(poses, where=self.location)
 
     def notes(self) -> list[str]:
-        """Return what the data lack."""
+        """Return notes on what is missing in the data."""
         return [
             f"SynthCity is a static cloud without trajectory: each frame is a tile of {self._step:.1f} m, in the frame of a place"
             f" {_HEIGHT_M} m above its ground, where no sensor was",
-            "only voxels with points are known; everything else is unknown, because nothing tells where space is free",
+            "only voxels with points are known, because there are no rays that show free space",
         ]
 
 
 class _TileFolder:
-    """A temporary folder that is deleted when nothing refers to this object any more, at the latest when the process ends."""
+    """A temporary folder. It is deleted with the last reference to this object, at the latest when the process ends."""
 
     def __init__(self) -> None:
         self.name = tempfile.mkdtemp(prefix="carlasc-synthcity-")
@@ -300,7 +301,7 @@ def _append(folder: str, points: NDArray[np.float64], labels: NDArray[np.uint8],
             with Path(_tile_file(folder, tile)).open("ab") as file:
                 part.tofile(file)
     except OSError as error:
-        advice = "set TMPDIR to a folder with 17 bytes of free space per point"
+        advice = "set TMPDIR to a folder on a disk with 17 bytes of free space per point"
         raise StorageError(
             folder, problem=f"the temporary folder cannot be written ({error})", advice=advice
         ) from error

@@ -14,13 +14,13 @@ from carlasc_converters.files import read_bytes
 from carlasc_converters.kitti_boxes import BoxRows, class_of
 
 MAX_BYTES = 256 << 20  # the files of KITTI have at most some ten megabytes
-_INTERPOLATED = 1  # the state of a box that was filled in between two others; 2 means that it was drawn
+_INTERPOLATED = 1  # the state of a box that was interpolated between two others; 2 means that it was drawn
 
 
 def read_tracklets(path: Path, frames: list[int]) -> dict[int, Boxes]:
     """Read the boxes of some frames, in the frame of the LiDAR: x forward, y left, z up. Tracks count from 1, in the order of the file.
 
-    Boxes that the annotators' program filled in between two others are marked as not annotated.
+    Boxes that the annotation tool interpolated between two others are marked as not annotated.
 
     Raises:
         FormatError: the file is damaged or too large, or names a type of object that KITTI does not have.
@@ -53,12 +53,12 @@ def _items(path: Path) -> list[ElementTree.Element]:
     data = read_bytes(path)
     if (
         b"<!ENTITY" in data or b"\0" in data
-    ):  # entities can make a small file very large; other encodings would hide them
+    ):  # entities can make a small file very large, and other encodings can hide them
         found = "an entity" if b"<!ENTITY" in data else "another encoding"
         raise FormatError(path, expected="XML in UTF-8 without entities", found=found, advice="copy the file again")
     try:
         root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # LookupError: an encoding that nobody knows
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # LookupError: an unknown encoding
         raise FormatError(path, expected="XML", found=f"damage: {error}", advice="copy the file again") from error
     tracklets = root.find("tracklets")
     if tracklets is None:

@@ -1,4 +1,4 @@
-"""The tree of frames of a bag: which frame is where in which, at which time."""
+"""The tree of coordinate frames of a bag, over time."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from carlasc.core.geometry import inverse_of, multiply, slerp
 from carlasc.errors import FormatError
 from carlasc_converters.rigid import poses_of
 
-_STILL = 1e-9  # what a transform changes by although nothing moves
+_STILL = 1e-9  # a transform that changes by less is static
 
 
 @dataclass(frozen=True)
 class PlacedFrame:
-    """A frame in another one at some time.
+    """The pose of a frame in another one at one time.
 
     Attributes:
         stamp_ns: the time.
         parent: the other frame.
-        child: the frame; empty if the message does not say it.
+        child: the frame; empty if the message does not name it.
         pose: x, y, z in metres, and a quaternion w, x, y, z: parent_T_child.
     """
 
@@ -36,7 +36,7 @@ class PlacedFrame:
 
 
 class FrameTrack:
-    """One frame in another over time."""
+    """The poses of one frame in another over time."""
 
     def __init__(self, where: str) -> None:
         self._where, self._stamps, self._poses = where, array("q"), array("d")
@@ -54,7 +54,7 @@ class FrameTrack:
         """(K,) increasing times in nanoseconds, and (K, 4, 4) poses: the last of each time.
 
         Raises:
-            FormatError: a quaternion is no rotation.
+            FormatError: a quaternion is not a rotation.
         """
         stamps, numbers = np.array(self._stamps, np.int64), np.array(self._poses, np.float64).reshape(-1, 7)
         poses = poses_of(numbers[:, 3:], numbers[:, :3], self._where)
@@ -68,7 +68,7 @@ class FrameTrack:
         return bool(np.abs(poses - poses[0]).max() > _STILL)
 
     def at(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return (M, 4, 4) poses at some times: interpolated, and before the first and after the last those."""
+        """Return (M, 4, 4) poses at some times: interpolated, and constant before the first and after the last."""
         times, poses = self.values
         after = (np.clip(stamps, times[0], times[-1]) - times[0]) * 1e-9
         return slerp(poses, (times - times[0]) * 1e-9, after)

@@ -1,1 +1,1 @@
-"""A small network of our own: what past scans saw in, classes of all voxels out."""
+"""A small network of our own: from the visibility of past scans to the classes of all voxels."""

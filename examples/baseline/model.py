@@ -1,7 +1,7 @@
-"""A U-Net over the ground plane that takes what past scans saw, not only what they hit: small, and fast on a CPU.
+"""A U-Net over the ground plane. Its input is the visibility of past scans: returns, and voxels that rays passed. It is small, and fast on a CPU.
 
 Height, time and the two kinds of observation (a ray passed, a ray ended) are channels of 2-D convolutions, so one pass completes all layers
-of voxels. The last layer classifies each voxel by features of its own.
+of voxels. The last layer classifies each voxel by its own features.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the network takes: for every scan of a stack, where its rays ended, where they only passed, and where they never were."""
+"""The input of the network: for each scan of a stack, voxels where rays ended, voxels that rays passed, and voxels without rays."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Seen(Task):
     """The task of a network that takes `visibility`.
 
     Args:
-        rays: whether the network is told where rays passed. If not, it takes occupancy alone, to measure what rays contribute.
+        rays: whether the input contains the voxels that rays passed. Otherwise it is occupancy only, to measure the effect of rays.
     """
 
     weighting = "root"
@@ -27,13 +27,13 @@ class Seen(Task):
         self.fields = ("visibility",) if rays else ("occupancy",)
 
     def from_scan(self, points: NDArray[np.float32], spec: GridSpec) -> Batch:
-        """Return what a scan (N, 4) in the sensor's frame saw."""
+        """Return the visibility of a scan (N, 4) in the sensor's frame."""
         if "occupancy" in self.fields:
             return super().from_scan(points, spec)
         return {"visibility": stack_visibility([points], np.eye(4)[None], spec)}
 
     def example(self, spec: GridSpec, history: int, rng: np.random.Generator) -> Batch:
-        """Return a made-up sample: as dense as a scan is, which hits 1 voxel in 20, and passes 2 in 5."""
+        """Return a random sample with the density of a scan: returns in 1 of 20 voxels, and passing rays in 2 of 5."""
         if "occupancy" in self.fields:
             return super().example(spec, history, rng)
         draw = rng.random((history, *spec.size))

@@ -1,4 +1,4 @@
-"""The frame of the scripts: errors in one line, what Ctrl-C leaves, and progress: a bar on a terminal, lines elsewhere."""
+"""The common part of the scripts: errors in one line, a message after Ctrl-C, and progress: a bar on a terminal, otherwise lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from carlasc.errors import ArgumentError, CarlascError
 
-EVERY_S = 10.0  # between two lines of progress where there is no terminal
+EVERY_S = 10.0  # seconds between two lines of progress without a terminal
 
 
 def run(main: Callable[..., Any], continued: str = "the same command continues") -> None:
@@ -23,7 +23,7 @@ def run(main: Callable[..., Any], continued: str = "the same command continues")
 
     Args:
         main: the function, whose parameters are options.
-        continued: how an interrupted run is continued.
+        continued: how to continue an interrupted run.
     """
 
     @wraps(main)
@@ -43,7 +43,7 @@ def run(main: Callable[..., Any], continued: str = "the same command continues")
 
 @contextmanager
 def progress_bar(description: str) -> Iterator[Callable[[int, int], None]]:
-    """Show progress on stderr: a bar on a terminal, and else a line every ten seconds. Yields a callback of (done, total)."""
+    """Show progress on stderr: a bar on a terminal, otherwise a line every ten seconds. Yields a callback of (done, total)."""
     console = Console(stderr=True)
     if not console.is_terminal:
         line = Line()
@@ -55,7 +55,7 @@ def progress_bar(description: str) -> Iterator[Callable[[int, int], None]]:
 
 
 class Line:
-    """A line on stderr that changes: on a terminal it is written over, elsewhere there is a new one every ten seconds."""
+    """A line on stderr that changes: it is overwritten on a terminal, and otherwise printed again every ten seconds."""
 
     def __init__(self) -> None:
         self._last_s = time.monotonic()

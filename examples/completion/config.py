@@ -31,14 +31,14 @@ STACKED = ("motionsc", "baseline", "baseline_hits")
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of a training run. The defaults are those of MotionSC on CarlaSC.
+    """Settings of a training run, with the defaults of MotionSC on CarlaSC.
 
     Attributes:
         network: one of `NETWORKS`.
         history: T, number of scans in a stack; more than 1 for `STACKED` networks only.
         align: move past scans into the newest one's frame by their poses.
-        shuffle_history: put the past scans of each stack in random order (to measure what their order contributes).
-        grid: which grid of the data to predict.
+        shuffle_history: put the past scans of each stack in random order (to measure the effect of their order).
+        grid: name of the grid to predict.
         remap: maps the labels to the predicted classes.
         train: split to train on, or names of sequences.
         val: split to choose the best epoch by.
@@ -46,8 +46,8 @@ class Config:
         flips: directions in which samples are mirrored at random: "x", "y", "xy" or "".
         class_weights: of the loss: "table" (the published voxel counts), "train" (counted on the training split), "none", or the file
             that `carlasc stats --json` wrote.
-        weighting: how much more a rare class weighs: "log" (the paper's 1 / ln of the count) or "root" (the cube root of how many times
-            rarer it is than the most frequent one, as for JS3C-Net); None is the network's own.
+        weighting: class weights from counts: "log" (the paper's 1 / ln of the count) or "root" (the cube root of the count of the most
+            frequent class divided by the count, as for JS3C-Net); None is the network's own.
         soft_labels: train on the probability of each class instead of labels; the grid must be made with `keep_evidence=True`.
         free_ratio: number of free voxels in the loss per occupied one, drawn at random for each batch; 0 takes all (SSCNet: 2).
         epochs: passes over the training split.
@@ -171,7 +171,7 @@ def _fits(value: Any, kind: Any) -> bool:
     origin = typing.get_origin(kind)
     if origin is Literal:
         return value in typing.get_args(kind)
-    if origin in (types.UnionType, typing.Union):  # the second is what a Literal or None is
+    if origin in (types.UnionType, typing.Union):  # a Literal or None is of the second type
         return any(_fits(value, part) for part in typing.get_args(kind))
     if origin is list:
         return isinstance(value, list) and all(_fits(item, typing.get_args(kind)[0]) for item in value)

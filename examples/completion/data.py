@@ -129,12 +129,12 @@ def open_split(
 
 
 class EpochSampler(DistributedSampler[int]):
-    """A DistributedSampler that can go on in the middle of an epoch, as `carlasc.ShardSampler` can."""
+    """A DistributedSampler that can continue in the middle of an epoch, like `carlasc.ShardSampler`."""
 
     _trained = 0
 
     def __iter__(self) -> Iterator[int]:
-        """Iterate over what is left of the epoch."""
+        """Iterate over the rest of the epoch."""
         left = islice(super().__iter__(), self._trained // self.num_replicas, None)
         self._trained = 0
         return left
@@ -149,7 +149,7 @@ class EpochSampler(DistributedSampler[int]):
 
 
 class Kept(TorchDataset[Values]):
-    """Keeps the samples of a data set in memory, as they are before they are transformed; for all runs of this process on the same data."""
+    """Keeps the samples of a data set in memory, before transforms are applied, for all runs of this process on the same data."""
 
     _samples_of: ClassVar[dict[tuple[Any, ...], dict[int, Sample]]] = {}
 
@@ -174,8 +174,8 @@ class Kept(TorchDataset[Values]):
 class TrainLoader:
     """Batches of the training split. Order and flips differ between epochs, and depend only on the seed and the epoch.
 
-    If the data are a store that keeps many frames in a file, the files are read one after another (`carlasc.ShardSampler`): from an
-    object store, each is fetched once.
+    If the data are a store with many frames per file, files are read one after the other (`carlasc.ShardSampler`), so that each file of an
+    object store is fetched once.
 
     Args:
         data: the split.
@@ -230,7 +230,7 @@ def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) ->
 
 
 def _loader(data: Any, config: Config, batch_size: int, **options: Any) -> DataLoader[Values]:
-    workers = min(config.workers, os.cpu_count() or 1)  # torch warns of more, and they gain nothing
+    workers = min(config.workers, os.cpu_count() or 1)  # torch warns about more workers, which do not help
     return DataLoader(
         data,
         batch_size,

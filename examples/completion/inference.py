@@ -32,7 +32,7 @@ class Completer(nn.Module):
         self.dtype = dtype
 
     def forward(self, *inputs: Any) -> Tensor:
-        """Take (B, T, X, Y, Z) occupancy, uint8 or float, or what else the network takes, to (B, X, Y, Z) uint8 labels."""
+        """Return (B, X, Y, Z) uint8 labels for (B, T, X, Y, Z) occupancy, uint8 or float, or for other inputs of the network."""
         outputs = self.network(*(given.to(self.dtype) if isinstance(given, Tensor) else given for given in inputs))
         return task_of(self.network).labels(outputs).to(torch.uint8)
 
@@ -40,7 +40,7 @@ class Completer(nn.Module):
 class Compiled:
     """A module that is compiled with its weights as constants, once per shape of input.
 
-    Batch norms are folded into convolutions, and the weights are laid out for the processor once. On a CPU this is most of the gain.
+    Batch norms are folded into convolutions, and the weights are arranged for the processor once, which gives most of the speed on a CPU.
     """
 
     def __init__(self, module: nn.Module, cudagraphs: bool = False) -> None:
@@ -67,10 +67,10 @@ def prepare(
     Args:
         network: the network. It is put into eval mode, moved to the device and, for bf16, converted, all in place.
         device: the device that computes.
-        mode: "eager" runs the network without compiling; "compile" compiles it at the first call, which takes about a minute, and is
-            several times faster afterwards. On CUDA the program is replayed as a CUDA graph, with channels last. Networks whose inputs
-            have no fixed shapes are always run eagerly in float32.
-        bf16: compute in bfloat16; None does so on CUDA with "compile".
+        mode: "eager" runs the network without compiling; "compile" compiles it at the first call, which takes about a minute; later calls
+            are several times faster. On CUDA, the program is replayed as a CUDA graph, with channels last. Networks with inputs of variable
+            shapes always run eagerly in float32.
+        bf16: compute in bfloat16; None: only on CUDA with "compile".
 
     Returns:
         A function from (B, T, X, Y, Z) occupancy, uint8 or float, on the device, or from the other arguments of the network, to
@@ -98,7 +98,7 @@ def prepare(
 
 
 def check_compiler(device: torch.device) -> None:
-    """Raise DependencyError if torch.compile will not find the C++ compiler that it needs."""
+    """Raise DependencyError if torch.compile cannot find a C++ compiler."""
     names = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++"]
     if device.type == "cpu" and sys.platform != "win32" and not any(shutil.which(name) for name in names):
         raise DependencyError(

@@ -1,4 +1,4 @@
-"""Latency and memory of a network at batch 1, as the paper measures them: 100 repetitions, warm."""
+"""Latency and memory of a network at batch size 1, measured as in the paper: 100 repetitions after a warm-up."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from carlasc import GridSpec, collate
 from completion.inference import Mode, prepare
 from completion.networks import KINDS, build_network
 
-_STACKS = 8  # together a million voxels of the published grid
+_STACKS = 8  # together, they have a million voxels of the published grid
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Latency:
         history: T.
         mode: "eager" or "compile".
         median_ms: median time of the repetitions.
-        fastest_ms: shortest time of the repetitions; more reliable for ratios if the machine does other work at the same time.
+        fastest_ms: shortest time of the repetitions; for ratios, it is more reliable on a busy machine.
         memory_mb: peak memory of the GPU, or of the whole process on a CPU.
         speedup: shortest time of the first mode of the same run (eager float32), divided by this mode's.
         differing: number of voxels per million whose label differs from the first mode's.
@@ -104,7 +104,7 @@ def randomise(network: nn.Module) -> nn.Module:
 
 
 def _time_ms(run: Callable[..., torch.Tensor], inputs: tuple[Any, ...], device: torch.device) -> float:
-    """Return the time of a call. With one thread on a CPU it is processor time, which other work on the machine does not change."""
+    """Return the time of a call. With one thread on a CPU it is CPU time, which does not depend on other work on the machine."""
     clock = time.process_time if device.type == "cpu" and torch.get_num_threads() == 1 else time.perf_counter
     if device.type == "cuda":
         torch.cuda.synchronize(device)

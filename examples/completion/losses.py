@@ -31,7 +31,7 @@ def completion_loss(outputs: Tensor | Sequence[Tensor], target: Tensor, class_we
     measure, blocks = (_measure_soft, coarsen_soft) if target.is_floating_point() else (_measure, coarsen)
     for scale, logits in enumerate([outputs] if isinstance(outputs, Tensor) else outputs):
         coarse = target if scale == 0 else blocks(target, 2**scale, len(class_weights))
-        # each voxel's loss first, then the sum: labels and certain probabilities are then added up in the same way
+        # the loss per voxel first, then the sum, so that labels and certain probabilities are added up in the same way
         losses, counted = measure(logits.movedim(-1, 1).float(), coarse, class_weights)
         sums.append(losses.sum())
         weights.append(counted.sum())
@@ -76,8 +76,9 @@ def coarsen(target: Tensor, block: int, num_classes: int) -> Tensor:
 def coarsen_soft(target: Tensor, block: int, num_classes: int) -> Tensor:
     """Return the probabilities of one class per block, by the rule of `coarsen`.
 
-    A block is occupied as probably as the voxel in it that most probably is, by the class whose probabilities add up to most. It is
-    free as probably as the known voxel in it that least probably is. If two classes are equally probable, the lower id is taken.
+    The probability that a block is occupied is the largest such probability of its voxels; its class is the one with the largest sum of
+    probabilities. The probability that it is free is the smallest such probability of its known voxels. If two classes are equally probable,
+    the lower id is taken.
 
     Args:
         target: (B, K, X, Y, Z) float32, zeros for voxels that are left out; X, Y and Z multiples of `block`.

@@ -25,8 +25,8 @@ class Kind:
     """A kind of network.
 
     Attributes:
-        build: makes one for K classes, a grid and T scans.
-        task: what it takes, how its loss is measured, what it predicts.
+        build: makes a network for K classes, a grid and T scans.
+        task: its inputs, its loss and its predictions.
         history: whether T may be more than 1.
     """
 
@@ -55,7 +55,7 @@ KINDS: Mapping[str, Kind] = {
 
 
 def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1) -> nn.Module:
-    """Build a network for a grid. Its task is noted in its attribute `task`.
+    """Build a network for a grid. Its task is in its attribute `task`.
 
     Args:
         name: one of `completion.config.NETWORKS`.
@@ -64,7 +64,7 @@ def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1)
         history: T, scans in a stack.
 
     Raises:
-        ArgumentError: no network has that name, or the size of the grid is not a multiple of what it needs.
+        ArgumentError: the name is unknown, or the size of the grid is not a multiple of the network's divisors.
     """
     if name not in KINDS:
         raise ArgumentError("network", expected=f"one of {', '.join(KINDS)}", found=repr(name))

@@ -30,7 +30,7 @@ _TABLES = {len(table.names): table for table in (CARLASC11, SEMANTICKITTI19)}
 
 @dataclass(frozen=True)
 class Model:
-    """Weights, with the network and the classes that they belong to.
+    """Weights, with their network and their classes.
 
     Attributes:
         network: name of the network.
@@ -48,18 +48,18 @@ class Model:
 
     @property
     def task(self) -> Task:
-        """What the network takes and predicts."""
+        """The inputs and the predictions of the network."""
         return KINDS[self.network].task
 
     @classmethod
     def read(cls, path: Path, history: int | None = None) -> Model:
-        """Read weights, and find out which network they belong to.
+        """Read weights, and find their network.
 
-        `history` is read from a config.yaml beside the weights if it is None. The file also decides between networks that have the same
+        If `history` is None, it is read from a config.yaml beside the weights. The file also decides between networks with the same
         weights.
 
         Raises:
-            FormatError: they belong to none of our networks, or to an unknown number of classes.
+            FormatError: the network or the number of classes is unknown.
         """
         state = read_weights(path)
         settings = path.parent / "config.yaml"
@@ -74,10 +74,10 @@ class Model:
         return cls(name, history, _TABLES[num_classes], state, str(path))
 
     def complete_on(self, spec: GridSpec, device: torch.device, mode: Mode) -> Complete:
-        """Return a function from the fields of a sample that the network takes to (X, Y, Z) labels.
+        """Return a function from the input fields of a sample to (X, Y, Z) labels.
 
         Raises:
-            FormatError: the weights are for another grid, number of classes or history; names the layer and both shapes.
+            FormatError: the weights are for another grid, number of classes or history; the message names the layer and both shapes.
         """
         network = build_network(self.network, len(self.classes.names), spec, self.history)
         load_weights(network, self.state, self.where)
@@ -124,7 +124,7 @@ def predict_dataset(
         ArgumentError: `out` is None and the data are not a folder.
         ConflictError: the grid exists, and was made by another network or on another grid.
     """
-    fields = dict.fromkeys(("occupancy", *model.task.fields))  # occupancy needs the grid, whose geometry is predicted
+    fields = dict.fromkeys(("occupancy", *model.task.fields))  # occupancy has the geometry of the predicted grid
     data = Dataset(source, split, history=model.history, grid=grid, fields=fields, remap=None)
     if out is None and not Path(source).is_dir():
         raise ArgumentError("out", expected=f"a folder to write to, because {source} is not one", found="none")

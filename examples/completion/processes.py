@@ -1,4 +1,4 @@
-"""One or more training processes, and what they exchange."""
+"""One or more training processes, and their communication."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Processes:
-    """The processes of a run, as one of them sees them.
+    """The processes of a run, and which of them this one is.
 
     Attributes:
         rank: number of this process.
@@ -40,7 +40,7 @@ class Processes:
         return value
 
     def share(self, tensors: Iterable[Tensor]) -> None:
-        """Copy the tensors of the first process to all others: the statistics of batch norms differ, because each process has seen other batches."""
+        """Copy the tensors of the first process to all others: the statistics of batch norms differ, because each process has other batches."""
         if self.world > 1:
             for tensor in tensors:
                 dist.broadcast(tensor, 0)

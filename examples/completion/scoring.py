@@ -21,7 +21,7 @@ from completion.tasks import Batch, task_of
 def score_with_certainty(
     network: nn.Module, loader: DataLoader[Mapping[str, Any]], num_classes: int, processes: Processes
 ) -> tuple[ConfusionMatrix, Uncertainty]:
-    """Return the confusion matrix of a network over the known voxels of a split, and how well its probabilities are calibrated."""
+    """Return the confusion matrix of a network over the known voxels of a split, and the calibration of its probabilities."""
     network.eval()
     task, matrix, certainty = task_of(network), ConfusionMatrix(num_classes), Uncertainty(num_classes)
     for batch in loader:

@@ -1,4 +1,4 @@
-"""What the scripts must know of a network: what it takes of a sample, how its loss is measured, what it predicts."""
+"""The interface between the scripts and a network: its inputs from a sample, its loss and its predictions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Batch = Mapping[str, Any]
 
 
 def root_weights(counts: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
-    """Return the cube root of how many times rarer each class is than the most frequent one; 0 for classes that never occur."""
+    """Return the cube root of the count of the most frequent class divided by the count of each class; 0 for classes that do not occur."""
     counts = np.asarray(counts, np.float64)
     return np.where(counts > 0, np.cbrt(counts.max() / np.maximum(counts, 1)), 0)
 
@@ -28,12 +28,12 @@ WEIGHTINGS: Mapping[str, Callable[[NDArray[Any]], NDArray[np.float64]]] = {"log"
 
 
 class Task:
-    """The task of a network that takes occupancy to the logits of all voxels. A network that does something else has a subclass.
+    """The task of a network from occupancy to the logits of all voxels. Networks with other tasks have a subclass.
 
     Attributes:
-        fields: fields of a sample that the network takes.
-        training_fields: more fields, which only its loss takes, beside the labels of the voxels.
-        weighting: how much more a rare class weighs in its loss, if the settings do not say: one of `WEIGHTINGS`.
+        fields: fields of a sample that are inputs of the network.
+        training_fields: further fields for its loss, besides the labels of the voxels.
+        weighting: default weighting of classes in its loss: one of `WEIGHTINGS`.
         fixed_shapes: whether the shapes of its inputs are always the same, so that it can be compiled.
     """
 
@@ -43,14 +43,14 @@ class Task:
     fixed_shapes = True
 
     def from_scan(self, points: NDArray[np.float32], spec: GridSpec) -> Batch:
-        """Return the `fields` of a sample, made of a scan (N, 4) in the sensor's frame alone."""
+        """Return the `fields` of a sample, made from a scan (N, 4) in the sensor's frame."""
         occupancy = np.zeros((1, *spec.size), np.uint8)
         voxels = spec.flat_index(points[:, :3])
         occupancy.reshape(-1)[voxels[voxels >= 0]] = 1
         return {"occupancy": occupancy}
 
     def example(self, spec: GridSpec, history: int, rng: np.random.Generator) -> Batch:
-        """Return the `fields` of a made-up sample, to measure times: as dense as a scan is, 1 voxel in 20."""
+        """Return the `fields` of a random sample with the density of a scan (1 of 20 voxels), to measure times."""
         return {"occupancy": (rng.random((history, *spec.size)) < 0.05).astype(np.uint8)}
 
     def seen(self, sample: Batch, spec: GridSpec) -> NDArray[np.uint8]:
@@ -58,7 +58,7 @@ class Task:
         return sample["occupancy"][-1]
 
     def prepare(self, batch: Batch, device: torch.device, draw: torch.Generator | None = None) -> Batch:
-        """Return a batch with what the network and its loss take, on the device.
+        """Return a batch with the inputs of the network and of its loss, on the device.
 
         Args:
             batch: the collated samples.
@@ -76,25 +76,25 @@ class Task:
         return completion_loss(outputs, target, class_weights)
 
     def balance(self, network: nn.Module, parts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how the parts make the loss: (S,) factors, and a number to add. Here the loss is the mean of the parts."""
+        """Return (S,) factors of the parts in the loss, and a number to add. Here, the loss is the mean of the parts."""
         return torch.full_like(parts, 1 / len(parts)), parts.new_zeros(())
 
     def logits(self, outputs: Any) -> Tensor:
-        """Return the (B, X, Y, Z, K) logits from what the network returns when it is not training."""
+        """Return the (B, X, Y, Z, K) logits from the output of the network in eval mode."""
         logits: Tensor = outputs
         return logits
 
     def labels(self, outputs: Any) -> Tensor:
-        """Return the (B, X, Y, Z) predicted classes from what the network returns when it is not training."""
+        """Return the (B, X, Y, Z) predicted classes from the output of the network in eval mode."""
         return self.logits(outputs).argmax(-1)
 
     def set_epoch(self, network: nn.Module, epoch: int) -> None:
-        """Change what the network changes from epoch to epoch, counted from 0."""
+        """Set the values of the network that depend on the epoch, counted from 0."""
 
 
 VOXELS = Task()
 
 
 def task_of(network: nn.Module) -> Task:
-    """Return the task that `build_network` noted in a network; that of occupancy grids for all others."""
+    """Return the task of a network from `build_network`; for other networks, the task of occupancy grids."""
     return getattr(network, "task", VOXELS)

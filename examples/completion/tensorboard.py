@@ -37,7 +37,7 @@ class Board:
             self._writer.close()
 
     def add_epoch(self, epoch: int, loss: float, learning_rate: float, matrix: ConfusionMatrix) -> None:
-        """Add an epoch's figures."""
+        """Add the scores of an epoch."""
         geometry = matrix.completeness()
         scalars = {"train/loss": loss, "train/learning_rate": learning_rate, "val/mIoU": matrix.miou}
         scalars |= {"val/accuracy": matrix.accuracy, "val/precision": geometry.precision}

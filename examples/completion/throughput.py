@@ -20,8 +20,8 @@ class Throughput:
     """Samples per second.
 
     Attributes:
-        loader: of the loader alone.
-        network: of forward, loss, backward and step on one batch in memory.
+        loader: of the loader only.
+        network: of forward pass, loss, backward pass and step on one batch in memory.
     """
 
     loader: float
@@ -29,7 +29,7 @@ class Throughput:
 
 
 def measure_throughput(source: str | Path, config: Config, device: torch.device, batches: int = 20) -> Throughput:
-    """Measure loader and network separately, with the settings of a run. The first batches, during which workers start, are not counted."""
+    """Measure loader and network separately, with the settings of a run. The first batches are not counted, because workers start meanwhile."""
     data = open_split(source, config.train, config, training=True)
     loader = TrainLoader(data, config)
     endless = itertools.chain.from_iterable(loader.epoch(number) for number in itertools.count())

@@ -1,4 +1,4 @@
-"""The training loop: after each epoch a score, the best weights so far, and a checkpoint."""
+"""The training loop, with a score, the best weights and a checkpoint after each epoch."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Progress:
         losses: mean training loss of each epoch.
         mious: mIoU on the validation split after each epoch.
         samples_per_s: training samples per second in each epoch.
-        step: number of steps made of an epoch that is not finished.
-        loss_so_far: sum of their losses.
+        step: number of finished steps of an unfinished epoch.
+        loss_so_far: sum of the losses of these steps.
     """
 
     epoch: int = 0
@@ -74,11 +74,11 @@ def train(
         source: the data, anything that `carlasc.open` takes.
         config: the settings.
         out: folder of the run.
-        processes: the processes of the run, and which one this is.
-        resume: continue from last.pt; the result is that of a run without interruption.
+        processes: the processes of the run.
+        resume: continue from last.pt; the result equals that of a run without interruption.
 
     Raises:
-        CarlascError: a split is empty, the loss is not finite, memory does not suffice, or `out` holds another run.
+        CarlascError: a split is empty, the loss is not finite, memory is not sufficient, or `out` holds another run.
     """
     data = open_split(source, config.train, config, training=True)
     loader = TrainLoader(data, config, processes.rank, processes.world)
@@ -148,7 +148,7 @@ def _begin(out: Path, config: Config, processes: Processes) -> Progress:
 
 
 def _resume(out: Path, config: Config, parts: dict[str, Any]) -> Progress:
-    """Load last.pt. Nothing else is needed, because order, flips and draws depend on the seed, the epoch and the step only."""
+    """Load last.pt. Nothing else is needed, because order, flips and random draws depend only on the seed, the epoch and the step."""
     before = Config.read(out / CONFIG) if (out / CONFIG).is_file() else config
     changed = [f.name for f in dataclasses.fields(Config) if getattr(before, f.name) != getattr(config, f.name)]
     if changed := [
@@ -193,18 +193,18 @@ def _train_epoch(
     processes: Processes,
     save: Callable[[], None],
 ) -> None:
-    """Make the steps of an epoch that are left, and note them in `progress`. `networks` are the network itself, and as it is wrapped."""
+    """Make the remaining steps of an epoch, and record them in `progress`. `networks` are the network itself, and its wrapped form."""
     networks[1].train()
     epoch, line = progress.epoch, Line()
     for step, batch in enumerate(loader.epoch(epoch, progress.step), progress.step):
         try:
             loss = _train_step(networks, optimizer, batch, class_weights, (epoch, step), config, processes)
         except (torch.OutOfMemoryError, RuntimeError, ValueError) as error:
-            if "more than 1 value per channel" in str(error):  # torch's words, where a batch norm has one value only
+            if "more than 1 value per channel" in str(error):  # torch's message for a batch norm with a single value
                 raise CarlascError(
                     f"epoch {epoch + 1}, batch {step + 1}",
-                    problem=f"{len(batch['frame'])} sample is too little for a batch norm on a grid as small as this",
-                    advice=f"choose a batch_size that does not leave one of the {len(loader.data)} samples alone",
+                    problem=f"{len(batch['frame'])} sample is too little for a batch norm on such a small grid",
+                    advice=f"choose a batch_size so that the last batch of the {len(loader.data)} samples has more than one",
                 ) from error
             if not _is_out_of_memory(error):
                 raise

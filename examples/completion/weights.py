@@ -1,4 +1,4 @@
-"""Reading and writing of weights: state dicts as `.pt` or `.safetensors`. Code in a file is never run."""
+"""Reading and writing weights: state dicts as `.pt` or `.safetensors`. Code in a file is never run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 
 StateDict = dict[str, Tensor]
 
-_MARKS = {  # a name that only one network's state dict has; looked for in this order
+_MARKS = {  # a name that only the state dict of one network has, searched in this order
     "motionsc": "stpn.conv_pre_1.weight",
     "lmscnet": "seg_head_1_2.conv0.weight",
     "lmscnet_ss": "seg_head_1_1.conv0.weight",
@@ -27,7 +27,7 @@ _MARKS = {  # a name that only one network's state dict has; looked for in this 
 _VARIANTS = {
     "js3cnet_exact": "js3cnet",
     "baseline_hits": "baseline",
-}  # networks whose weights cannot be told from those of another
+}  # networks whose weights have the same names as those of another
 
 
 def read_weights(path: Path) -> StateDict:
@@ -66,7 +66,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def write_weights(path: Path, network: nn.Module) -> None:
-    """Write a network's state dict, as safetensors if the name ends so. The file is complete or does not exist."""
+    """Write a network's state dict, as safetensors if the name ends in .safetensors. The file is complete or does not exist."""
     state = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     if path.suffix == ".safetensors":
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -87,7 +87,7 @@ def load_weights(network: nn.Module, state: Mapping[str, Tensor], where: str) ->
     """Load a state dict strictly; `where` is the file named in errors.
 
     Raises:
-        FormatError: a layer is missing, unknown, or of another shape; names it and both shapes.
+        FormatError: a layer is missing, unknown, or of another shape; the message names it and both shapes.
     """
     own = network.state_dict()
     for name, value in own.items():
@@ -118,10 +118,10 @@ def load_weights(network: nn.Module, state: Mapping[str, Tensor], where: str) ->
 def identify(state: Mapping[str, Tensor], where: str, trained: str | None = None) -> tuple[str, int]:
     """Return the name of the network that a state dict belongs to, and the number of classes.
 
-    `trained` is the name of the network that the run's settings give: it decides between networks that have the same weights.
+    `trained` is the name of the network in the settings of the run, which decides between networks with the same weights.
 
     Raises:
-        FormatError: it belongs to none of our networks.
+        FormatError: the network is unknown.
     """
     name = next((name for name, mark in _MARKS.items() if mark in state), None)
     if name is None:

@@ -1,4 +1,4 @@
-"""JS3C-Net: a sparse U-Net labels the points, a dense network completes the scene from their logits, and near points refine each voxel.
+"""JS3C-Net: a sparse U-Net labels the points, a dense network completes the scene from their logits, and nearby points refine each voxel.
 
 X. Yan et al.: Sparse Single Sweep LiDAR Point Cloud Segmentation via Learning Contextual Shape Priors from Scene Completion, AAAI 2021.
 """
@@ -68,7 +68,7 @@ class SegmentationHead(nn.Module):
 def pool(features: Tensor, cells: Tensor, size: tuple[int, int, int, int]) -> Tensor:
     """Return a dense volume of the points' features: zeros, and the mean over five slots where a cell has points.
 
-    The slots hold the cell's first five points, in their order; the first point again in those that are left.
+    The slots hold the first five points of the cell in order; remaining slots hold the first point again.
 
     Args:
         features: (N, C).
@@ -128,8 +128,8 @@ class Decoder(nn.Module):
 def nearest(supports: Tensor, queries: Tensor, search: Search) -> Tensor:
     """Return the (Q, 8) int64 nearest supports of each query, the nearest first, for whole-numbered positions (S, 3) and (Q, 3).
 
-    "topk" takes the lower index if two are equally near. "tree" takes either, and is many times faster on a CPU. Fewer than eight
-    supports are filled up with the first, and so is index 0 wherever it is found: the reference takes it for an empty place.
+    "topk" takes the lower index if two are equally near. "tree" takes either, and is many times faster on a CPU. If there are fewer than
+    eight supports, the first one is repeated. It also replaces index 0, which the reference implementation treats as empty.
     """
     count = min(NEIGHBOURS, len(supports))
     if search == "tree":
@@ -168,7 +168,7 @@ class Interaction(nn.Module):
         cells = torch.cartesian_prod(*(torch.arange(n, device=coarse.device) for n in coarse.shape[2:]))
         near = coarse.new_zeros(len(coarse), len(cells), WIDTH)
         found = {item: self._relate(cells, volume) for item, volume in enumerate(shape.detach()) if volume.any()}
-        if found:  # otherwise no point is within the grid
+        if found:  # otherwise, no point is inside the grid
             relations, features = (torch.stack(parts) for parts in zip(*found.values(), strict=True))
             weights = self.relation_w(relations.flatten(0, 2)).reshape(features.shape)
             near = near.index_copy(
@@ -178,7 +178,7 @@ class Interaction(nn.Module):
         return self.fuse_mlps(rows).reshape(len(coarse), len(cells), -1).transpose(1, 2).reshape(coarse.shape)
 
     def _relate(self, cells: Tensor, volume: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (Q, 8, 10) where each coarse cell's neighbours are, and (Q, 8, 16) their features, for one item."""
+        """Return (Q, 8, 10) positions of the neighbours of each coarse cell, and (Q, 8, 16) their features, for one item."""
         supports = volume.any(0).nonzero()
         here, there = self._centres(cells, 2), self._centres(supports, 1)
         if self.exact:  # in units of half a voxel
@@ -190,7 +190,7 @@ class Interaction(nn.Module):
         return relation, volume[:, supports[:, 0], supports[:, 1], supports[:, 2]].T[found]
 
     def _centres(self, cells: Tensor, step: int) -> Tensor:
-        """Return the centres of cells that are `step` voxels wide, in metres; in whole metres, as the reference does, if not `exact`."""
+        """Return the centres of cells that are `step` voxels wide, in metres; without `exact`, in whole metres, as in the reference implementation."""
         centres = (cells + 0.5) * (step * self.voxel) + self.lower
         return centres if self.exact else centres.trunc()
 
@@ -219,7 +219,7 @@ class JS3CNet(nn.Module):
         spec: the Cartesian grid to complete. X, Y and Z must be even.
         channels: columns of a point (x, y, z in metres, and a fourth) that are its features.
         residual: use residual blocks in the U-Net.
-        exact: search neighbours by their true distance. The reference truncates all positions to whole metres.
+        exact: search neighbours by their true distance. The reference implementation truncates all positions to whole metres.
         search: how neighbours are searched: "tree" (needs SciPy) or "topk".
     """
 

@@ -42,7 +42,7 @@ class Level:
         for k in range(13):
             dx, dy, dz = k // 9 - 1, k // 3 % 3 - 1, k % 3 - 1
             wanted = self._keys + ((dx * self._side) + dy) * self._side + dz
-            place = torch.searchsorted(self._keys, wanted)  # an earlier key, so the place is never beyond the end
+            place = torch.searchsorted(self._keys, wanted)  # an earlier key, so that the index is never beyond the end
             sites = (self._keys[place] == wanted).nonzero().squeeze(1)
             pairs.append((place[sites], sites))
         return pairs
@@ -158,7 +158,7 @@ class Down(Convolution):
 
 
 class Up(Convolution):
-    """The inverse of `Down`: back to exactly the sites that it started from, one term per site."""
+    """The inverse of `Down`: from the coarser sites to the sites before it, one term per site."""
 
     volume = 8
 

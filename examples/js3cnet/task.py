@@ -1,4 +1,4 @@
-"""How JS3C-Net is trained and used: points and voxels are both predicted, with learned weights of the two losses."""
+"""The task of JS3C-Net: it predicts points and voxels, with learned weights of the two losses."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class PointsAndVoxels(Task):
         azimuth = np.tile(np.linspace(-np.pi, np.pi, 1875, endpoint=False), 64)
         elevation = np.repeat(np.radians(np.linspace(-24.8, 2.0, 64)), 1875)
         rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], 1)
-        side_m = 9 + 3 * (np.floor(8 * azimuth / np.pi) % 3)  # of the houses' fronts from the sensor
+        side_m = 9 + 3 * (np.floor(8 * azimuth / np.pi) % 3)  # distance of the fronts of houses from the sensor
         with np.errstate(divide="ignore"):
             reach = np.minimum(side_m / np.abs(rays[:, 1]), 45)
             ground = np.where(rays[:, 2] < 0, -1.8 / rays[:, 2], np.inf)
@@ -93,14 +93,14 @@ class PointsAndVoxels(Task):
         return batch["points"], batch["cells"]
 
     def loss(self, outputs: Prediction, batch: Batch, target: Tensor, class_weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the parts for the points and for the voxels. Points of class 0, which voxels have when they are free, are left out."""
+        """Return the parts for the points and for the voxels. Points of class 0, which means free for voxels, are left out."""
         labels, weights = torch.cat(batch["point_labels"]).long() - 1, class_weights[1:]
         points = cross_entropy(outputs.points.float(), labels, weights, ignore_index=-1, reduction="sum")
         voxels, counted = completion_loss(outputs.voxels, target, class_weights)
         return torch.cat([points[None], voxels]), torch.cat([weights[labels[labels >= 0]].sum()[None], counted])
 
     def balance(self, network: nn.Module, parts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return 1 / s^2 of both parts, and the sum of 2 ln s: the larger s is, the less its part weighs."""
+        """Return 1 / s^2 of both parts, and the sum of 2 ln s: a larger s reduces the weight of its part."""
         variances = torch.cat([network.get_parameter("seg_sigma"), network.get_parameter("complet_sigma")]) ** 2
         return 1 / variances, variances.log().sum()
 

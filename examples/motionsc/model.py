@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate
 
 
 class TemporalConvolution(nn.Module):
-    """A convolution over time alone: (B, T, C, X, Y) to (B, T - kernel + 1, C, X, Y)."""
+    """A convolution over time only: (B, T, C, X, Y) to (B, T - kernel + 1, C, X, Y)."""
 
     def __init__(self, channels: int, kernel: int) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class SpatioTemporalPyramid(nn.Module):
 
     Args:
         height: Z, the channels of the input and of the output. X and Y must be multiples of 16.
-        frames: T; the temporal kernels are 3 where there is enough time left, else 1.
+        frames: T; the temporal kernels are 3 if enough frames are left, otherwise 1.
     """
 
     def __init__(self, height: int, frames: int) -> None:

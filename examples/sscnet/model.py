@@ -1,4 +1,4 @@
-"""SSCNet: 3-D convolutions with dilation at a quarter of the scale, and SSCNet-full, which learns the way back up.
+"""SSCNet: 3-D convolutions with dilation at a quarter of the scale, and SSCNet-full, which learns the upsampling.
 
 S. Song et al.: Semantic Scene Completion from a Single Depth Image, CVPR 2017. SSCNet-full as in LMSCNet's paper.
 """

@@ -99,8 +99,12 @@ def test_the_default_that_a_help_text_names_is_that_of_the_library():
     named = {}
     for name, annotation in get_type_hints(ScanFlags, include_extras=True).items():
         for option in getattr(annotation, "__metadata__", ()):
-            word = re.search(r"(?:^|[;.] )(\w+): [^;]*\(default\)", option.help)
+            word = re.search(r"(?:^|[;.] )(\w+): [^;.]*\(default\)", option.help)
             named |= {name: word[1]} if word else {}
-    assert named.keys() == {"dynamic", "motion", "complete"}
     library = FromScans()
-    assert named == {"dynamic": library.dynamic, "motion": library.motion.source, "complete": library.complete}
+    assert named == {
+        "dynamic": library.dynamic,
+        "motion": library.motion.source,
+        "complete": library.complete,
+        "rays": library.rays,
+    }

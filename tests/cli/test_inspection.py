@@ -39,7 +39,7 @@ def test_validate_of_broken_data_groups_what_it_found_and_exits_1(sequence: Path
     assert result.exit_code == 1
     assert "error: point-counts (3)" in result.output
     assert "warning: times (1)" in result.output
-    assert "not sound (3 errors, 1 warnings" in result.output
+    assert "not sound (3 errors, 1 warning," in result.output
 
 
 def test_validate_prints_a_few_of_a_kind_and_all_on_request(sequence: Path) -> None:

@@ -35,8 +35,8 @@ def test_it_says_what_was_done_to_each_sequence_and_what_was_written(drive, tmp_
     assert done.exit_code == 0, done.stderr
     first, note, last = done.stdout.splitlines()
     assert first.startswith("Train/One/cartesian: poses were refined: neighbouring scans disagreed by ")
-    assert note == "note: without evaluation_16x16x4/, made with other poses"
-    assert last == f"{tmp_path}/out: poses of 1 of 1 sequences refined; 24 files linked, 0 written"
+    assert note == "note: evaluation_16x16x4/ left out, because of other poses"
+    assert last == f"{tmp_path}/out: poses of 1 of 1 sequence refined; 24 files linked, 0 written"
     again = call(tmp_path / "out", "-o", tmp_path / "again", "--json")
     printed = json.loads(again.stdout)
     assert printed["refined"] == [] and printed["linked"] == 24

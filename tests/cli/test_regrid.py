@@ -103,7 +103,7 @@ def test_bad_frames_are_listed_at_the_end_and_the_exit_code_tells(capture):
         (["--size", "1.5,10,10"], "--size: expected 3 whole numbers"),
         (["--res", 0.2, "--bounds", "1,-1,0,1,0,1"], "expected lower < upper on every axis"),
         (["--res", 0.2, "--bounds", "1,2,3"], "--bounds: expected 6 numbers"),
-        (["--preset", "coarse", "--bounds", "0,1,0,1,0,1"], "--bounds: expected none with --preset"),
+        (["--preset", "coarse", "--bounds", "0,1,0,1,0,1"], "--bounds: expected none, because --preset has bounds"),
         (
             ["--preset", "cylindrical", "--coordinates", "cartesian"],
             "--coordinates: expected cylindrical with --preset cylindrical",
@@ -119,10 +119,13 @@ def test_bad_frames_are_listed_at_the_end_and_the_exit_code_tells(capture):
             ["--preset", "coarse", "--min-range-m", 5, "--max-range-m", 2],
             "--min-range-m: expected 0 <= minimum < maximum",
         ),
-        (["--preset", "coarse", "--observe", "capture", "--stride", 2], "--observe: expected scans with the options"),
+        (
+            ["--preset", "coarse", "--observe", "capture", "--stride", 2],
+            "--observe: expected scans, because options for scans",
+        ),
         (
             ["--preset", "coarse", "--observe", "capture", "--from-grid", "x"],
-            "--observe: expected grid with --from-grid",
+            "--observe: expected grid, because --from-grid",
         ),
         (
             ["--preset", "coarse", "--from-grid", "x", "--keep-votes"],

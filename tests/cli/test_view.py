@@ -48,7 +48,7 @@ def test_a_recording_is_written_and_its_size_said_before_all_points_are_kept(gol
         (["-o", "a.html", "--classes", "mine"], 2, "--classes: expected"),
         (["-o", "a.html", "--frames", "x"], 2, "--frames: expected"),
         (["--json"], 2, "--out"),
-        (["--beside", "other"], 2, "--beside: a window shows one run"),
+        (["--beside", "other"], 2, "--beside: a window shows only one run"),
         (["-o", "a.mcap", "--beside", "other"], 2, "--beside: expected a page"),
         (["-o", "a.html", "--full-points"], 2, "--full-points: expected a recording"),
         (["--to", "a.rrd", "--grid", "fine"], 1, "fine"),

@@ -72,7 +72,9 @@ def test_points_times_and_poses_come_back(tmp_path, kind, poses):
         units, said = recording.notes()
         assert units == "/lidar/points: the times of points are in s"
         assert "the poses are those of base_link" in said
-        assert said.endswith(", as assumed: the messages do not say it") == (poses in ("pose", "covariance", "path"))
+        assert said.endswith(", which is assumed: the messages do not name it") == (
+            poses in ("pose", "covariance", "path")
+        )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -163,7 +165,7 @@ def test_poses_of_a_frame_that_the_lidar_has_no_path_to_are_refused_or_forced(tm
         recording.poses()
     np.testing.assert_array_equal(recording.sensors[0].vehicle_T_sensor, np.eye(4))
     assert recording.poses(force=True).world_T_vehicle[2, 0, 3] == 2
-    assert any("from lidar to imu: both are taken as one" in note for note in recording.notes())
+    assert any("from lidar to imu: both are taken as the same frame" in note for note in recording.notes())
     (recording,) = Bag(tmp_path / "drive.bag", pose_frame="lidar").sequences()
     assert recording.poses().world_T_vehicle[2, 0, 3] == 2
 

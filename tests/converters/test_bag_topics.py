@@ -48,7 +48,7 @@ def test_a_bag_without_points_is_named_with_what_it_has(tmp_path, kind):
     bag = bag_of(tmp_path, kind, "/chatter", "/odom")
     message = refused(MissingDataError, lambda: Bag(bag).sequences())
     assert "found /chatter (String, 3 messages, 10 Hz), /odom (Odometry" in message
-    assert "its driver replays them" in message
+    assert "replay them with its driver" in message
 
 
 def test_a_topic_that_does_not_exist_or_has_another_type_is_named(tmp_path):
@@ -84,7 +84,7 @@ def test_messages_of_a_packet_each_are_refused_with_what_to_do(tmp_path, kind):
     bag = bag_of(tmp_path, kind, "/packets", frames=20, period_ns=1_327_000)
     message = refused(FormatError, lambda: Bag(bag).sequences())
     assert "/packets: expected a message for each turn of the LiDAR, found 20 messages, 754 per second" in message
-    assert "set the driver to publish whole turns" in message
+    assert "set the driver to publish full turns" in message
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -113,7 +113,7 @@ def test_a_third_partys_converter_is_found_and_used(installed, tmp_path):
     ("how", "cause"),
     [
         ("torn", "lab 0: expected a scan, found half of one"),
-        ("faulty", "lab 0: the converter failed: KeyError: 'points'"),
+        ("faulty", "lab 0: the converter failed: KeyError: 'points': check the file, or report the error"),
     ],
 )
 def test_where_every_frame_fails_the_first_cause_is_the_message(installed, tmp_path, how, cause, posed):

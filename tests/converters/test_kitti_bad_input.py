@@ -216,7 +216,7 @@ def test_camera_poses_without_their_calibration_are_refused(simulated, tmp_path)
     (copy / "sequences" / "00" / "calib.txt").write_text(
         "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n"
     )  # what somebody may write when the file is missing
-    with pytest.raises(FormatError, match=r"they look like camera-frame poses.*inv\(Tr\) @ P @ Tr.*`force=True`"):
+    with pytest.raises(FormatError, match=r"the likely cause is camera-frame poses.*inv\(Tr\) @ P @ Tr.*`force=True`"):
         run(tmp_path)
     assert not (tmp_path / "out").exists()
     assert run(tmp_path, force=True).made == 24

@@ -124,7 +124,7 @@ def test_names_of_classes_belong_to_classes_and_unknown_ones_are_said(tmp_path):
             entry["class_id"] = "scarecrow" if entry["class_id"] == "van" else entry["class_id"]
 
     (recording,) = Ncore(write_store(tmp_path, DRIVE, edit=rename)).sequences()
-    assert recording.notes() == ["objects of classes that are not known became Other object: scarecrow"]
+    assert recording.notes() == ["objects of unknown classes became Other object: scarecrow"]
     assert any((boxes.labels == OTHER_OBJECT).any() for boxes in recording.boxes().values())
 
 
@@ -137,7 +137,7 @@ def test_frames_that_nobody_annotated_have_no_entry_and_far_observations_are_lef
 
     (recording,) = Ncore(write_store(tmp_path, DRIVE, edit=thin)).sequences()
     assert sorted(recording.boxes()) == [0, 3]
-    assert recording.notes() == ["1 observations of boxes are at no frame, and were left out"]
+    assert recording.notes() == ["1 observation of boxes left out, not near any frame"]
 
 
 def test_a_lidar_that_starts_late_gives_each_frame_once(tmp_path):

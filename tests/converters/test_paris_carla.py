@@ -105,7 +105,7 @@ def test_towns_are_found_below_the_folder_with_the_splits_of_the_paper(tmp_path:
 
 
 def test_notes_say_what_the_licence_forbids(town: Path) -> None:
-    assert any("must not be passed on" in note for note in recording(town).notes())
+    assert any("must not be shared" in note for note in recording(town).notes())
 
 
 def test_a_conversion_keeps_points_times_and_where_rays_began(town: Path, tmp_path: Path) -> None:

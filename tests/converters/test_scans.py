@@ -172,7 +172,7 @@ def test_times_are_found_in_points_and_in_names_and_it_is_said(tmp_path):
     np.testing.assert_allclose(clock.times(), DRIVE.times, atol=1e-9)
     np.testing.assert_allclose(names.times(), DRIVE.times, atol=1e-9)
     assert clock.frames[2].read()[0].seconds.min() == 0
-    assert "the times of points are in ns: that gives a scan of a usual length" in clock.notes()
+    assert "the times of points are in ns, because scans then have a usual duration" in clock.notes()
     assert "the times of scans are from the names of the files" in names.notes()
 
 
@@ -193,7 +193,7 @@ def test_a_table_of_ones_own_keeps_its_ids(tmp_path):
     (tmp_path / "mine.json").write_text(json.dumps(own))
     write_scan(tmp_path / "in/a.npy", {name: np.ones(5, np.float32) for name in ("x", "y", "z", "label")})
     given = {"source_classes": str(tmp_path / "mine.json")}
-    with pytest.raises(ArgumentError, match="classes: expected mine, because nothing maps this table"):
+    with pytest.raises(ArgumentError, match="classes: expected mine, because no map to CarlaSC"):
         convert("scans", tmp_path / "in", tmp_path / "out", options=given, grids=None, run=Run(workers=1))
     kept = LayoutOptions(classes="mine")
     poses = PoseOptions(force=True)
@@ -335,10 +335,10 @@ def test_classes_outside_of_the_table_are_failures_of_their_frames(tmp_path):
 def test_a_folder_that_another_converter_reads_names_it(tmp_path):
     (tmp_path / "in/sensors").mkdir(parents=True)
     write_scan(tmp_path / "in/a.npy", fields_of(DRIVE, 0))
-    with pytest.raises(MissingDataError, match="this is what `carlasc convert scans` reads"):
+    with pytest.raises(MissingDataError, match="use `carlasc convert scans`, which can read this folder"):
         convert("argoverse2", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     options = {"pose_file": str(tmp_path / "p.npy")}
     np.save(tmp_path / "p.npy", np.eye(4)[None])
     convert("scans", tmp_path / "in", tmp_path / "own", grids=None, options=options, run=Run(workers=1))
-    with pytest.raises(MissingDataError, match="this has the layout of CarlaSC already"):
+    with pytest.raises(MissingDataError, match="this folder has CarlaSC.s layout already"):
         convert("argoverse2", tmp_path / "own", tmp_path / "out", run=Run(workers=1))

@@ -277,7 +277,7 @@ def test_what_cannot_be_exported_is_named_in_one_line(tmp_path):
         with pytest.raises(MissingDataError, match=message):
             export("opensceneflow", tmp_path / field, tmp_path / "out", run=Run(workers=1))
     write_drive(tmp_path / "still", leave_out=("flow", "boxes"))
-    with pytest.raises(MissingDataError, match="expected flow or boxes, which say how objects move, found none"):
+    with pytest.raises(MissingDataError, match="expected flow or boxes, for the motion of objects, found none"):
         export("opensceneflow", tmp_path / "still", tmp_path / "out", run=Run(workers=1))
     write_drive(tmp_path / "in")
     folder = tmp_path / "in" / "Train/Street.1/cartesian"

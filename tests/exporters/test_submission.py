@@ -118,7 +118,7 @@ def test_the_command_says_it_in_one_line(case):
     given = ["export", "kitti", str(data), str(out), "--check", task]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
-    assert f"benchmark takes for {task}: 22 files" in " ".join(result.output.split())
+    assert f"benchmark for {task}: 22 files" in " ".join(result.output.split())
     Path(out / FIRST).write_bytes(b"")
     result = CliRunner().invoke(app, given)
     assert result.exit_code != 0

@@ -87,7 +87,7 @@ WRONG = {
     "elsewhere": (
         {"change": elsewhere},
         "fit",
-        "of another sequence, or the grids are in a frame that no correction reaches; tried: /",
+        "check that scans and grids are of the same sequence and in a known coordinate frame; tried: /",
     ),
     "mirrored": ({"change": planted.mirrored}, "axes", "y mirrored"),
     "axes": ({"change": planted.swapped_axes}, "axes", "x, y, z of the grid are y, x, z of the scans"),
@@ -273,7 +273,7 @@ def test_grids_of_another_length_are_named_with_their_scans(town, tmp_path):
         shutil.copy(file, file.with_name(f"000099{file.suffix}"))
     result = carlasc.audit(grids, town, frames=(8, 100))
     assert result.frames == {"cartesian": 8}
-    assert "cartesian: 1 grid of 17 without a scan of the same number or time were left out: 99" in result.notes
+    assert "cartesian: 1 of 17 grids left out, without a scan of the same number or time: 99" in result.notes
 
 
 @pytest.mark.slow

@@ -298,7 +298,7 @@ def test_a_non_commercial_set_stays_so_and_each_source_keeps_its_licence(mixed: 
     assert "non-commercial use only" in row and "carlasc.json of the sequences" in row
     assert "not for commercial use" in text
     assert "- set of Tra: see the page of its publishers" in text
-    assert "Who uses all of them together keeps the conditions of all of them" in text
+    assert "If you use all sequences together, the conditions of all licences hold" in text
 
 
 @pytest.mark.parametrize(
@@ -307,7 +307,7 @@ def test_a_non_commercial_set_stays_so_and_each_source_keeps_its_licence(mixed: 
 def test_a_set_that_forbids_passing_on_is_refused_with_the_reason(tmp_path: Path, license_: str) -> None:
     root = licensed(write_dataset(tmp_path / "data"), {SCANS: license_})
     with pytest.raises(
-        CarlascError, match=r"found CC BY-(NC-)?ND \d\.0 of set of Val, which forbids that: publish how"
+        CarlascError, match=r"found CC BY-(NC-)?ND \d\.0 of set of Val, which forbids that: publish instead how"
     ):
         write_card(root, **SAID, pictures=False)
     assert not (root / "README.md").exists()
@@ -339,7 +339,7 @@ def test_simulated_data_need_a_licence_from_their_author(tmp_path: Path) -> None
     root = write_dataset(tmp_path / "data")
     result = CliRunner().invoke(app, ["card", str(root), "--no-pictures"])
     assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
-    assert "--license: expected the licence under which you publish these data" in result.stderr
+    assert "--license: expected the licence of these data" in result.stderr
     licensed(root, {WHOLE: None, SCANS: None})
     with pytest.raises(ArgumentError, match="expected the licence of set of Tra and set of Val"):
         write_card(root, pictures=False)
@@ -348,7 +348,9 @@ def test_simulated_data_need_a_licence_from_their_author(tmp_path: Path) -> None
 def test_a_given_licence_does_not_replace_that_of_the_source(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     licensed(root, dict.fromkeys(carlasc.open(root).sequences(), "CC BY-NC-SA 3.0"))
-    with pytest.raises(ArgumentError, match=r"license: expected CC BY-NC-SA 3\.0, which holds .*, found MIT"):
+    with pytest.raises(
+        ArgumentError, match=r"license: expected CC BY-NC-SA 3\.0, the licence of the source, .*, found MIT"
+    ):
         write_card(root, license="mit", pictures=False)
     assert write_card(root, pictures=False).licenses == ("CC BY-NC-SA 3.0",)
 
@@ -389,7 +391,7 @@ def test_data_behind_a_url_have_their_card_in_a_folder_here(tmp_path: Path, capl
     fsspec = pytest.importorskip("fsspec")
     source = write_zip(files_of(write_dataset(tmp_path / "data")), tmp_path / "x.zip")
     fsspec.filesystem("memory").pipe("/cards/x.zip", source.read_bytes())
-    with pytest.raises(ArgumentError, match=r"out: expected a folder for the card of memory://cards/x\.zip"):
+    with pytest.raises(ArgumentError, match=r"out: expected a folder for the card, because memory://cards/x\.zip"):
         write_card("memory://cards/x.zip", **SAID, pictures=False)
     write_card("memory://cards/x.zip", tmp_path / "card", **SAID, pictures=False)
     (file,) = [file for file in croissant(tmp_path / "card")["distribution"] if file["@type"] == "cr:FileObject"]

@@ -108,7 +108,7 @@ def test_a_needed_package_that_does_not_load_is_a_problem_and_what_needs_it_is_l
     monkeypatch.setattr(importlib, "import_module", load)
     found = doctor()
     assert not found.ok
-    assert found.problems == ("numba does not load (Numba needs NumPy 2.2 or less)",)
+    assert found.problems == ("numba cannot be imported (Numba needs NumPy 2.2 or less)",)
     assert found.compiled is None and found.processor.target == ""
 
 
@@ -118,7 +118,7 @@ def test_a_package_that_is_only_on_the_path_says_so(monkeypatch):
 
     monkeypatch.setattr(metadata, "requires", requires)
     found = doctor()
-    assert not found.ok and "not installed, only found on the path" in found.problems[0]
+    assert not found.ok and "on the path, but not installed" in found.problems[0]
 
 
 def test_no_name_of_a_user_is_printed(monkeypatch, tmp_path):

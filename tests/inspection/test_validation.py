@@ -215,7 +215,7 @@ def test_camera_frame_poses_show_on_a_straight_drive_where_a_mirrored_y_cannot(t
 
 def test_poses_that_stand_while_the_sensor_moves_are_told_with_the_offset(copy: Path) -> None:
     change_poses(copy, lambda p: np.tile(np.eye(4), (len(p), 1, 1)))
-    assert "m away from where the poses put them" in found(validate(copy))["poses-on-scans"]
+    assert "m away from their poses" in found(validate(copy))["poses-on-scans"]
 
 
 def test_scans_that_are_in_one_common_frame_are_told(copy: Path) -> None:

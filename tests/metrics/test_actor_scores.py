@@ -119,7 +119,7 @@ def test_the_command_prints_the_table(truth):
     given = ["evaluate", str(truth), str(truth), "--convention", "own", "--actors"]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
-    assert "LSTQ" in result.output and "off by 0.00 m/s" in result.output
+    assert "LSTQ" in result.output and "mean velocity error of moving voxels: 0.00 m/s" in result.output
     result = CliRunner().invoke(app, [*given, "--json"])
     values = json.loads(result.stdout)["actors"]
     assert values["class_pq"]["Vehicle"] == 1 and values["lstq"] == 1 and values["velocity_by_speed"]["from 5 m/s"] == 0

@@ -255,7 +255,7 @@ def test_the_command_prints_what_was_made_and_one_line_where_it_fails(data, pred
     done = CliRunner().invoke(app, [*arguments, "--by", "SPVCNN"])
     assert done.exit_code == 0
     assert "out: labels of 7 frames predicted by SPVCNN (carla); " in done.output
-    assert "note: without evaluation/, evaluation_8x4x3/, of other labels or classes" in done.output
+    assert "note: evaluation/, evaluation_8x4x3/ left out, because of other labels or classes" in done.output
     again = CliRunner().invoke(app, arguments)
     assert again.exit_code == 1 and "`--overwrite`" in again.output
     printed = CliRunner().invoke(app, [*arguments, "--overwrite", "--json"])

@@ -1,1 +1,1 @@
-"""The audit of anybody's ground truth: grids and the scans that they belong to are counted frame by frame, and judged by the sums."""
+"""The audit of ground truth of any origin: grids are compared with their scans frame by frame, and the sums give the verdicts."""

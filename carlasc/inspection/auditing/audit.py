@@ -1,4 +1,4 @@
-"""`audit`: grids of any format that is read here are compared with the scans that they belong to, and what is wrong is named."""
+"""`audit`: compares grids with the scans that they belong to, and reports what is wrong with the grids."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from carlasc.storage.protocol import Source
 from carlasc.storage.resuming import derived_key, read_derived, scans_digest
 from carlasc.storage.sinks import SequenceWriter
 
-_VERSION = 2  # of what is counted: it changes when the same input gives other sums
-_STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and stretches of a sequence at least
-_DRAWN = 50  # stretches that are drawn at most: neighbours are drawn together where there are more
-_SHOWN = 4  # frames that are drawn
+_VERSION = 2  # version of the counts: it changes when the same input gives other sums
+_STRETCH, _STRETCHES = 8, 10  # frames of a stretch, and least number of stretches of a sequence
+_DRAWN = 50  # largest number of stretches to draw from: with more, neighbours are drawn together
+_SHOWN = 4  # number of frames in pictures
 _REACH = 30  # frames before and after a stretch in which actors matter
 _BLOCK = 400  # frames for which actors are found together
-_SUMS, _WORST, _KEY = "audit", "worst", "key"  # names of the files that keep sums, and of what else is in them
+_SUMS, _WORST, _KEY = "audit", "worst", "key"  # name of the files of sums, and of other entries in them
 
-_Row = tuple[str, int, int, int]  # of the worst frames: path, frame of the grid, frame of the scan, wrong voxels
+_Row = tuple[str, int, int, int]  # a wrong frame: path, frame of the grid, frame of the scan, wrong voxels
 
 
 @dataclass(frozen=True)
 class _Stretch:
-    """Some frames of a sequence, to be counted in a worker, and where their sums are kept."""
+    """Some successive frames of a sequence, which a worker counts, and the place of their sums."""
 
     counter: FrameCounter
     frames: tuple[tuple[int, int], ...]
@@ -57,7 +57,7 @@ class _Stretch:
     scans: str  # digest
 
     def key(self) -> str:
-        """Return the name of the sums: those of other grids, other scans or another window have another one."""
+        """Return the name of the sums, which differs for other grids, other scans or another window."""
         one, content = self.counter.matched, sha256()
         for number, _ in self.frames:
             with suppress(CarlascError, OSError):  # which is reported when the frame is counted
@@ -67,11 +67,11 @@ class _Stretch:
         return sha256(json.dumps([about, self.scans, content.hexdigest()], default=str).encode()).hexdigest()
 
     def read(self) -> Sums | None:
-        """Return what another run or part kept."""
+        """Return the sums of another run or part."""
         return None if self.writer is None else read_derived(self.writer, _SUMS, self.key(), _sums_from)
 
     def count(self) -> tuple[Sums, list[AuditFailure]]:
-        """Count the frames, unless another run did; return which of them cannot be read."""
+        """Count the frames, unless another run did; return those that cannot be read."""
         if (kept := self.read()) is not None:
             return kept, []
         counter, sums = replace(self.counter), Sums()  # whose caches end with it
@@ -111,19 +111,19 @@ def audit(
     keep: str | Path | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> AuditResult:
-    """Compare grids with the scans that they belong to, and name what is wrong with the grids.
+    """Compare grids with the scans that they belong to, and report what is wrong with the grids.
 
-    Nothing is written but what `keep` asks for. A frame that cannot be read is listed in `failures`.
+    Nothing is written, except to `keep`. A frame that cannot be read is listed in `failures`.
 
     Args:
         grids: anything that `evaluate` reads: a data set, the folder of a grid, or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or
             CarlaOcc.
-        scans: a recording in the layout: scans; poses, labels, and what shows motion are used where they exist.
+        scans: a recording in CarlaSC's layout, with scans; poses, labels, boxes, instances and flow are used if they exist.
         grid: name of the grids; None takes `evaluation`, or the only grid of a sequence.
         made_from: first and last scan, relative to its frame, that a grid was made from; None if that is not known.
         frames: frames of the grids; None for all.
-        keep: folder for the sums of stretches of frames, so that an interrupted audit goes on, and parts can be put together.
-        run: how the work is spread, and who is told of its progress. A part needs `keep`; the last part judges.
+        keep: folder for intermediate sums, so that an interrupted audit continues, and parts can be joined.
+        run: how the work is spread, with a callback for progress. A part needs `keep`; the last part gives the verdicts.
 
     Returns:
         The verdict of each check, with its number, interval and place.
@@ -137,7 +137,7 @@ def audit(
     if made_from is not None and not made_from[0] <= 0 <= made_from[1]:
         raise ArgumentError("made_from", expected="a range that contains 0, such as -30:30", found=str(made_from))
     if run.part.count > 1 and keep is None:
-        raise ArgumentError("part", expected="`keep`, the folder in which parts are put together", found="no folder")
+        raise ArgumentError("part", expected="`keep`, a folder in which parts are joined", found="no folder")
     matched = match_grids(grids, scans, grid, frames)
     notes = [f"{one.path}: {note}" for one in matched for note in one.notes]
     stretches = list(chain.from_iterable(_stretches_of(one, made_from, keep) for one in matched))
@@ -159,7 +159,7 @@ def audit(
 
 
 def voxels_of(result: AuditResult, path: str, number: int, frame: int) -> tuple[MatchedGrids, NDArray[np.uint8]]:
-    """Count a frame of an audit again: return its grids, and what its voxels are (see `FrameCounter.add_frame`)."""
+    """Count a frame of an audit again: return its grids, and the states of its voxels (see `FrameCounter.add_frame`)."""
     one = next(one for one in match_grids(result.grids, result.scans, result.grid, None) if one.path == path)
     return one, FrameCounter(one, _actors_of(one, frame, frame, Run(workers=1), [])).add_frame({}, number, frame)
 
@@ -182,7 +182,7 @@ def _stretches_of(one: MatchedGrids, window: tuple[int, int] | None, keep: str |
 
 
 def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> Iterator[_Stretch]:
-    """Yield stretches with what moves near them, which is found for some hundred frames at a time, so that memory does not grow."""
+    """Yield stretches with the moving actors near them. Actors are found for some hundred frames at a time, to bound memory."""
     known, actors = ("", -1), MovingActors()
     for stretch in stretches:
         if stretch.read() is None:
@@ -198,26 +198,26 @@ def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> I
 
 
 def _actors_of(one: MatchedGrids, first: int, last: int, run: Run, notes: list[str]) -> MovingActors:
-    """Return what moves near some frames of a recording: by its fields, and if it has none by free space."""
+    """Return the moving actors near some frames of a recording: by its fields, or without any by free space."""
     if layout.POSES not in one.scans.documents():
-        notes.append(f"{one.pair}: the scans have no poses.txt: what moves, and drift, cannot be told")
+        notes.append(f"{one.pair}: the scans have no poses.txt: moving actors and drift are not checked")
         return MovingActors()
     frames = one.scans.frames("points")
     far = frames[(frames < first - 2 * _REACH) | (frames > last + 2 * _REACH)].tolist()
     scans, named = WithoutScans(one.scans, far), [n for n in ScanFeed(one.scans, FromScans()).motion if n != "evidence"]
-    # where fields name actors, evidence would only add doubtful ones
+    # if a field names actors, evidence would only add doubtful ones
     observe = FromScans(motion=MotionOptions(named[0] if named else "evidence"))  # type: ignore[arg-type]
     try:
         return find_actors(ScanFeed(scans, observe), run)
     except CarlascError as error:
-        notes.append(f"{one.path}: what moves cannot be told: {error}")
+        notes.append(f"{one.path}: moving actors are not checked: {error}")
         return MovingActors()
 
 
 def _count_all(
     stretches: list[_Stretch], run: Run, notes: list[str]
 ) -> tuple[dict[str, list[Sums]], list[_Row], list[AuditFailure], bool]:
-    """Count the stretches of this part, and read those of others: sums by sequence, frames, failures, and whether all are there."""
+    """Count the stretches of this part, and read those of others: sums by sequence, worst frames, failures, and whether all exist."""
     own = run.part.take(range(len(stretches)))
     steps = StepCounter(run.progress, sum(len(stretch.frames) for stretch in stretches))
     steps(0)

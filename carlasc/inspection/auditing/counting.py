@@ -1,4 +1,4 @@
-"""What is counted of each frame: sums, which add up over stretches of frames, so that memory does not grow with the number of frames."""
+"""Counting frames: the counts of a frame are added to sums, so that memory does not grow with the number of frames."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from carlasc.inspection.auditing.verdicts import Sums, add
 from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 
-HEIGHTS = 4  # layers of equal height that shares are told by
+HEIGHTS = 4  # shares are also computed for this number of layers of equal height
 MAX_ID = 511  # larger ids of classes count as this one
-_SPREAD, _RAYS = 20_000, 8000  # points of a frame that are spread over places, and rays that are followed
-_LEAST, _MOST, _IN_ALL = 500, 2500, 250_000  # points that are left of these in a frame, and in all frames
-_TIMES = (*range(-20, -1, 2), *range(2, 21, 2))  # frames before and after, at which actors are looked for
-_APART = 20  # frames to the scans that show a drift
-_CLEAR_RAYS = 3  # so many rays cross a phantom
-_AROUND_M = 0.6  # by which an actor may be larger than its body, which was measured on a few sides
-_INSET_M = 0.2  # by which the path of an actor is narrower than its body, and above the ground
-_MEMBERS = 5  # voxels in which an actor must be seen
-_KEPT = 14  # scans that are kept for the frames that follow
+_SPREAD, _RAYS = 20_000, 8000  # points of a frame that are thinned evenly in space, and rays that are followed
+_LEAST, _MOST, _IN_ALL = 500, 2500, 250_000  # points that are kept of these in a frame, and in all frames
+_TIMES = (*range(-20, -1, 2), *range(2, 21, 2))  # frames before and after, in which the paths of actors are checked
+_APART = 20  # frames between the scans that show a drift
+_CLEAR_RAYS = 3  # an occupied voxel that this number of rays cross is a phantom
+_AROUND_M = 0.6  # an actor may be larger than its body by this, because bodies are measured on a few sides only
+_INSET_M = 0.2  # the path of an actor is narrower than its body by this, and as far above the ground
+_MEMBERS = 5  # an actor counts if it is seen in this number of voxels
+_KEPT = 14  # number of scans kept in memory for later frames
 FREE, OCCUPIED, PHANTOM, TRAIL, FALSE_FREE = range(5)
-"""What a voxel is in what `add_frame` returns."""
+"""The states of voxels that `add_frame` returns."""
 
 
 @dataclass
 class _Frame:
-    """A grid and its scan; `voxels` holds -1 for points outside of the grid, and for those that are no returns."""
+    """A grid and its scan; `voxels` is -1 for points outside of the grid, and for points that are no returns."""
 
     number: int
     scan: Scan
@@ -68,7 +68,7 @@ class FrameCounter:
 
     Attributes:
         matched: the grids and their scans.
-        actors: what moves in the recording.
+        actors: the moving actors of the recording.
         window: first and last scan that the grids were made from, relative to the frame; None if that is not known.
     """
 
@@ -79,10 +79,10 @@ class FrameCounter:
     _spread: dict[int, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
 
     def add_frame(self, sums: Sums, number: int, frame: int) -> NDArray[np.uint8]:
-        """Add a frame to sums, and return what its voxels are.
+        """Add a frame to sums, and return the states of its voxels.
 
         Args:
-            sums: of the frames before.
+            sums: sums of the frames before.
             number: number of the grid.
             frame: number of the scan.
 
@@ -153,7 +153,7 @@ class FrameCounter:
         return int(np.clip(_IN_ALL // len(self.matched.frames), _LEAST, _MOST))
 
     def _fit_points(self, frame: int) -> NDArray[np.float64]:
-        """Return (N, 3) points of a scan inside the grid, about as many of each place; none if it cannot be read."""
+        """Return (N, 3) points of a scan inside the grid, thinned evenly in space; none if it cannot be read."""
         if frame not in self._spread:
             spec, edge = self.matched.spec, float(self.matched.spec.voxel_size[[0, 2]].min()) / 2
             scan = self._other(frame)
@@ -167,7 +167,7 @@ class FrameCounter:
     # Scans at other times
 
     def _other(self, frame: int) -> Scan | None:
-        """Return the scan of another frame; None without one, or if it cannot be read, which is reported where it is the frame's own."""
+        """Return the scan of another frame; None if it does not exist or cannot be read (its own frame reports the error)."""
         try:
             return None if self._row(frame) is None else self._scan(frame)
         except (CarlascError, OSError):
@@ -186,7 +186,7 @@ class FrameCounter:
         return None if poses is None else self.matched.grid_T_scan @ invert(poses[self._row(frame)])
 
     def _standing(self, frame: int, other: int) -> NDArray[np.float64] | None:
-        """Return (N, 3) returns of another scan inside the grid of a frame, of what cannot move as far as labels say; None without it."""
+        """Return (N, 3) returns of another scan inside the grid of a frame, without classes that can move; None without the scan."""
         grid_T_world, poses = self._grid_T_world(frame), self.matched.trajectory[2]
         if grid_T_world is None or poses is None or (scan := self._other(other)) is None:
             return None
@@ -197,7 +197,7 @@ class FrameCounter:
         return placed[self.matched.spec.flat_index(placed) >= 0]
 
     def _add_held_out(self, sums: Sums, seen: _Frame) -> None:
-        """Count the returns of the nearest scans that did not make the grid, of what stands still."""
+        """Count the returns of static classes in the nearest scans that took no part in the grid."""
         if self.window is None or seen.known is None:
             return
         for other in (seen.number + self.window[0] - 1, seen.number + self.window[1] + 1):
@@ -210,13 +210,13 @@ class FrameCounter:
 
     @cached_property
     def ground(self) -> list[int]:
-        """The classes of the grids that are ground, as far as the scans' classes tell."""
+        """The classes of the grids that are ground, by the class table of the scans."""
         lookup = self.matched.lookup
         found = set() if lookup is None else {int(lookup[i]) for i in self.matched.scans.metadata.classes.ground}
         return sorted(found - {-1, 0})
 
     def _add_classes(self, sums: Sums, seen: _Frame) -> None:
-        """Count the classes of the grid, those of points by that of their voxels, and columns with ground at one and at two heights."""
+        """Count the classes of the grid, points by their class and the class of their voxel, and columns with ground at one and at two heights."""
         lookup, labels = self.matched.lookup, seen.scan.labels
         add(sums, "classes of grids", np.bincount(seen.labels[seen.occupied].astype(np.int64), minlength=MAX_ID + 1))
         if len(self.ground):
@@ -245,10 +245,10 @@ class FrameCounter:
         return wrong
 
     def _add_phantoms(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
-        """Count occupied voxels that rays cross, of those that rays see, by class, distance and height, and return the wrong ones."""
+        """Count occupied voxels that rays see, and those that rays cross, by class, distance and height; return the crossed ones."""
         spec, clear = self.matched.spec, seen.crossed >= _CLEAR_RAYS
         wrong = seen.occupied & clear & ~seen.around
-        # rays run along the ground for metres, and through its voxels
+        # rays near the ground cross its voxels for metres
         wrong &= ~(np.isin(seen.labels, self.ground) if len(self.ground) else lowest_of_columns(seen.occupied))
         looked = np.nonzero(seen.occupied & (clear | seen.hit))
         centers = spec.from_axes(np.array(spec.lower) + (np.column_stack(looked) + 0.5) * spec.voxel_size)
@@ -263,7 +263,7 @@ class FrameCounter:
         points: NDArray[np.floating],
         wrong: NDArray[np.bool_],
     ) -> None:
-        """Add (K, B, H, 2) how many there are by class, band of distances and height, and how many of them are wrong."""
+        """Add (K, B, H, 2) counts by class, distance and height: all of them, and the wrong ones."""
         low, high = self.matched.spec.lower[2], self.matched.spec.upper[2]
         heights = np.clip((points[:, 2] - low) / (high - low) * HEIGHTS, 0, HEIGHTS - 1).astype(np.int64)
         bands = np.searchsorted(BANDS_M, np.linalg.norm(points, axis=1), side="right") - 1
@@ -294,7 +294,7 @@ class FrameCounter:
     # Actors
 
     def _add_actors(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
-        """Count the voxels on the path of each actor and on itself, and those of them that are occupied; return occupied paths."""
+        """Count voxels, and occupied voxels, on the path and on the body of each actor; return the occupied voxels of paths."""
         trails, flat = np.zeros(seen.occupied.size, np.bool_), seen.occupied.reshape(-1)
         for name, members in self._members(seen):
             own = np.unique(seen.voxels[members])
@@ -303,7 +303,7 @@ class FrameCounter:
                 add(sums, f"actor {name}", [0, 0, len(own), flat[own].sum(), 1])
         if (grid_T_world := self._grid_T_world(seen.number)) is not None:
             wide = max(float(self.matched.spec.voxel_size[0]), _AROUND_M)
-            here = seen.around.reshape(-1).copy()  # what the scan meets is there, whoever it is
+            here = seen.around.reshape(-1).copy()  # a voxel with a return of the scan is rightly occupied
             for track in self.actors.tracks.values():
                 here[self._body(track, [seen.number], grid_T_world, wide)] = True
             for number, track in self.actors.tracks.items():
@@ -315,7 +315,7 @@ class FrameCounter:
         return trails.reshape(seen.occupied.shape)
 
     def _members(self, seen: _Frame) -> list[tuple[str, NDArray[np.integer]]]:
-        """Return the points of each actor in a scan: by its instances, or by what moves."""
+        """Return the points of each actor in a scan: by instances, or by tracks of moving actors."""
         ids, labels = seen.scan.instances, seen.scan.labels
         if ids is None or not ids.any():
             tracks = self.actors.tracks.items()
@@ -329,7 +329,7 @@ class FrameCounter:
     def _body(
         self, track: Track, frames: Sequence[int], grid_T_world: NDArray[np.float64], margin_m: float
     ) -> NDArray[np.int64]:
-        """Return the voxels in the body of an actor at some frames, wider by a margin; above the ground where it is narrower."""
+        """Return the voxels in the body of an actor at some frames, wider by a margin. A negative margin also leaves out the lowest voxel."""
         spec, poses = self.matched.spec, [pose for frame in frames if (pose := track.pose(frame)) is not None]
         lower, upper = track.lower - margin_m, track.upper + margin_m
         if margin_m < 0:

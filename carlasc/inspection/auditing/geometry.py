@@ -1,8 +1,8 @@
 """The verdicts on the geometry, the times and the drift of grids.
 
-The share of the points of scans that lie in occupied voxels is highest where scans and grids belong together, and falls within a tenth of a
-voxel. Each correction is therefore a hypothesis, and the best one names the fault and its size. Corrections come in families, most of which move the
-points of scans by an affine map.
+The share of the points of scans in occupied voxels is highest if scans and grids are aligned, and it already falls at a shift of a tenth of
+a voxel. Each correction is therefore a hypothesis, and the best one gives the fault and its size. Corrections come in families, most of which
+move the points of scans by an affine map.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from carlasc.errors import count
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import State, Stretches, Verdict
 
-# A correction must raise the share of points in occupied voxels by so much, and lower that of others by this factor.
+# A correction must raise the share of points in occupied voxels by this much, and lower the share of other points by this factor.
 _GAIN, _FEWER = 0.01, 1.3
-_ALIKE = 0.02  # axes and lags whose shares differ by less are not told apart
-_SAME = 0.25  # of the gain: corrections whose gains differ by less are not told apart
-_FLAT = 0.006  # values whose shares differ by less are equal
-_BELONGS = 0.75  # share of points below which scans and grids do not belong together
+_ALIKE = 0.02  # axes and lags are not distinguished if their shares differ by less
+_SAME = 0.25  # of the gain: corrections are not distinguished if their gains differ by less
+_FLAT = 0.006  # values are equal if their shares differ by less
+_BELONGS = 0.75  # with a smaller share of points, scans and grids do not belong together
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class _Fit:
 
     @property
     def is_fault(self) -> bool:
-        """Whether a correction fits better than the data as they are, by more than chance, and the fault is not too small to matter."""
+        """Whether a correction fits better than the data as they are, by more than chance, and the fault is large enough to matter."""
         family = self.family
         own, best = (1 - float(self.shares[0, row]) for row in (family.neutral, self.best))
         gains = self.shares[1:, self.best] - self.shares[1:, family.neutral]
@@ -67,7 +67,7 @@ class _Fit:
 
     @cached_property
     def interval(self) -> tuple[float, float]:
-        """The values about the best one that fit as well, and those that are best in nearly all draws."""
+        """The lowest and the highest value that fit as well as the best one, or are the best in nearly all draws."""
         values, worse = self.family.values, np.flatnonzero(self.shares[0] < self.shares[0, self.best] - _FLAT)
         low = int(worse[worse < self.best].max(initial=-1)) + 1
         high = int(worse[worse > self.best].min(initial=len(values))) - 1
@@ -88,9 +88,9 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
     fits = [_Fit(family, part) for family, part in zip(kinds, np.split(shares, ends[:-1], axis=1), strict=True)]
     top, own = max(float(fit.shares[0].max()) for fit in fits), shares[:, 0]
     low, high = np.quantile(own[1:], (0.025, 0.975)).tolist()
-    text = f"{own[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} under the best correction"
+    text = f"{own[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} with the best correction"
     state: State = "sound" if top >= _BELONGS else "fault"
-    advice = f"these are scans of another sequence, or the grids are in a frame that no correction reaches; tried: {one.pair}"
+    advice = f"check that scans and grids are of the same sequence and in a known coordinate frame; tried: {one.pair}"
     yield Verdict("fit", state, float(own[0]), low, high, "share", text, one.path, "" if state == "sound" else advice)
     if state == "fault":
         return
@@ -99,14 +99,14 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
         yield from (_sound_or_not(fit, one.path) for fit in fits)
         return
     best = max(found, key=lambda fit: fit.gain)
-    # of corrections that fit nearly as well, a shift needs fewer assumptions than another size
+    # a shift that fits nearly as well as another size is preferred: it needs fewer assumptions
     near = [fit for fit in found if fit.family.kind == "shift" and fit.gain >= (1 - _SAME / 5) * best.gain]
     winner = max(near, key=lambda fit: fit.gain) if near and best.family.kind == "voxel size" else best
     for fit in found:
         together = fit.family.kind == winner.family.kind == "shift" and fit.gain >= _SAME * winner.gain
         if fit is winner or together:
             yield _fault(fit, found, one)
-    text = f"the rest is not told before {winner.family.name} is right"
+    text = f"not judged before the fault of {winner.family.name} is corrected"
     yield Verdict("other geometry", "undetermined", None, None, None, "", text, one.path)
 
 
@@ -117,14 +117,14 @@ def _fault(fit: _Fit, found: list[_Fit], one: MatchedGrids) -> Verdict:
     ]
     also = f"; {' or '.join(o.family.name for o in others)} explains it nearly as well" if others else ""
     own, best = (float(fit.shares[0, row]) for row in (family.neutral, fit.best))
-    text = f"{_describe(fit, one)}: undone, {best:.1%} instead of {own:.1%} of points are in occupied voxels{also}"
+    text = f"{_describe(fit, one)}: corrected, {best:.1%} instead of {own:.1%} of points are in occupied voxels{also}"
     if family.kind == "axes":
         low = high = fit.value
     return Verdict(family.name, "fault", fit.value, low, high, family.unit, text, one.path, family.advice)
 
 
 def _sound_or_not(fit: _Fit, where: str) -> Verdict:
-    """Return the verdict of a family that explains nothing better: sound, if the right value is told from others."""
+    """Return the verdict of a family without a better correction: sound, if the data distinguish the right value from others."""
     family, shares, (low, high) = fit.family, fit.shares[0], fit.interval
     neutral, measured, unclear = float(family.values[family.neutral]), fit.value, ""
     if family.kind == "axes":
@@ -136,7 +136,7 @@ def _sound_or_not(fit: _Fit, where: str) -> Verdict:
         unclear = "the vehicle hardly moves" if (near >= shares[family.neutral] - _ALIKE).any() else ""
         text, measured, low, high = "grids fit their own scans best", neutral, neutral, neutral
     else:
-        unclear = f"the drive does not tell values from {low:.3g} to {high:.3g} {family.unit} apart"
+        unclear = f"any value from {low:.3g} to {high:.3g} {family.unit} fits this drive"
         unclear = unclear if high - low > family.widest else ""
         small = "" if fit.value == neutral else ", too little to matter"
         text = f"{fit.value:.3g} {family.unit} (95 %: {low:.3g} to {high:.3g}){small}"
@@ -155,17 +155,17 @@ def _describe(fit: _Fit, one: MatchedGrids) -> str:
     if fit.family.kind == "lag":
         late, other = ("late", "before") if value < 0 else ("early", "after")
         frames = f"{count(round(abs(value)), 'frame')} ({abs(value) * one.period_s:.2f} s)"
-        return f"grids are {frames} {late}: each shows what a scan {other} its own saw"
+        return f"grids are {frames} {late}: each fits a scan {other} its own"
     if fit.family.kind == "shift":
         voxels = value / shift_step(one.spec, name[-1])
         return f"grids are moved by {value:.3f} m along {name[-1]}, {voxels:.2f} voxels {ends}"
     if fit.family.kind == "yaw":
         return f"grids are turned by {value:.2f} degrees {ends}"
     if fit.family.kind == "height drift":
-        return f"places that were seen later are {value:.2f} m/s higher {ends}"
+        return f"height increases with the time of the scan, by {value:.2f} m/s {ends}"
     axes = (0, 1) if "x, y" in name else (2,) if " z" in name else (0, 1, 2)
     true = ", ".join(f"{one.spec.voxel_size[axis] / value:.3g}" for axis in axes)
-    return f"declared is {value:.3f} times the true one {ends}, which is {true} m"
+    return f"the declared size is {value:.3f} times the true one {ends}, which is {true} m"
 
 
 _FINE, _VOXELS = 0.1, 1.5  # steps of a shift, in voxels, and as far as these go
@@ -178,18 +178,18 @@ _LAGS = np.arange(-3.0, 4.0)
 
 @dataclass(frozen=True)
 class Family:
-    """Corrections of one kind; the one that changes nothing is among them.
+    """Corrections of one kind, among them one that changes nothing.
 
     Attributes:
-        name: of the fault, such as "shift x".
+        name: name of the fault, such as "shift x".
         kind: "axes", "shift", "yaw", "voxel size", "height drift" or "lag".
-        values: (V,) size of the fault that each correction undoes, rising; numbers of the choices of axes.
+        values: (V,) size of the fault that each correction removes, rising; numbers of the choices of axes.
         warps: (V, 3, 5) maps of points: p' = A p + b + c dt, as columns A, b, c; dt is how much later than the frame the points were seen.
         neutral: row of the correction that changes nothing.
         unit: of the values.
-        least: smaller faults are none.
-        widest: a wider interval of values determines nothing.
-        advice: what to fix.
+        least: smaller faults are ignored.
+        widest: with a wider interval of values, the fault is undetermined.
+        advice: what to do.
     """
 
     name: str
@@ -206,7 +206,7 @@ class Family:
 def families(spec: GridSpec) -> list[Family]:
     """Return the families of corrections of a grid."""
     found = [_family("axes", "axes", range(len(AXES)), [m for _, m in AXES], "give grids and scans the same axes")]
-    advice = "move the bounds, or the place of the sensor in the poses that the grids were made with"
+    advice = "move the bounds, or correct the position of the sensor in the poses that the grids were made with"
     for axis, name in enumerate("xyz"):
         step = shift_step(spec, name)
         fine = np.arange(-round(_VOXELS / _FINE), round(_VOXELS / _FINE) + 1) * _FINE * step
@@ -215,26 +215,26 @@ def families(spec: GridSpec) -> list[Family]:
         shifts.warps[:, axis, 3] = values
         found.append(shifts)
     turns = [rotation_z(angle)[:3, :3] for angle in np.radians(_YAW_DEG)]
-    advice = "turn the calibration of the sensor that the grids were made with"
+    advice = "correct the yaw of the sensor in the calibration that the grids were made with"
     found.append(_family("yaw", "yaw", _YAW_DEG, turns, advice, "degrees", 0.4, 1.5))
     for axes, which in (("", (1, 1, 1)), (" x, y", (1, 1, 0)), (" z", (0, 0, 1))):
-        # the fault: declared = ratio * true size; the cell of p in the true grid is that of p * ratio in the declared one
+        # the fault is declared = ratio * true size: p is in the true grid where p * ratio is in the declared one
         scales = [np.diag(np.where(which, ratio, 1.0)) for ratio in _RATIOS]
         for anchor, fixed in (("", np.zeros(3)), (", lower bound kept", np.array(spec.lower))):
             if not anchor or spec.coordinates == "cartesian":
-                advice = "correct the voxel size or the bounds that are declared"
+                advice = "correct the declared voxel size or bounds"
                 sizes = _family(f"voxel size{axes}{anchor}", "voxel size", _RATIOS, scales, advice, "times", 0.02, 0.15)
                 sizes.warps[:, :, 3] = fixed - sizes.warps[:, :, :3] @ fixed
                 found.append(sizes)
     advice = "refine the poses (`carlasc refine`) and make the grids again"
     drift = _family("height drift", "height drift", _DRIFT_M_S, [np.eye(3)], advice, "m/s", 0.02, 0.06)
     drift.warps[:, 2, 4] = _DRIFT_M_S
-    advice = "give the grids the numbers or times of these scans"
+    advice = "give the grids the numbers or the times of these scans"
     return [*found, drift, _family("lag", "lag", _LAGS, [np.eye(3)], advice, "frames", 1.0, 1.0)]
 
 
 def shift_step(spec: GridSpec, axis: str) -> float:
-    """Return the size of a voxel along x, y or z; for a cylindrical grid, x and y take that along the radius."""
+    """Return the size of a voxel along x, y or z; in a cylindrical grid, x and y take the size along the radius."""
     return float(spec.voxel_size[0 if spec.coordinates == "cylindrical" and axis != "z" else "xyz".index(axis)])
 
 

@@ -16,13 +16,13 @@ from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import Share, State, Stretches, Verdict, share_of
 from carlasc.inspection.heldout_scores import BANDS_M
 
-# A share is a fault from the first value on; that of one class of at least so many counts from the second on.
+# A share is a fault from the first value on; the share of one class is a fault from the second on, if it has at least so many counts.
 _FREE, _FREE_OF_CLASS, _PHANTOM, _PHANTOM_OF_CLASS, _LEAST = 0.06, 0.4, 0.03, 0.2, 1000
 _TRAIL, _TRAIL_VOXELS = 0.1, 30  # of the path of an actor
 _ERASED, _ERASED_VOXELS = 0.2, 40  # of the voxels in which an actor was seen
 _DOUBLED = 0.05  # of the columns with ground
-_EXPLAINED, _OWN = 0.5, 0.3  # shares of a class that another name explains, and that its own name has then at most
-_NONE = 0.002  # the share of its own name where a thin marking is lost in any case
+_EXPLAINED, _OWN = 0.5, 0.3  # least share of the points of a class under another class, and largest share under its own
+_NONE = 0.002  # largest share under its own class, for thin markings, which lose their voxels in any case
 _SHOWN = 4
 
 
@@ -35,11 +35,11 @@ def judge_contents(
         stretches: the sums of a sequence.
         one: its grids and scans.
         window: first and last scan that a grid was made from; None if that is not known.
-        wrong: the fault of geometry that was found, which makes voxels seem wrong that are not; empty for none.
+        wrong: the fault of geometry, because of which other voxels seem wrong; empty for none.
     """
     judge = _Judge(stretches, one, window)
     for verdict in judge.voxels():
-        text = f"not judged before {wrong} is right: {verdict.text}"
+        text = f"not judged before the fault of {wrong} is corrected: {verdict.text}"
         hidden = wrong and verdict.state == "fault"
         yield replace(verdict, state="undetermined", text=text, advice="") if hidden else verdict
     yield from judge.gaps(wrong)
@@ -68,21 +68,23 @@ class _Judge:
     def voxels(self) -> Iterator[Verdict]:
         """Yield what is wrong in voxels."""
         if self.stretches.stacked("returns") is None:
-            yield self._say("false free", "undetermined", "the files do not tell free from unknown space")
+            yield self._say("false free", "undetermined", "the files do not distinguish free from unknown space")
         else:
             by = "scans that may have made the grids" if self.window is None else "the frame's own scan"
-            what, advice = f"returns of {by} are in voxels called free", "the grids call free what scans meet"
+            what, advice = f"returns of {by} are in voxels called free", "make these voxels occupied"
             classes = self.one.scans.metadata.classes
             yield self._by_class("returns", "false free", what, (_FREE, _FREE_OF_CLASS), classes, advice)
         if self.window is not None:
             yield self._held_out()
-        what, advice = "occupied voxels are crossed by rays", "rays pass through what is not there"
+        what, advice = "occupied voxels are crossed by rays", "make these voxels free"
         yield self._by_class("seen voxels", "phantoms", what, (_PHANTOM, _PHANTOM_OF_CLASS), self.one.classes, advice)
         yield from self._actors()
         found = self.stretches.share("ground columns")
         text = "no class of the grids is ground" if found is None else f"{_percent(found)} of the columns with ground have it at two heights"  # fmt: skip
         state: State | bool = "undetermined" if found is None else found[1] > _DOUBLED
-        yield self._say("doubled ground", state, text, found, "the poses behind the grids drift in height: refine them")
+        yield self._say(
+            "doubled ground", state, text, found, "refine the poses that the grids were made with: they drift in height"
+        )
         yield from self._labels()
 
     def _by_class(
@@ -101,7 +103,7 @@ class _Judge:
         wrong = [f"{share[0]:.0%} of {name}" for share, name in worst if share[1] > limits[1]]
         text = f"{_percent(found)} of the {what}{': ' if wrong else ''}{', '.join(wrong[:_SHOWN])}"
         if wrong and check == "false free":
-            advice = "these are lost; thin things are outvoted by rays that pass beside them: use more scans or sensors"
+            advice = "use more scans or sensors: rays that pass beside thin objects outvote their returns"
         bands = zip(BANDS_M, total.sum(axis=(0, 2)), strict=False)
         near = [f"from {low:.0f} m {n[1] / n[0]:.1%}" for low, n in bands if n[0]]
         levels = [f"layer {k + 1} of {HEIGHTS} {n[1] / n[0]:.1%}" for k, n in enumerate(total.sum(axis=(0, 1))) if n[0]]
@@ -111,12 +113,10 @@ class _Judge:
 
     def _held_out(self) -> Verdict:
         if (found := self.stretches.share("held out")) is None:
-            text = "no frame has a scan just outside of the window, and poses and a mask"
+            text = "no frame has a scan just outside of the window, with poses and a mask"
             return self._say("false free, held out", "undetermined", text)
-        text = (
-            f"{_percent(found)} of the returns of static things in scans that did not make the grids are in free voxels"
-        )
-        advice = "the grids do not hold what later or earlier scans meet"
+        text = f"{_percent(found)} of the returns of static objects in scans that took no part in the grids are in free voxels"
+        advice = "make these voxels occupied or unknown"
         return self._say("false free, held out", found[1] > _FREE, text, found, advice)
 
     def _actors(self) -> Iterator[Verdict]:
@@ -128,14 +128,14 @@ class _Judge:
         paths = {name: share_of(n[:, 1], n[:, 0]) for name, n in moved.items()}
         trails = [(moved[name][0, 1], name, path) for name, path in paths.items() if path and path[1] > _TRAIL]
         listed = [f"actor {name} {_percent(path, 0)}" for _, name, path in sorted(trails, reverse=True)]
-        advice = f"leave out what moves, or move it along: {first_names(listed, _SHOWN)}"
+        advice = f"leave out moving actors, or move their points along: {first_names(listed, _SHOWN)}"
         if moved:
             total = np.sum(list(moved.values()), axis=0)
             found, frames = share_of(total[:, 1], total[:, 0]), self._frames[0]
-            text = f"{found[0] if found else 0:.2%} of the paths of {count(len(moved), 'actor')} are occupied, {total[0, 1] * volume / frames:.2f} m3 in a frame"
+            text = f"{found[0] if found else 0:.2%} of the paths of {count(len(moved), 'actor')} are occupied, {total[0, 1] * volume / frames:.2f} m3 per frame"
             yield self._say("ghost trails", bool(trails), text, found, advice)
         else:
-            text = "nothing moves in the recording, as far as its fields and free space show"
+            text = "no moving actor was found in the recording"
             yield self._say("ghost trails", "undetermined", text)
         own = {name: share_of(n[:, 3], n[:, 2]) for name, n in seen.items() if n[0, 4] >= 2}
         erased = [(seen[name][0, 2], name, share[0]) for name, share in own.items() if share and share[2] < _ERASED]
@@ -146,7 +146,7 @@ class _Judge:
         yield self._say(
             "erased actors",
             bool(erased) if seen else "undetermined",
-            text if seen else "no actor is named in the recording",
+            text if seen else "no actor was found in the recording",
             (number, number, number) if seen else None,
             "keep the voxels of these actors",
             "actors",
@@ -204,16 +204,16 @@ class _Judge:
         share = len(missing) / made
         text = f"{len(missing)} of {made} frames have no grid ({share:.1%})"
         text += f": {first_names(map(str, missing))}" if missing else ""
-        advice = "make these frames, or say why they are missing"
+        advice = "make these frames, or document why they are missing"
         yield self._say("missing frames", bool(missing), text, (share, share, share), advice)
         if 0 < without < frames:
-            share, text = without / frames, f"{without} of {frames} frames do not say which voxels are known"
+            share, text = without / frames, f"{without} of {frames} frames have no mask of known voxels"
             yield self._say("missing masks", True, text, (share, share, share), "write the masks of all frames")
         counts, kinds, table = self._confusion, self.stretches.stacked("classes of grids"), self.one.classes
         if not wrong and counts is not None and kinds is not None and table is not None:
             met, made_of = counts.sum(axis=(0, 2)), kinds.sum(axis=0)
             gone = [_name(table, i) for i in np.flatnonzero(met >= _LEAST).tolist() if not made_of[i]]
-            text = f"classes that scans show and no voxel has: {', '.join(gone)}" if gone else "every class of the scans is in the grids"  # fmt: skip
+            text = f"classes in the scans but not in the grids: {', '.join(gone)}" if gone else "every class of the scans is in the grids"  # fmt: skip
             number = float(len(gone))
             yield self._say("missing classes", bool(gone), text, (number, number, number), "label the voxels of these classes", "classes")  # fmt: skip
         if (unknown := self.stretches.drawn("unknown")) is not None:
@@ -228,12 +228,12 @@ class _Judge:
 def _explains(
     drawn: NDArray[np.float64], rows: NDArray[np.float64], right: NDArray[np.float64], i: int, thin: bool
 ) -> int | None:
-    """Return the class whose voxels hold most points of another one, which has nearly none of its own; None if there is none."""
+    """Return the class whose voxels hold most points of class `i`, if nearly no points are in voxels of class `i`; otherwise None."""
     j = int(drawn[0, i].argmax())
     own, moved = share_of(right[:, i], rows[:, i]), share_of(drawn[:, i, j], rows[:, i])
     if j == i or own is None or moved is None:
         return None
-    lost = thin and drawn[0, j, i] < _EXPLAINED * rows[0, j]  # a thin marking loses its voxels to the ground around it
+    lost = thin and drawn[0, j, i] < _EXPLAINED * rows[0, j]  # the ground around a thin marking outvotes it
     return j if own[2] < (_NONE if lost else _OWN) and moved[1] > _EXPLAINED else None
 
 

@@ -1,4 +1,4 @@
-"""What the audit counts in compiled code: points under many corrections, the voxels of bodies, and the rays that cross each voxel."""
+"""The compiled loops of the audit: points under many corrections, the voxels of bodies, and the rays that cross each voxel."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from carlasc.core.cells import Cells, find_voxel
 from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
 
-_SAMPLES = 4  # on a ray, per edge of the smallest voxel
-_INSIDE = 3  # samples of a ray that a voxel must hold to be crossed: rays that graze a corner do not count
+_SAMPLES = 4  # samples on a ray per edge of the smallest voxel
+_INSIDE = 3  # least samples of a ray in a voxel that it crosses: rays that graze a corner do not count
 
 
 def count_occupied_under(
@@ -47,7 +47,7 @@ def _count(points, warps, cells, occupied, counted):  # type: ignore[no-untyped-
 def crossings(
     origins: NDArray[np.float64], points: NDArray[np.float64], spec: GridSpec, margin_m: float
 ) -> NDArray[np.int64]:
-    """Return (X, Y, Z) how many rays cross each voxel, and not only a corner of it, before they come near their return.
+    """Return (X, Y, Z) how many rays cross each voxel, not only a corner of it, before they come near their return.
 
     Args:
         origins: (N, 3) metres, where each ray begins, in the frame of the grid.
@@ -104,7 +104,7 @@ def _mark(points, poses, cells, inside):  # type: ignore[no-untyped-def]
 
 
 def grown(mask: NDArray[np.bool_], turns: bool) -> NDArray[np.bool_]:
-    """Return a mask grown by one voxel in each direction, around the full turn of a cylindrical grid if it `turns`."""
+    """Return a mask grown by one voxel in each direction; if `turns`, the azimuth of a cylindrical grid is periodic."""
     for axis in range(3):
         sides = [(1, 1) if a == axis else (0, 0) for a in range(3)]
         wide = np.moveaxis(np.pad(mask, sides, mode="wrap" if turns and axis == 1 else "constant"), axis, 0)

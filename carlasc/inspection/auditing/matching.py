@@ -1,4 +1,4 @@
-"""Which scan belongs to which grid, and where it is in the frame of the grid: by the names of sequences, and by number or time."""
+"""Pairs of grids and scans: by the names of sequences, and by the numbers or times of frames; and the pose of a scan in the frame of its grid."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from carlasc.storage.files import parse_json
 from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence
 
-_SAME_TIME_S = 0.06  # a grid belongs to a scan of nearly its time
+_SAME_TIME_S = 0.06  # a grid belongs to a scan if their times differ by less
 _NOISE = 255
-_HEIGHT_M = 1.8  # of the sensor above the ground where the recording does not say it, as in CarlaSC
-_TIMES = "tokens.txt"  # the table of times beside grids that are named by tokens: lines of a token and seconds
+_HEIGHT_M = 1.8  # height of the sensor above the ground in CarlaSC, used if the recording has none
+_TIMES = "tokens.txt"  # table of times beside grids that are named by tokens: lines of a token and seconds
 _FRAMES = {
     "occ3d-lidar": "the vehicle, with its origin on the ground",
     "openoccupancy": "the LiDAR, x to the right and y forward",
@@ -49,8 +49,8 @@ class MatchedGrids:
     Attributes:
         grids: the grids.
         scans: the recording.
-        frames: pairs of the number of a grid and that of its scan, rising.
-        absent: frames of the recording, within the grids' span and at their usual distance, that have no grid.
+        frames: pairs of the number of a grid and the number of its scan, rising.
+        absent: frames without a grid, within the span of the grids and at their usual interval.
         notes: what was assumed.
         height_m: height of the sensor above the origin of the grids.
     """
@@ -106,7 +106,7 @@ class MatchedGrids:
 
     @property
     def _many_to_one(self) -> bool:
-        """Whether several classes of the grids are one of the scans, so that the labels of the grids are mapped and not those of the scans."""
+        """Whether the labels of the grids are mapped, not those of the scans: if several classes of the grids are one class of the scans."""
         return isinstance(self.grids, CarlaOccGrids) and self.scans.metadata.classes != CARLAOCC
 
     @property
@@ -118,7 +118,7 @@ class MatchedGrids:
 
     @cached_property
     def lookup(self) -> NDArray[np.int64] | None:
-        """(K,) class of the grids of each class of the scans, -1 for those that have none; None if no map is known."""
+        """(K,) class of the grids for each class of the scans, -1 for none; None if no map is known."""
         source = self.scans.metadata.classes
         mapping = None if self.classes is None else _mapping(source, self.classes, self.grids.benchmark)
         if mapping is None:
@@ -129,7 +129,7 @@ class MatchedGrids:
         return lookup
 
     def read(self, frame: int) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Return (X, Y, Z) labels of a grid, which voxels are occupied, and which are known; None if the files do not say it.
+        """Return (X, Y, Z) labels of a grid, occupied voxels, and known voxels; None for these if the files do not contain them.
 
         Raises:
             CarlascError: the grid cannot be read.
@@ -137,7 +137,8 @@ class MatchedGrids:
         labels, known = self.grids.labels(frame), self.grids.known(frame)
         where = f"{self.grids.location}: frame {self.grids.name_of(frame)}"
         if labels.size != self.spec.num_voxels:
-            raise FormatError(where, expected=f"{self.spec.num_voxels} voxels", found=str(labels.size))
+            expected, advice = f"{self.spec.num_voxels} voxels", "check the size in params.json"
+            raise FormatError(where, expected=expected, found=str(labels.size), advice=advice)
         labels = labels.reshape(self.spec.size)
         occupied = labels != (17 if self.grids.benchmark == "occ3d-lidar" else 0)
         if self.grids.benchmark in _FRAMES:
@@ -185,7 +186,9 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
     recordings = {s.path: s for s in source.sequences().values() if "points" in s.fields()}
     found = list(open_grids(grids, grid, "truth"))
     if not recordings:
-        raise MissingDataError(source.location, expected="sequences with scans (velodyne/)", found="none")
+        advice = "give the recording in the layout, such as `carlasc convert` writes it"
+        expected = "sequences with scans (velodyne/)"
+        raise MissingDataError(source.location, expected=expected, found="none", advice=advice)
     pairs = [(one, _recording_of(one, recordings, alone=len(found) == 1)) for one in found]
     matched = [_match_frames(one, own, FrameRange.of(frames)) for one, own in pairs if own is not None]
     if not matched:
@@ -193,8 +196,8 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
         raise MissingDataError(
             str(grids),
             expected="grids of a sequence of the scans",
-            found=f"none of the pairs tried has one name: {tried}",
-            advice="give one sequence of each side if they have other names",
+            found=f"none of the pairs tried has the same name: {tried}",
+            advice="give one sequence of each, if their names differ",
         )
     return matched
 
@@ -212,9 +215,9 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
     height = _height_of(scans) if grids.benchmark == "occ3d-lidar" else 0.0
     if height is None:
         height = _HEIGHT_M
-        notes.append(f"the height of the sensor is not known, and taken to be {height:g} m")
+        notes.append(f"the height of the sensor is not known: {height:g} m is assumed")
     result = MatchedGrids(grids, scans, (), (), (), height)
-    _ = result.spec  # unknown geometry is an error before work begins
+    _ = result.spec  # raises now, before work begins, if the geometry is unknown
     if not isinstance(grids, TokenFrames):
         pairs = [(number, number) for number in numbers if number in set(own.tolist())]
     elif (times := _token_times(grids)) is not None:
@@ -223,7 +226,7 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
         nearest = [(number, int(np.abs(seconds - t).argmin()), t) for number, t in timed]
         pairs = [(number, int(own[row])) for number, row, t in nearest if abs(seconds[row] - t) <= _SAME_TIME_S]
     elif len(numbers) == len(own):
-        notes.append("tokens without times were taken in the order of the scans")
+        notes.append("tokens have no times: they were matched to the scans in their order")
         pairs = list(zip(numbers, own.tolist(), strict=True))
     else:
         raise MissingDataError(
@@ -234,12 +237,12 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
         )
     if without := sorted(set(numbers) - {number for number, _ in pairs}):
         names = first_names([grids.name_of(number) for number in without], 4)
-        notes.append(f"{count(len(without), 'grid')} of {len(numbers)} without a scan of the same number or time were left out: {names}")  # fmt: skip
+        notes.append(f"{len(without)} of {count(len(numbers), 'grid')} left out, without a scan of the same number or time: {names}")  # fmt: skip
     pairs = [pair for pair in pairs if pair[0] in chosen]
     if not pairs:
         where = f"frames {own[0]} to {own[-1]}" if len(own) else "frames with scans"
         shown = f"{grids.name_of(numbers[0])} to {grids.name_of(numbers[-1])}" if numbers else "no frame"
-        advice = "no pair of frames has one number or time"
+        advice = "check the names of the files: no grid has the number or time of a scan"
         raise MissingDataError(result.pair, expected=f"grids of {where}", found=shown, advice=advice)
     made = [scan for _, scan in pairs]
     step = max(int(np.bincount(np.diff(made)).argmax()), 1) if len(made) > 1 else 1
@@ -270,7 +273,7 @@ def _height_of(scans: Sequence) -> float | None:
 
 
 def _mapping(source: ClassTable, target: ClassTable, benchmark: str | None) -> Mapping[int, int] | None:
-    """Return which class of the grids each class of the scans becomes; None if nothing says so."""
+    """Return the class of the grids for each class of the scans; None if no map is known."""
     if benchmark in _FRAMES:
         to_occ3d = TO_OCC3D.get(source.name)
         if to_occ3d is None or benchmark == "occ3d-lidar":

@@ -1,6 +1,6 @@
-"""What an audit counts and what it says: sums of stretches of frames, shares of them, the verdict of each check, and the result of them all.
+"""The sums and the verdicts of an audit: sums over blocks of successive frames, shares of them, and a verdict for each check.
 
-The intervals of shares come from stretches that are drawn with replacement.
+The intervals of shares come from a block bootstrap: blocks are drawn with replacement.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class Verdict:
 
     Attributes:
         check: what was checked, such as "shift x"; docs/commands/audit.md lists all.
-        state: "fault"; "sound"; "undetermined" where the drive or the files cannot tell.
+        state: "fault"; "sound"; "undetermined" if the drive or the files do not determine it.
         value: the number that was measured; None if nothing could be measured.
         low: lower end of its interval of 95 %.
         high: upper end.
         unit: of the three numbers; "share" for shares of 1.
         text: what was found, in words.
         where: the sequence.
-        advice: what to fix; empty if nothing is wrong.
-        details: more numbers in words, such as those by distance; shown on the page.
+        advice: what to do; empty if nothing is wrong.
+        details: more numbers, such as those by distance; shown on the page.
     """
 
     check: str
@@ -50,7 +50,7 @@ class Verdict:
 
     @property
     def sentence(self) -> str:
-        """The check, what was found, and what to fix, in a line."""
+        """The check, what was found, and what to do, in a line."""
         return f"{self.check}: {self.text}{f': {self.advice}' if self.advice else ''}"
 
 
@@ -74,15 +74,15 @@ class AuditResult:
     """What `audit` found.
 
     Attributes:
-        grids: where the grids are.
-        scans: where the scans are.
-        verdicts: of all checks, by path of the sequence; empty if other parts have still to count their frames.
+        grids: location of the grids.
+        scans: location of the scans.
+        verdicts: of all checks, by path of the sequence; empty until all parts have counted their frames.
         frames: number of audited frames, by path of the sequence.
-        placed: the frame that the grids are taken to be in, in words, by path of the sequence.
+        placed: the assumed coordinate frame of the grids, in words, by path of the sequence.
         worst: the frames with most wrong voxels, worst first: path, frame of the grids, frame of the scan, number of wrong voxels.
         notes: what was assumed.
         failures: frames that could not be audited.
-        grid: name of the grids that was asked for.
+        grid: requested name of the grids.
         elapsed_s: duration, in seconds.
     """
 
@@ -99,7 +99,7 @@ class AuditResult:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong, as far as the drives tell, and every frame could be read."""
+        """Whether no fault was found, and every frame could be read."""
         return not self.faults and not self.failures
 
     @property
@@ -148,7 +148,7 @@ class Stretches:
         return np.concatenate([np.ones((1, count)), drawn])
 
     def draw(self, counts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return (1 + DRAWS, ...) the sum of (S, ...) counts of all stretches, then of stretches drawn with replacement."""
+        """Return (1 + DRAWS, ...) sums of (S, ...) counts: of all stretches, then of stretches that are drawn with replacement."""
         return np.tensordot(self._weights, counts.astype(np.float64), axes=1)
 
     def drawn(self, name: str) -> NDArray[np.float64] | None:
@@ -157,7 +157,7 @@ class Stretches:
         return None if counts is None else self.draw(counts)
 
     def share(self, name: str) -> Share | None:
-        """Return the share of the second of two counts in the first; None if there is nothing to share."""
+        """Return the share of the second of two counts in the first; None if the first is missing or 0."""
         drawn = self.drawn(name)
         return None if drawn is None else share_of(drawn[:, 1], drawn[:, 0])
 

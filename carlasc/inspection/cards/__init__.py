@@ -1,1 +1,1 @@
-"""Data cards: what a data set holds, how it was made and who may use it, for people (README.md) and for programs (croissant.json)."""
+"""Data cards: contents, origin and licence of a data set, for people (README.md) and for programs (croissant.json)."""

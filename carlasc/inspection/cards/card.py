@@ -35,8 +35,8 @@ class CardResult:
         frames: number of frames of the data set.
         sequences: number of its sequences.
         licenses: names of the licences that hold, the strictest first.
-        notes: what the card lacks, and why.
-        failures: (file, message) of what could not be read.
+        notes: what is missing in the card, and why.
+        failures: (file, message) of each file that could not be read.
     """
 
     folder: Path
@@ -72,26 +72,26 @@ def card(
 ) -> CardResult:
     """Write the card of a data set: README.md with the YAML that the Hugging Face Hub reads, croissant.json, and pictures.
 
-    Counts, classes, splits, sensors, licences, sources, settings and limits are read from the data. What the data cannot say is given here.
+    Counts, classes, splits, sensors, licences, sources, settings and limits are read from the data. All other details are given in `about`.
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source at such a place.
-        out: folder of the card, the root of what is published. None: the data themselves, if they are a folder or a Parquet store;
-            otherwise the folder that they are in.
-        about: what the data cannot say: their name, authors, licence, and how to cite them.
+        out: folder of the card, the root folder of the publication. None: the source, if it is a folder or a Parquet store;
+            otherwise the folder that contains it.
+        about: details that are not in the data: their name, authors, licence, and how to cite them.
         pictures: whether a grid and a scan are drawn, which needs the extra `render`.
         every: count the classes of every N-th frame.
         overwrite: whether an existing card is replaced.
-        run: how the counting is spread, and who is told of its progress.
+        run: how the counting is spread, with a callback for progress.
 
     Returns:
         What was written. Frames that could not be read are listed in `failures`.
 
     Raises:
         MissingDataError: there is no data set, or it has no sequences.
-        ArgumentError: a licence, a version or a date is not one; no licence is known; or the licence contradicts that of the source.
+        ArgumentError: a licence, a version or a date is not valid; no licence is known; or the licence contradicts that of the source.
         FormatError: the data do not have the format, or the licence in carlasc.json is not known.
-        CarlascError: the licence of the source forbids passing on what is made from it.
+        CarlascError: the licence of the source forbids publishing derived data.
         ConflictError: a card exists, and `overwrite` is not given.
         StorageError: the folder cannot be written to.
     """
@@ -126,7 +126,7 @@ def card(
 def _check_free(folder: Path, overwrite: bool, pictures: bool) -> bool:
     """Check that no card exists, before anything is counted; return whether files may be replaced.
 
-    croissant.json is the first file of a card and README.md the last: what lies beside the one without the other is what a killed run left.
+    croissant.json is the first file of a card, and README.md the last: a folder with the first one only is from a run that was killed.
     """
     if folder.exists() and not folder.is_dir():
         raise ArgumentError("out", expected="a folder", found=f"the file {folder}")
@@ -151,7 +151,7 @@ def _is_ours(path: Path) -> bool:
 
 
 def _describe(facts: Facts) -> str:
-    """Return what the data set is, in two sentences."""
+    """Return a description of the data set, in two sentences."""
     grids = ", ".join(f"{grid.name} ({' x '.join(map(str, grid.size))})" for grid, _, _ in facts.grids[:3])
     what = f"with voxel grids of complete semantic scenes: {grids}" if grids else "without voxel grids"
     made = ["recorded in a simulator"] if facts.simulated else []
@@ -162,7 +162,7 @@ def _describe(facts: Facts) -> str:
 
 
 def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path, str]], list[str]]:
-    """Draw a grid and a scan; return (file, what it shows) of each picture, and notes on those that could not be drawn."""
+    """Draw a grid and a scan; return (file, content) of each picture, and a note for each picture that could not be drawn."""
     from carlasc.viewing import Scene, StyleOptions, render
 
     drawn, notes = [], []

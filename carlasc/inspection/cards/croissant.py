@@ -18,7 +18,7 @@ from carlasc.storage import layout
 Json = dict[str, Any]
 
 WRITER = "carlasc"
-"""Who wrote the file, as its `sdPublisher` says."""
+"""The `sdPublisher` of the file: the program that wrote it."""
 CONFORMS_TO = ("http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0")
 KEYWORDS = ("LiDAR", "voxel grid", "semantic scene completion", "semantic mapping", "occupancy", "scene flow")
 _PARQUET = "application/x-parquet"
@@ -65,7 +65,7 @@ def _vocabulary() -> Json:
 
 
 def _papers(facts: Facts) -> str:
-    """Return what to cite: the papers of the sources, or that which introduced CarlaSC."""
+    """Return what to cite: the papers of the sources, or the paper that introduced CarlaSC."""
     papers = list(dict.fromkeys(filter(None, facts.citations.values())))
     return "; ".join(papers) if papers and not facts.simulated else read("motionsc.bib").strip()
 
@@ -91,7 +91,7 @@ def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iter
             "description": "The git repository at the Hugging Face Hub.",
             "contentUrl": place.repository,
             "encodingFormat": "git+https",
-            # What the Hub itself writes: a repository has no checksum of its own.
+            # The same text as in the files of the Hub: a repository has no checksum.
             "sha256": "https://github.com/mlcommons/croissant/issues/80",
         }
     for table in tables:

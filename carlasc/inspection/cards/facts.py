@@ -1,4 +1,4 @@
-"""What a card says, as values: read from the data, and given by the author where the data cannot say it."""
+"""The facts of a card, as values: read from the data, or given by the author."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from carlasc.storage.views import ChosenSequences
 
 @dataclass(frozen=True)
 class CardDetails:
-    """What the data cannot say of themselves.
+    """Details of a data set that are not in the data.
 
     Attributes:
         name: name of the data set; None takes that of the source.
-        description: what it is, in a sentence or two; None makes one from the data.
+        description: a sentence or two; None makes one from the data.
         authors: names of the people or groups that publish it.
-        license: licence of the sequences whose carlasc.json names none, such as "cc-by-4.0", or the address of its text. The licence of data that were
-            converted holds for what was made from them, whatever is given here.
-        citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is named in any case.
+        license: licence of the sequences whose carlasc.json names none, such as "cc-by-4.0", or the address of its text. Converted
+            sequences keep the licence of their source.
+        citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is always named, too.
         url: address of the page where the data are published, such as "https://huggingface.co/datasets/ORG/NAME".
-        contact: whom to ask, in words or as an address.
+        contact: a name or an address for questions.
         version: version of the data.
         published: date of the publication, YYYY-MM-DD; None takes today.
 
     Raises:
-        ArgumentError: a version, a date or an address is not one.
+        ArgumentError: a version, a date or an address is not valid.
     """
 
     name: str | None = None
@@ -65,15 +65,15 @@ class CardDetails:
 
 @dataclass(frozen=True)
 class Facts:
-    """What was read.
+    """The facts that were read from the data.
 
     Attributes:
-        overview: what `info` found.
+        overview: the result of `info`.
         sequences: the sequences, by path.
         parts: sources and licences, the strictest first.
         statistics: the counts of classes, one for each class table; none without labels.
-        every: which frames were counted: every N-th.
-        reports: the reports that runs left beside the grids, by sequence and grid.
+        every: every N-th frame was counted.
+        reports: the reports beside the grids, by sequence and grid.
         lossy_mm: step to which coordinates of points were rounded, millimetres; None for exact ones.
     """
 
@@ -116,7 +116,7 @@ class Facts:
 
     @cached_property
     def grids(self) -> list[tuple[GridOverview, int, int]]:
-        """Each kind of grid, with its number of sequences and of frames: those that differ in nothing but their sequence are one kind."""
+        """Each kind of grid, with its number of sequences and of frames. Grids of one kind differ only in their sequence."""
         kinds: dict[tuple[object, ...], list[GridOverview]] = {}
         for sequence in self.overview.sequences:
             for grid in sequence.grids:
@@ -136,7 +136,7 @@ class Facts:
 
     @property
     def simulated(self) -> bool:
-        """Whether some sequences were converted from nothing: they were recorded in a simulator."""
+        """Whether some sequences were not converted: they were recorded in a simulator."""
         return any(part.source is None for part in self.parts)
 
     @property
@@ -146,7 +146,7 @@ class Facts:
 
     @cached_property
     def citations(self) -> dict[str, str]:
-        """What to cite for each source; "" where carlasc.json does not say it."""
+        """What to cite for each source; "" if carlasc.json does not name it."""
         said = {one.metadata.source: one.metadata.extra.get("citation") for one in self.sequences.values()}
         return {source: text if isinstance(text := said.get(source), str) else "" for source in self.sources}
 
@@ -167,7 +167,7 @@ class Facts:
 
     @property
     def failures(self) -> list[tuple[str, str]]:
-        """(file, message) of what could not be read."""
+        """(file, message) of each file that could not be read."""
         return [failure for one in self.statistics for failure in one.failures]
 
     def known_share(self) -> float | None:
@@ -177,7 +177,7 @@ class Facts:
 
 
 def gather(source: Source, license_: License | None, every: int, run: Run) -> Facts:
-    """Read what a card says.
+    """Read the facts of a card.
 
     Raises:
         MissingDataError: the source has no sequences.
@@ -186,7 +186,9 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
     """
     sequences = {path: one for path, one in source.sequences().items() if one.fields()}
     if not sequences:
-        raise MissingDataError(source.location, expected="sequences", found="none", advice="a raw capture has no card")
+        raise MissingDataError(
+            source.location, expected="sequences", found="none", advice="make them with `carlasc regrid`"
+        )
     parts = licensed_parts(sequences.values(), license_, source.location)
     reports = {}
     for path, sequence in sequences.items():
@@ -197,7 +199,7 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
                 reports[f"{path}/{grid}" if path else grid] = Report.from_json(sequence.read_document(name), where)
     overview = info(source)
     for one in overview.sequences:
-        if one.problem:  # a grid that cannot be described would be missing from the card, and nobody would know
+        if one.problem:  # otherwise, a grid that cannot be described would be missing from the card without a message
             raise FormatError(one.path or source.location, problem=one.problem)
     return Facts(
         overview,
@@ -211,7 +213,7 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
 
 
 def _count(location: str, sequences: Mapping[str, StoredSequence], every: int, run: Run) -> tuple[Statistics, ...]:
-    """Count the classes, apart for each class table; sequences without labels are left out."""
+    """Count the classes, separately for each class table; sequences without labels are left out."""
     if every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     tables: dict[str, dict[str, StoredSequence]] = {}
@@ -222,7 +224,7 @@ def _count(location: str, sequences: Mapping[str, StoredSequence], every: int, r
     for chosen in tables.values():
         try:
             counted.append(stats(ChosenSequences(location, chosen), remap=None, every=every, run=run))
-        except MissingDataError:  # several grids, and none of them the published one
+        except MissingDataError:  # several grids without the published one
             continue
     return tuple(counted)
 

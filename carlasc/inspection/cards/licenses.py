@@ -1,4 +1,4 @@
-"""Licences of data: what they are called, what they permit, and which of them hold for the sequences of a data set."""
+"""Licences of data: their names, what they permit, and the licences of the sequences of a data set."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from carlasc.inspection.texts import read_table
 from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
-_OTHER = "other"  # what the Hugging Face Hub calls a licence that it has no name for
+_OTHER = "other"  # name at the Hugging Face Hub for all licences that it does not list
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class License:
         name: its usual name, such as "CC BY-NC-SA 4.0".
         url: the address of its text.
         hub: its name at the Hugging Face Hub; "other" for one that the Hub does not know.
-        derivatives: whether what is made from the data may be passed on; None if that is not known.
+        derivatives: whether derived data may be published; None if that is not known.
         commercial: whether commercial use is permitted; None if that is not known.
-        share_alike: whether what is made from the data must have the same licence; None if that is not known.
+        share_alike: whether derived data must have the same licence; None if that is not known.
     """
 
     name: str
@@ -38,7 +38,7 @@ class License:
 
     @property
     def conditions(self) -> str:
-        """What it demands, in words."""
+        """Its conditions, in words."""
         if self.derivatives is None:
             return "read its text"
         demands = [
@@ -46,8 +46,8 @@ class License:
             for text, holds in (
                 ("name the authors", self.name.startswith(("CC BY", "ODC-BY"))),
                 ("non-commercial use only", not self.commercial),
-                ("the same licence for what is made from the data", self.share_alike),
-                ("no passing on of what is made from the data", not self.derivatives),
+                ("the same licence for derived data", self.share_alike),
+                ("no publication of derived data", not self.derivatives),
             )
             if holds
         ]
@@ -61,7 +61,7 @@ class License:
 
 @cache
 def _licenses() -> dict[str, License]:
-    """Return the licences by name; of those of Creative Commons, all versions that exist."""
+    """Return the licences by name, with all versions of those of Creative Commons."""
     table = read_table("licenses.toml")
     found = [License(**entry) for entry in table["license"]]
     for kind, on_hub in table["creative_commons"].items():
@@ -78,7 +78,7 @@ def find_license(text: str) -> License | None:
     stripped = text.strip()
     if re.fullmatch(r"https?://[^\s\"'<>]+", stripped):
         if deed := re.match(r"https?://(?:www\.)?creativecommons\.org/licenses/([a-z-]+)/(\d\.\d)\b", stripped):
-            return _licenses().get(f"cc-{deed[1]}-{deed[2]}")  # also where /deed.en, /legalcode or a country follows
+            return _licenses().get(f"cc-{deed[1]}-{deed[2]}")  # /deed.en, /legalcode or a country may follow
         address = re.sub(r"^https?://(www\.)?", "", stripped).rstrip("/")
         known = (
             one for one in _licenses().values() if re.sub(r"^https://(www\.)?", "", one.url).rstrip("/") == address
@@ -112,9 +112,9 @@ class LicensedPart:
     """The sequences of a data set that come from one source under one licence.
 
     Attributes:
-        source: what they were converted from, as carlasc.json says; None for sequences that were converted from nothing.
+        source: what they were converted from, as carlasc.json says; None for sequences that were not converted.
         license: the licence that holds for them.
-        stated: whether the author of the card named the licence, because the data do not.
+        stated: whether the author of the card named the licence, because the data do not name one.
         paths: the sequences.
     """
 
@@ -127,7 +127,7 @@ class LicensedPart:
 def licensed_parts(sequences: Iterable[Sequence], given: License | None, location: str) -> tuple[LicensedPart, ...]:
     """Return the licences of a data set, the strictest first.
 
-    The licence of the data that a sequence was converted from holds for the sequence. `given` holds for those that name none.
+    A converted sequence keeps the licence of its source. `given` is the licence of sequences that name none.
 
     Args:
         sequences: the sequences.
@@ -135,9 +135,9 @@ def licensed_parts(sequences: Iterable[Sequence], given: License | None, locatio
         location: the data set, for errors.
 
     Raises:
-        FormatError: the text in carlasc.json is no licence that is known.
-        ArgumentError: sequences without a licence, and none is given; or one is given, and all sequences have another.
-        CarlascError: a licence forbids passing on what is made from the data.
+        FormatError: the licence in carlasc.json is unknown.
+        ArgumentError: a sequence has no licence, and none is given; or one is given, although all sequences have a licence.
+        CarlascError: a licence forbids publishing derived data.
     """
     found: dict[tuple[str | None, License | None], list[str]] = {}
     for sequence in sequences:
@@ -145,9 +145,9 @@ def licensed_parts(sequences: Iterable[Sequence], given: License | None, locatio
         if license_ is not None and license_.derivatives is False:
             raise CarlascError(
                 sequence.location,
-                expected="a licence under which what is made from the data may be passed on",
+                expected="a licence that permits publishing derived data",
                 found=f"{license_.name} of {source or 'its source'}, which forbids that",
-                advice="publish how you made the data instead: others can convert their own copy",
+                advice="publish instead how you made the data, so that others can convert their own copies",
             )
         found.setdefault((source, license_), []).append(sequence.path)
     known = {license_ for _, license_ in found if license_ is not None}
@@ -156,14 +156,14 @@ def licensed_parts(sequences: Iterable[Sequence], given: License | None, locatio
         of = " and ".join(source for source in without if source)
         raise ArgumentError(
             "license",
-            expected=f"the licence of {of}" if of else "the licence under which you publish these data",
-            found=f"none, neither given nor in {layout.METADATA} of {location}",
+            expected=f"the licence of {of}" if of else "the licence of these data",
+            found=f"none given, and none in {layout.METADATA} of {location}",
             advice="name it with `license`, such as cc-by-4.0",
         )
     if given is not None and not without and given not in known:
         raise ArgumentError(
             "license",
-            expected=f"{', '.join(sorted(one.name for one in known))}, which holds for what is made from the source of the data",
+            expected=f"{', '.join(sorted(one.name for one in known))}, the licence of the source, which also holds for data that are made from it",
             found=given.name,
         )
     parts = []
@@ -184,6 +184,6 @@ def _license_of(sequence: Sequence) -> License | None:
             f"{sequence.location}/{layout.METADATA}",
             expected="the name of a licence, or the address of its text, in license",
             found=repr(text),
-            advice="look it up, and write it as CC BY-NC-SA 4.0 or as https://...",
+            advice="look it up, and write its name (CC BY-NC-SA 4.0) or its address (https://...)",
         )
     return found

@@ -1,4 +1,4 @@
-"""Where the data lie that a card is about: on this machine, and beside the card once both are published; and the tables of a Parquet store, as `datasets.load_dataset` names them."""
+"""The location of the data of a card, on this machine and after publication; and the tables of a Parquet store, with their names in `datasets.load_dataset`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import is_url
 
 HUB_SPLITS = {"Train": "train", "Val": "validation", "Test": "test"}
-"""What the Hugging Face Hub calls the splits; a data set without splits is all `train` there."""
+"""The names of the splits at the Hugging Face Hub. A data set without splits is `train` there."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ _HUB = "https://huggingface.co/datasets/"
 
 @dataclass(frozen=True)
 class Place:
-    """The place of the data.
+    """The location of the data.
 
     Attributes:
         location: the source, as it was given.
@@ -112,7 +112,7 @@ class Place:
         return str(PurePosixPath(self.name) / path) if self.name or path else ""
 
     def address(self, path: str) -> str:
-        """Return the address of a file: its URL where that is known, else its path below the folder of the card."""
+        """Return the address of a file: its URL if that is known, otherwise its path below the folder of the card."""
         published = self.published(path)
         return f"{self.repository}/resolve/main/{published}" if self.repository else published
 
@@ -137,19 +137,19 @@ class Place:
 
 
 def place_of(source: str | os.PathLike[str] | Source, out: Path | None, url: str | None) -> tuple[Place, Path]:
-    """Return the place of the data, and the folder of the card.
+    """Return the location of the data, and the folder of the card.
 
-    A folder of sequences and a Parquet store have the card inside, which is where the Hugging Face Hub looks for it; other stores have it beside
-    them. A source that is not below the folder of the card is described as if it lay there under its own name.
+    The card is inside a folder of sequences or a Parquet store, because the Hugging Face Hub looks for it there, and beside other stores. A
+    source that is not below the folder of the card is described as if it were there, under its own name.
 
     Raises:
-        ArgumentError: the source is a URL or no path, and no folder is given.
+        ArgumentError: no folder is given, and the source is a URL or no path.
     """
     location = source.location if isinstance(source, Source) else os.fspath(source)
     repository = url.rstrip("/") if url and url.startswith(_HUB) else None
     if is_url(location):
         if out is None:
-            raise ArgumentError("out", expected=f"a folder for the card of {location}", found="none")
+            raise ArgumentError("out", expected=f"a folder for the card, because {location} is a URL", found="none")
         tree = RemoteTree(location)
         name = PurePosixPath(location.partition("://")[2].partition("?")[0]).name
         return Place(location, None, name, tree.size() is not None, repository), out

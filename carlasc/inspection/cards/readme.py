@@ -1,4 +1,4 @@
-"""README.md: the card for people, with the YAML that the Hugging Face Hub reads at its head (https://huggingface.co/docs/hub/datasets-cards)."""
+"""README.md: the card for people. It begins with YAML that the Hugging Face Hub reads (https://huggingface.co/docs/hub/datasets-cards)."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def readme(
 
     Args:
         facts: what was read from the data.
-        details: what the data cannot say; with a name, a description and a date.
-        place: where the data lie.
-        tables: those of a Parquet store.
-        pictures: (path below the folder of the card, what it shows) of each.
+        details: what is not in the data; with a name, a description and a date.
+        place: the location of the data.
+        tables: the tables of a Parquet store.
+        pictures: (path below the folder of the card, content) of each picture.
     """
     opening = [_text(details.description or ""), *(f"![{_text(caption)}]({path})" for path, caption in pictures)]
     text = fill(
@@ -91,7 +91,7 @@ def _front_matter(facts: Facts, details: CardDetails, place: Place, tables: Sequ
             for place_first, table in ((number == 0, table) for number, table in enumerate(tables))
         ]
     else:
-        values["viewer"] = False  # the Hub would show the pictures of the card as if they were the data
+        values["viewer"] = False  # otherwise, the Hub would take the pictures of the card for the data
     return _yaml(values)
 
 
@@ -115,7 +115,7 @@ def _tags(facts: Facts) -> list[str]:
 
 
 def _yaml(value: Any, indent: str = "") -> str:
-    """Return plain values as YAML: blocks for lists and objects, and JSON, which is YAML, for the rest."""
+    """Return plain values as YAML: blocks for lists and objects, and JSON (a subset of YAML) for other values."""
     lines = []
     for key, entry in value.items() if isinstance(value, Mapping) else enumerate(value):
         head = f"{indent}- " if not isinstance(value, Mapping) else f"{indent}{key}:"
@@ -132,7 +132,7 @@ def _yaml(value: Any, indent: str = "") -> str:
 def _glance(facts: Facts, details: CardDetails) -> str:
     rows = [
         ["frames", f"{facts.frames:,} in {facts.sequences_told}"],
-        ["splits", ", ".join(f"{name} {frames:,}" for name, (_, frames) in facts.splits.items())],
+        ["frames by split", ", ".join(f"{name} {frames:,}" for name, (_, frames) in facts.splits.items())],
         ["fields of scans", ", ".join(facts.fields) or "none"],
         ["grids", "; ".join(_grid(grid) for grid, _, _ in facts.grids) or "none"],
         ["sensors", ", ".join(facts.sensors) or ("simulated LiDAR" if facts.simulated else "not named")],
@@ -196,7 +196,7 @@ def _first_read(first: SequenceOverview) -> str:
 
 
 def _samples(facts: Facts, name: str) -> str:
-    """Return a line of Python that opens the data for training; "" if they are no scans with grids of one name."""
+    """Return a line of Python that opens the data for training; "" without scans, or without grids of one name."""
     if not all("points" in one.fields and one.grids for one in facts.overview.sequences):
         return ""
     common = set.intersection(*({grid.name for grid in one.grids} for one in facts.overview.sequences))
@@ -313,13 +313,13 @@ def _percent(share: float | None) -> str:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]], *, links: bool = False) -> str:
-    """Return a table; where `links`, cells may hold links, and are taken as they are."""
+    """Return a table; with `links`, cells may hold links and are not escaped."""
     lines = [header, ["---"] * len(header), *rows]
     cells = [[cell if links else _text(cell) for cell in line] for line in lines]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in cells)
 
 
 def _text(text: str) -> str:
-    """Return a text as Markdown shows it: names come from data, and must start no tag, link or heading."""
+    """Return a text, escaped for Markdown: names come from data, and must not start a tag, link or heading."""
     shown = printable(" ".join(text.split()))
     return re.sub(r"([\\`*_\[\]<>])", r"\\\1", shown) if re.search(r"[`*\[\]<>\\]", shown) else shown

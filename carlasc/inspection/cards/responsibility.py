@@ -1,7 +1,7 @@
-"""What a card says of responsible use: how the data were collected and labelled, their limits, biases and uses.
+"""The texts of a card about responsible use: how the data were collected and labelled, their limits, biases and uses.
 
-The texts state what the data and their passports show. They are the fields of Croissant's RAI vocabulary (https://docs.mlcommons.org/croissant),
-and the README takes the same texts.
+They are made from the data and from their carlasc.json. They are the fields of Croissant's RAI vocabulary
+(https://docs.mlcommons.org/croissant); README.md contains the same texts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from carlasc.inspection.cards.facts import CardDetails, Facts
 from carlasc.inspection.texts import say
 
 RARE = 0.001
-"""Share of the points or voxels below which a class is called rare."""
+"""A class with a smaller share of the points or voxels is called rare."""
 
 
 def responsibility(facts: Facts, details: CardDetails) -> dict[str, str | list[str] | bool]:
@@ -114,7 +114,7 @@ def how_made(record: Mapping[str, object] | None) -> str:
 
 
 def biases(facts: Facts) -> list[str]:
-    """Return how the data are unbalanced, one sentence each."""
+    """Return how unbalanced the classes are, one sentence each."""
     sentences = []
     for one in facts.statistics:
         for what, counts in (("points", one.total.points), ("known voxels that are occupied", one.total.voxels)):

@@ -1,6 +1,6 @@
-"""What a page shows: grids of one run or of two beside each other, with path, evidence and scores; and how it is encoded in few bytes.
+"""The contents of a page: grids of one run or of two beside each other, with trajectory, evidence and scores, in a compact encoding.
 
-A frame is sparse voxels and thinned points, delta-coded, in byte planes, deflated.
+A frame consists of sparse voxels and thinned points, delta-coded, in byte planes, deflated.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def encode_grid(grid: Grid) -> Arrays:
 
 
 def encode_evidence(grid: Grid, fields: Mapping[str, NDArray[Any]]) -> Arrays:
-    """Encode what is known of the occupied voxels of a grid besides their classes (see `docs/format.md#evidence`).
+    """Encode the evidence of the occupied voxels of a grid (see `docs/format.md#evidence`).
 
     Args:
         grid: the grid.
@@ -83,7 +83,7 @@ def encode_scan(scan: Scan, cell_m: float) -> Arrays:
         `box` (6,) int32: first cell and number of cells along each axis. `index`: differences of the rising C-order indices of the cells
         in the box. `offset` (3 N,): position within the cell in steps, axis by axis. `label` of each point, if the scan has labels.
     """
-    cells = np.floor(scan.points.T.astype(np.float64, order="C") / cell_m).astype(np.int64)  # fast axis by axis
+    cells = np.floor(scan.points.T.astype(np.float64, order="C") / cell_m).astype(np.int64)  # by axis, which is fast
     lower = cells.min(1) if len(scan) else np.zeros(3, np.int64)
     size = cells.max(1) - lower + 1 if len(scan) else np.ones(3, np.int64)
     index, first = np.unique(np.ravel_multi_index(tuple(cells - lower[:, None]), tuple(size)), return_index=True)
@@ -100,16 +100,16 @@ def encode_scan(scan: Scan, cell_m: float) -> Arrays:
 
 
 def encode_actors(content: FrameContent, moving: Scan | None, trails: Sequence[Trail]) -> Arrays:
-    """Encode what moves in a frame, metres, sensor frame.
+    """Encode the moving actors of a frame, metres, sensor frame.
 
     Args:
         content: the frame.
-        moving: the points that move, with flow; None if nothing says what does.
-        trails: the ways of the actors.
+        moving: the moving points, with flow; None if motion is not known.
+        trails: the tracks of the actors.
 
     Returns:
-        Flat float32 arrays: `arrows`, start point and vector (m/s) of an arrow for each moving actor, unless `moving` is None; `boxes` and
-        `tracks`, both ends of each line, where there are any.
+        Flat float32 arrays: `arrows`, start point and vector (m/s) of an arrow per moving actor, unless `moving` is None; `boxes` and
+        `tracks`, both ends of each line, if there are any.
     """
     arrays: Arrays = {}
     if moving is not None:
@@ -148,7 +148,7 @@ def _narrow(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
     return values.astype(next(t for t in (np.uint8, np.uint16, np.uint32) if largest <= np.iinfo(t).max))
 
 
-EVIDENCE = ("occupied", "views", "flags", "instance")  # the fields of a grid that a page shows, where they exist
+EVIDENCE = ("occupied", "views", "flags", "instance")  # the fields of a grid that a page shows, if they exist
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class PagePanel:
 
     Attributes:
         name: "prediction", "truth", "errors", or "grid" if there is only one.
-        title: what is written above it: the name, the size of the grid if there is only one, or that of the run if two are compared.
+        title: text above it: the name, the size of the grid if there is only one, or the name of the run if two are compared.
         spec: geometry.
         colors: colours of its labels.
         run: number of the run that it belongs to: 0, or 1 for the run beside it.
@@ -189,11 +189,11 @@ class FrameScores:
 
 @dataclass(frozen=True, eq=False)
 class PageContent:
-    """Reads what a page shows of each frame. Nothing of a frame is kept.
+    """Reads the contents of a page frame by frame. No frame is kept in memory.
 
     Attributes:
-        reader: the run that is shown.
-        beside: the run that it is compared with, or None.
+        reader: the first run.
+        beside: the run to compare it with, or None.
         frames: the frame numbers.
         thin_m: side length of the cells to which points are thinned, metres.
     """
@@ -224,7 +224,7 @@ class PageContent:
 
     @cached_property
     def runs(self) -> tuple[str, ...]:
-        """The names of the runs: what tells two runs apart, their grids, or the last folders in which their paths differ."""
+        """The names of the runs. Two runs are named by their grids, or by the last folders in which their paths differ."""
         parts = [
             (*PurePath(reader.data.sequence.location).parts, reader.data.grid)
             for reader in (self.reader, self.beside)
@@ -239,7 +239,7 @@ class PageContent:
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """The names of the cameras with images of these frames; none without Pillow, which makes them small."""
+        """The names of the cameras with images of these frames; empty without Pillow, which scales the images."""
         sequence = self.reader.data.sequence
         if find_spec("PIL") is None:
             return ()
@@ -251,7 +251,7 @@ class PageContent:
 
         Args:
             frame: frame number.
-            trails: follows the actors through the frames, which are then read in their order; None shows no tracks.
+            trails: the tracks of the actors, for which frames must be read in order; None shows no tracks.
 
         Raises:
             FormatError: the data do not have the format.
@@ -279,7 +279,7 @@ class PageContent:
         return arrays, self._score(grids)
 
     def describe(self) -> dict[str, Any]:
-        """Return what the scripts of the page need to know besides the frames and their scores."""
+        """Return the values for the scripts of the page, except the frames and their scores."""
         reader = self.reader
         poses = [pose for pose in map(reader.read_pose, self.frames) if pose is not None]
         tables = {colors.table.name: colors for colors in (reader.colors, *(panel.colors for panel in self.panels))}
@@ -304,7 +304,7 @@ class PageContent:
         }
 
     def _has_classes(self) -> bool:
-        """Whether the first frame has classes, whose colours show more than heights do."""
+        """Whether the first frame has classes, so that colours by class are more useful than colours by height."""
         content = self.reader.read(self.frames[0])
         labels = [grid.labels for grid in content.grids]
         if content.scan is not None and content.scan.labels is not None:
@@ -317,7 +317,7 @@ class PageContent:
         return tuple(name for name in EVIDENCE if reader.has(f"{reader.data.grid}/{name}"))
 
     def _score(self, grids: list[Grid]) -> FrameScores | None:
-        """Return the scores of the runs' predictions in the classes that are shown, where the truth is known."""
+        """Return the scores of the predictions of the runs, in the shown classes and in voxels that the ground truth knows."""
         if self.reader.truth is None:
             return None
         truth = grids[1]
@@ -355,6 +355,7 @@ def open_content(
             other.data.sequence.location,
             expected=f"one of the frames {reader.frames[0]} to {reader.frames[-1]}",
             found=f"frames {other.frames[0]} to {other.frames[-1]}",
+            advice="choose others with `frames`",
         )
     return PageContent(reader, other, frames, thin_m)
 

@@ -1,4 +1,4 @@
-"""A scene as a page that any browser opens: one self-contained HTML file, or a folder of which a browser fetches the frames that it shows."""
+"""A scene as a page for any browser: one self-contained HTML file, or a folder from which the browser fetches frames."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def compose(name: str, describe: Callable[[], Mapping[str, Any]], blocks: Iterat
 
     Args:
         name: title of the page.
-        describe: returns the description of the scene. It is called after the last block was taken.
-        blocks: the frames, which become part of the page; None if a browser fetches each from the page's folder.
+        describe: returns the description of the scene. It is called after the last block.
+        blocks: the frames, which become part of the page; None if the browser fetches them from the folder of the page.
     """
     assets = files("carlasc.viewing.page").joinpath("assets")
 
@@ -133,18 +133,18 @@ class NewFolder:
 
 @contextmanager
 def writing_folder(out: Path) -> Iterator[NewFolder]:
-    """Yield a folder that gets its name when the block ends, and that is removed if it fails.
+    """Yield a temporary folder, which is renamed at the end of the block, and removed if the block fails.
 
-    What is in its place is removed only then; `check_folder` says whether it may be.
+    An existing folder is replaced at the end of the block. Call `check_folder` before.
 
     Raises:
-        StorageError: it cannot be written; nothing is left behind.
+        StorageError: the folder cannot be written; nothing is left behind.
     """
     out = out.resolve()  # "." has no name
     part, old = (out.with_name(f".{out.name}.{ending}") for ending in ("part", "old"))
     try:
         with writing(out):
-            remove(part)  # what a killed run left
+            remove(part)  # left by a killed run
             make_folder(part)
             folder = NewFolder(part)
             yield folder
@@ -193,7 +193,7 @@ def write_page(
 
 
 class _Writer:
-    """Writes the frames of a page one after the other, and then what describes them."""
+    """Writes the frames of a page one after the other, then their description."""
 
     def __init__(self, content: PageContent, progress: Callable[[int, int], None] | None) -> None:
         self.content = content

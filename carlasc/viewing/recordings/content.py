@@ -1,4 +1,4 @@
-"""What a recording holds of each frame, whichever format it is written in: right-handed, thinned, with the way of each actor."""
+"""The contents of a recording frame by frame, for all formats: right-handed, thinned, with the track of each actor."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from carlasc.viewing.scene import SceneReader
 from carlasc.viewing.trails import Trail, Trails
 
 MAX_POINTS = 30_000
-"""Points of a frame, unless all are asked for: a frame is then smaller than half a megabyte."""
+"""Default number of points per frame, so that a frame is smaller than half a megabyte."""
 
 _GOLDEN = (
     2654435769  # 2**32 over the golden ratio: multiples of it, modulo 2**32, are spread evenly, however many are taken
@@ -46,7 +46,7 @@ class Triangles(NamedTuple):
 def class_surfaces(grid: Grid) -> Iterator[tuple[int, Triangles]]:
     """Yield each class of a cylindrical grid with the surface of its voxels, without the faces that two voxels share.
 
-    The lowest faces of the lowest cells, which are seen from below the ground only, are left out.
+    The lowest faces of the lowest cells are left out, because they are visible only from below the ground.
     """
     spec, labels = split_arcs(grid.spec, grid.labels)
     parts = [_faces(spec, labels, axis, side) for axis in range(3) for side in (0, 1)]
@@ -99,7 +99,7 @@ def _faces(
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One frame, in right-handed axes: x ahead, y to the left, z up; in the frame of the sensor where nothing else is said.
+    """One frame, in right-handed axes: x forward, y to the left, z up; in the frame of the sensor, unless noted.
 
     Attributes:
         number: frame number.
@@ -108,9 +108,9 @@ class RecordedFrame:
         scan: the thinned points with their labels; None if the frame has no points.
         tails: (M, 3) start points of the arrows that show how actors move, metres.
         vectors: (M, 3) vectors of the arrows, metres per second.
-        boxes: tracked boxes; None where the frame was not annotated.
-        pose: (4, 4) world_T_sensor, where the world is the frame of the first scan; None if the sequence has no poses.
-        trails: the ways of the actors up to this frame, in the world.
+        boxes: tracked boxes; None if the frame was not annotated.
+        pose: (4, 4) world_T_sensor; the world is the frame of the first scan; None if the sequence has no poses.
+        trails: the tracks of the actors up to this frame, in the world.
         picture: the bird's-eye camera picture as its JPEG bytes, or None.
         photos: the images of the cameras.
     """
@@ -129,7 +129,7 @@ class RecordedFrame:
 
 
 class RecordingWriter(Protocol):
-    """Writes the frames of a scene to a file, one after the other, and keeps none of them."""
+    """Writes the frames of a scene to a file, one after the other, without keeping them in memory."""
 
     def write(self, frame: RecordedFrame) -> None:
         """Append a frame."""
@@ -174,7 +174,7 @@ def record_frames(reader: SceneReader, max_points: int | None) -> Iterator[Recor
 
 
 def thin_scan(scan: Scan, most: int) -> Scan:
-    """Return at most so many points of a scan, spread evenly over their order in the file. It chooses the same ones each time."""
+    """Return at most `most` points of a scan, spread evenly over their order in the file: the same ones in each call."""
     if len(scan) <= most:
         return scan
     order = np.arange(len(scan), dtype=np.uint64) * np.uint64(_GOLDEN) % np.uint64(2**32)

@@ -3,11 +3,11 @@
 Topics, all in right-handed axes with z up; times are seconds since the first frame:
 
     /tf                      FrameTransforms: `ego`, the sensor, in `world`, the frame of the first scan
-    /points                  PointCloud: colours, class ids, and numbers of actors where there are some
+    /points                  PointCloud: colours, class ids, and numbers of actors if they exist
     /grid                    VoxelGrid, or SceneUpdate with meshes for a cylindrical grid; with a ground truth
                              /prediction, /truth and /errors; /actors: its voxels by actor
-    /flow, /boxes, /tracks   SceneUpdate: arrows, boxes, the ways of the actors
-    /path                    SceneUpdate: the way of the vehicle through the whole recording
+    /flow, /boxes, /tracks   SceneUpdate: arrows, boxes, the tracks of the actors
+    /path                    SceneUpdate: the trajectory of the vehicle in the whole recording
     /picture                 CompressedImage: the bird's-eye camera picture
     /cameras/NAME/image, /cameras/NAME/calibration
                              CompressedImage and CameraCalibration of each camera, whose frame is NAME

@@ -3,8 +3,8 @@
 Entities, all in right-handed axes with z up:
 
     world                        class names and colours
-    world/path                   the way of the vehicle through the whole recording
-    world/tracks                 the ways of the actors up to the frame
+    world/path                   the trajectory of the vehicle in the whole recording
+    world/tracks                 the tracks of the actors up to the frame
     world/ego                    the pose of the sensor; everything below is in its frame
     world/ego/vehicle            a plain car
     world/ego/points, flow, boxes
@@ -52,10 +52,10 @@ _EYE, _TARGET = (-49.0, 0.0, 35.0), (-3.0, 0.0, -3.0)  # behind and above: a pub
 
 
 class PipedFile:
-    """Takes what is written to a pipe and writes it to a file.
+    """Copies the data that is written to a pipe into a file.
 
-    Rerun's own thread ends on a full disk, and whoever waits for it then waits for ever. The pipe is always read, so the library sees no error;
-    the first one is kept for `check`.
+    On a full disk, Rerun's own thread ends, and a call that waits for the thread hangs. This class always reads the pipe, so that the library
+    sees no error, and keeps the first error of writing for `check`.
     """
 
     def __init__(self, path: Path, begin: Callable[[str], object]) -> None:
@@ -63,7 +63,7 @@ class PipedFile:
 
         Args:
             path: the file.
-            begin: opens a path for writing, that of the pipe.
+            begin: opens the pipe for writing; its argument is the path.
 
         Raises:
             OSError: the file or the pipe cannot be created.
@@ -84,10 +84,10 @@ class PipedFile:
         self._thread.start()
 
     def check(self) -> None:
-        """Raise the first error of writing.
+        """Raise the first error of writing, if any.
 
         Raises:
-            OSError: there was one.
+            OSError: the file could not be written.
         """
         if self._error is not None:
             raise self._error
@@ -110,7 +110,7 @@ class PipedFile:
                         self._write(block)
                     except OSError as error:
                         self._error = error
-                        with suppress(OSError):  # it is removed anyway
+                        with suppress(OSError):  # the file is removed anyway
                             self._file.truncate(0)
 
     def _write(self, block: bytes) -> None:
@@ -130,7 +130,7 @@ class RerunWriter:
         self._rr: Any = import_extra("rerun", "rerun")
         self._reader = reader
         self._drawn: dict[str, set[int]] = {panel.name: set() for panel in reader.panels}
-        batches = self._rr.ChunkBatcherConfig(flush_tick=timedelta(days=1))  # frames, not seconds, say when
+        batches = self._rr.ChunkBatcherConfig(flush_tick=timedelta(days=1))  # batches end by frames, not by time
         self._waiting = 0
         self._recording = self._rr.RecordingStream("carlasc", recording_id=uuid4(), batcher_config=batches)
         self._recording.set_log_time_enabled(False)
@@ -186,7 +186,7 @@ class RerunWriter:
         self._waiting = 0
 
     def _write_static(self) -> None:
-        """Write what is the same in all frames."""
+        """Write the entities that are the same in all frames."""
         rr, reader = self._rr, self._reader
 
         def log(entity: str, *content: Any) -> None:
@@ -202,7 +202,7 @@ class RerunWriter:
             log("world/path", rr.LineStrips3D([path], colors=[palette.PATH], radii=[_TRAIL_RADIUS_M]))
 
     def _write_grid(self, panel: GridPanel, grid: Grid) -> None:
-        """Write the voxels of each class, and remove those of classes that the frame before had."""
+        """Write the voxels of each class, and clear classes that only the previous frame had."""
         rr, colors = self._rr, panel.colors.by_id
         if grid.spec.coordinates == "cylindrical":
             drawn = {label: self._mesh(surface, albedo_factor=colors[label]) for label, surface in class_surfaces(grid)}
@@ -237,7 +237,7 @@ class RerunWriter:
         self._recording.log("world/ego/boxes", content)
 
     def _write_photo(self, photo: Photo) -> None:
-        """Write the image of a camera, and where the camera was; distortion is left out, as Rerun has no model of it."""
+        """Write the image and the pose of a camera; distortion is left out, because Rerun has no model of it."""
         rr, camera, place = self._rr, photo.camera, photo.ego_T_camera
         name = f"world/ego/cameras/{rr.escape_entity_path_part(camera.name)}"
         lens = rr.Pinhole(
@@ -260,7 +260,7 @@ class RerunWriter:
         return self._rr.AnnotationContext([unlabelled, *((entry.order, entry.name, entry.color) for entry in entries)])
 
     def _blueprint(self) -> Any:
-        """Return what is open at the beginning: the grids side by side, the points and the picture beside or below them."""
+        """Return the views at the start: the grids side by side, the points and the picture beside or below them."""
         blueprint, reader = self._rr.blueprint, self._reader
         names = [panel.name for panel in reader.panels]
         grids = [

@@ -1,4 +1,4 @@
-"""Boxes around actors: the annotated ones of a frame, or the tightest ones around the points of each actor; and how they are drawn."""
+"""Boxes around actors: the annotated boxes of a frame, or the tightest boxes around the points of actors; and their drawings."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ BOX = Entry("box, with a bar to its front", palette.ARROW, AFTER_CLASSES + 10)
 """The entry of a legend for boxes."""
 
 _BAR_M = 0.08  # width of the edges of a box
-_MIN_SPEED_M_S = 0.5  # slower actors may move by the noise of their points alone
+_MIN_SPEED_M_S = 0.5  # a slower motion may be noise of the points
 _LEAST_SIZE_M = 0.1
 _FEWEST_POINTS = 5
-_CLOSE_M = 0.05  # nearer points count as being on the side
+_CLOSE_M = 0.05  # nearer points count as on the side
 _ANGLES = np.deg2rad(np.arange(0, 90, 2.0))
 
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -62,8 +62,8 @@ def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
 def tight_boxes(scan: Scan) -> Boxes:
     """Return the tightest upright box around the points of each numbered actor that has at least five.
 
-    A box points to where its actor moves. One that does not move points along the longer side of the rectangle to whose sides its
-    points are closest, to either of its two ends.
+    A box points in the direction of motion of its actor. The box of a static actor points along the longer side of the rectangle whose sides
+    are closest to the points, to one of its two ends.
 
     Args:
         scan: with instances; with flow, boxes of moving actors have the right direction.
@@ -142,7 +142,7 @@ def box_edges(boxes: Boxes) -> QuadMesh:
 
 
 def _direction(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
-    """Return the yaw of an actor, in radians: that of its velocity, or of the rectangle to whose sides its points are closest.
+    """Return the yaw of an actor, in radians: that of its velocity, or of the rectangle whose sides are closest to its points.
 
     A LiDAR sees one or two sides of a vehicle. The smallest rectangle around them is often tilted; the closest one is not (Zhang, Xu, Dong
     and Dolan, "Efficient L-shape fitting for vehicle detection using laser scanners", 2017).

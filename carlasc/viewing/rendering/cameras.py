@@ -1,8 +1,8 @@
-"""Cameras: where a picture is taken from.
+"""Cameras: the viewpoints of pictures.
 
 All coordinates are in the frame of the data. Only the camera depends on the handedness of that frame: in CarlaSC's left-handed frame
-(y right) the camera's right is `up x forward`, in a right-handed one (y left) it is `forward x up`. What is on the vehicle's left is on
-the left of the picture in both, and no geometry is mirrored.
+(y right) the camera's right is `up x forward`, in a right-handed one (y left) it is `forward x up`. In both, the left of the vehicle is on
+the left of the picture, and no geometry is mirrored.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NEAREST_M = 1.0
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """From where a perspective view is taken. What is None is chosen so that the whole drawing is in the picture.
+    """The viewpoint of a perspective view. Values that are None are chosen so that the whole drawing is in the picture.
 
     Attributes:
         azimuth_rad: direction from the target to the camera: 0 is behind the ego vehicle, positive is towards its right.
@@ -111,13 +111,13 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """From where the pictures of a scene are taken. Without `still`, the camera follows the ego vehicle.
+    """The camera of the pictures of a scene. Without `still`, the camera moves with the ego vehicle.
 
     Attributes:
         view: "perspective", "bev" (bird's-eye view) or "both", side by side.
         viewpoint: where perspective views are taken from; the default is a point behind and above the ego vehicle.
         orbit: whether the camera circles the scene once: while the frames follow each other, or around a single frame.
-        still: whether the camera stays in one place of the world while the vehicle drives; needs poses.
+        still: whether the camera stays at one place in the world; needs poses.
 
     Raises:
         ArgumentError: an unknown view.
@@ -165,7 +165,7 @@ class Camera:
         return origins, directions
 
     def project(self, points: ArrayLike, width: int, height: int) -> tuple[Floats, Floats, Floats]:
-        """Return pixel column, row and depth of (N, 3) points; a pinhole camera sees only points with a depth above 0."""
+        """Return pixel column, row and depth of (N, 3) points; a pinhole camera shows only points with a depth above 0."""
         x, y, depth = self.axes @ (np.asarray(points, np.float64) - self.position).T
         scale = height / (2 * self.half_height)
         with np.errstate(divide="ignore", invalid="ignore"):  # points with depth 0
@@ -186,7 +186,7 @@ class Camera:
 def perspective_camera(
     extent: Floats, viewpoint: Viewpoint, aspect: float, *, axes: Axes = "left", margin: float = 0.02
 ) -> Camera:
-    """Return the camera of a viewpoint; what the viewpoint leaves open is fitted to the extent.
+    """Return the camera of a viewpoint; values that are not given are fitted to the extent.
 
     Args:
         extent: (N, 3) points that should be in the picture, metres.

@@ -1,4 +1,4 @@
-"""What a picture is made of: a grid in the colours of its classes or of its evidence, a scan, scene flow or the errors of a prediction."""
+"""Drawings, the parts of a picture: a grid in the colours of its classes or of its evidence, a scan, scene flow or the errors of a prediction."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _PARTS |= {"actor": "instance", "seen": "seen"}
 _KEPT_BY = {"actor": "actors", "seen": "seen"}  # options of regrid
 _SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # upper bounds of the classes of probabilities, except for the last one
 _POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
-VELOCITY = Entry("velocity (way of 1 s)", palette.ARROW, AFTER_CLASSES)
+VELOCITY = Entry("velocity (distance in 1 s)", palette.ARROW, AFTER_CLASSES)
 _ORIGINS = (
     Entry("seen in this frame", (0, 114, 178), 0),
     Entry("seen in other frames", (190, 196, 204), 1),
-    Entry("contested: traffic passes here at other times", (204, 121, 167), 2),
+    Entry("contested: traffic passes at other times", (204, 121, 167), 2),
     Entry("inferred: no scan saw it", (230, 110, 0), 3),
 )
 _SEEN = (
@@ -59,7 +59,7 @@ class Drawing:
         points: (N, 3) metres, or None.
         point_colors: (N, 3) uint8 RGB of the points, or None.
         legend: the meaning of the colours.
-        note: a line to write into the picture, such as that the grid is empty; or None.
+        note: a line of text in the picture, for example if the grid is empty; or None.
     """
 
     extent: Extent
@@ -73,7 +73,7 @@ class Drawing:
         """Return the picture, (H, W, 3) uint8, without legend or title.
 
         Args:
-            camera: where it is taken from.
+            camera: the camera.
             width: W, pixels.
             height: H, pixels.
             axes: handedness of the data.
@@ -128,7 +128,7 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
 
 
 def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing:
-    """Return the voxels where a prediction is right, wrong, missed or invented, where the truth is known.
+    """Return the errors of a prediction, in voxels that the ground truth knows: right, wrong class, missed or invented.
 
     Args:
         prediction: the predicted grid.
@@ -206,7 +206,7 @@ def flow_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
 
 
 def with_arrows(drawing: Drawing, moving: Scan | None) -> Drawing:
-    """Return a drawing with the arrows of what moves, points or middles of voxels with flow; None for nothing."""
+    """Return a drawing with the arrows of moving points or voxels; None if nothing moves."""
     if moving is None or not len((ends := motion_arrows(moving))[0]):
         return drawing
     mesh = arrows(*ends, palette.ARROW, 0.24)
@@ -252,7 +252,7 @@ def voxel_drawing(
     empty: str,
     ego: bool,
 ) -> Drawing:
-    """Return voxels on the floor of their grid.
+    """Return voxels above the floor of their grid.
 
     Args:
         spec: geometry of the grid.
@@ -279,7 +279,7 @@ def ego_vehicle() -> QuadMesh:
 
 
 def check_color(color: GridColor, reader: SceneReader) -> None:
-    """Check that the grid of each frame has what its colours are taken from.
+    """Check that the grid of each frame has the field of its colours.
 
     Raises:
         ArgumentError: an unknown colour, or no grid is shown.
@@ -350,7 +350,7 @@ def evidence_legend(color: GridColor) -> list[Entry]:
 
 
 def _classify(values: NDArray[Any], color: GridColor) -> tuple[NDArray[np.int64], list[Entry]]:
-    """Return which entry of the legend each voxel belongs to, and the legend."""
+    """Return the entry of the legend for each voxel, and the legend."""
     legend = evidence_legend(color)
     if color == "inferred":
         seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)

@@ -1,4 +1,4 @@
-"""Writing pictures as PNG, GIF, MP4 and WebP (the last two with the encoder that imageio-ffmpeg includes). A file is written whole or not at all."""
+"""Writing pictures as PNG, GIF, MP4 and WebP (the last two with the encoder that imageio-ffmpeg includes). A file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float
         path: a file name that ends in .png, or in one of `FILMS`.
         pictures: (H, W, 3) uint8, all of one size (see `encodable_size`); at least one.
         fps: pictures per second, above 0.
-        dpi: pixels per inch that a PNG says it has; None says nothing. Films say nothing.
+        dpi: pixels per inch in the metadata of a PNG; None for none. Not used for films.
 
     Raises:
         ArgumentError: an impossible `fps`.
@@ -68,7 +68,7 @@ def _write_gif(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float
 
 
 def _to_palette(picture: NDArray[np.uint8]) -> Any:
-    """Return a picture in 256 colours. Rare colours weigh more than their frequency, so that small things keep their colour."""
+    """Return a picture in 256 colours. Rare colours have a weight above their frequency, so that small objects keep their colour."""
     module = import_extra("PIL.Image", "render")
     packed = picture.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     colors, counts = np.unique(packed, return_counts=True)
@@ -92,7 +92,7 @@ def _encode(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, s
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=messages,
-            start_new_session=True,  # Ctrl-C ends this process, which then ends the encoder
+            start_new_session=True,  # Ctrl-C must not reach the encoder: this process ends it
         )
         try:
             _feed(process, picture, pictures)

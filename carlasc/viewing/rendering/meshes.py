@@ -28,7 +28,7 @@ class QuadMesh:
         colors: (Q, 3) uint8 RGB.
         openness: (Q, 4) float32, 0 to 1: share of the sky that the adjacent voxels leave free at each corner.
         edges: (Q, 4) bool: whether the edge from corner i to i + 1 is drawn.
-        open_sky: (Q,) bool: whether the face counts as seeing the whole sky, because it is too large for a single value.
+        open_sky: (Q,) bool: whether the whole sky is assumed visible, because the face is too large for a single value.
     """
 
     corners: NDArray[np.float32]
@@ -79,7 +79,7 @@ def grid_mesh(
         spec: geometry of the grid.
         colors: (X, Y, Z, 3) uint8 RGB of each cell.
         occupied: (X, Y, Z) bool.
-        on_floor: whether the grid stands on a floor, which hides the lowest faces of the lowest cells: they are left out.
+        on_floor: whether a floor below the grid hides the lowest faces of the lowest cells, which are then left out.
     """
     whole = spec
     spec, occupied = split_arcs(whole, occupied)
@@ -91,7 +91,7 @@ def grid_mesh(
 
 
 def split_arcs(spec: GridSpec, values: NDArray[_Value]) -> tuple[GridSpec, NDArray[_Value]]:
-    """Return a grid whose wide cylindrical cells are divided into narrow ones, which are drawn flat; other grids as they are.
+    """Return a grid with wide cylindrical cells divided into narrow ones, which are drawn flat; other grids are not changed.
 
     Args:
         spec: geometry.

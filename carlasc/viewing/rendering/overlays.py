@@ -20,7 +20,7 @@ from carlasc.viewing.rendering.render import RenderResult
 from carlasc.viewing.scene import Scene, SceneReader, as_scene
 from carlasc.viewing.targets import check_target
 
-_EDGE = 0.75  # brightness of a voxel where its neighbour in the picture is another one
+_EDGE = 0.75  # brightness of a voxel at its edges in the picture
 
 
 def overlay(
@@ -32,7 +32,7 @@ def overlay(
     fps: float | None = None,
     overwrite: bool = False,
 ) -> RenderResult:
-    """Draw the voxels of a grid over the images of a camera: those that are hidden by others are left out.
+    """Draw the visible voxels of a grid over the images of a camera.
 
     Args:
         source: a `Scene`, or anything that a scene's `source` may be. Without `frames`, a picture shows the first one, a film all.
@@ -43,9 +43,9 @@ def overlay(
         overwrite: whether an existing file is replaced.
 
     Raises:
-        ArgumentError: an argument has no meaning, or the grid is cylindrical.
+        ArgumentError: an argument has a wrong value, or the grid is cylindrical.
         MissingDataError: the camera, its images or the grid do not exist.
-        FormatError: an image or the calibration is damaged, or they do not fit each other.
+        FormatError: an image or the calibration is damaged, or the two do not match.
         ConflictError: `out` exists.
     """
     started, scene = time.monotonic(), as_scene(source)
@@ -75,7 +75,8 @@ def _pictures(
     for frame in frames:
         place, grid = scan_T_camera(reader.data.sequence, camera, frame), reader.data.read_grid(frame)
         if place is None:
-            raise MissingDataError(f"{reader.path}: frame {frame}", expected=f"an image of {camera.name}", found="none")
+            where, advice = f"{reader.path}: frame {frame}", "choose other frames with `frames`"
+            raise MissingDataError(where, expected=f"an image of {camera.name}", found="none", advice=advice)
         picture, labels = read_image(reader.data.sequence, camera, frame), grid.labels.reshape(-1)
         found, _ = cast_rays(grid.labels[None], grid.spec, place[:3, 3], rotate_vectors(place, looks[looks_somewhere]))
         voxels = np.full(len(looks), -1, np.int64)

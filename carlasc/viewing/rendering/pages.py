@@ -1,7 +1,7 @@
 """The layout of a picture: panels, their titles and the legend, without overlaps and without clipping.
 
 The layout is computed first, so that every panel is rendered at its final size. Titles are above the panels; the legend is in a column
-to the right of square panels, and in rows below wide ones. Captions, where there are some instead of titles, are below the panels.
+to the right of square panels, and in rows below wide ones. Captions, which replace titles, are below the panels.
 The font is the one that Pillow includes.
 """
 
@@ -45,7 +45,7 @@ class Page:
         panels: rectangle of each panel.
         titles: rectangle of each panel's title or caption; empty if there are none.
         entry_boxes: rectangle of each entry of the legend: a swatch and a name.
-        entries: the legend. Entries for which there is no space are left out; the last entry then says how many.
+        entries: the legend. Entries without space are left out; the last entry then gives their number.
     """
 
     size: tuple[int, int]
@@ -75,7 +75,7 @@ def plan_page(
         titled: whether they have titles.
         legend: entries of the legend; empty for no legend.
         aspect: preferred width over height of a panel.
-        captions: a text for each panel, below it and in as many lines as needed; instead of titles. Empty for none.
+        captions: texts below the panels instead of titles, in as many lines as needed. Empty for none.
         columns: number of panels in a row; None takes the number with which panels are largest.
         font_size: pixels; None takes one by the size of the picture.
 
@@ -99,7 +99,7 @@ def plan_page(
         column, row = number % columns, number // columns
         left, right = (round(area.width * c / columns) for c in (column, column + 1))
         top, bottom = (round(area.height * r / rows) for r in (row, row + 1))
-        if captions:  # all panels have one size, so that what they show can be compared
+        if captions:  # all panels have the same size, so that their contents can be compared
             left, right = left + gap, left + max(gap + 1, area.width // columns - gap)
             bottom = top + area.height // rows
         else:
@@ -159,7 +159,7 @@ def draw_page(
 def _place_legend(
     size: tuple[int, int], font_size: int, entries: list[Entry], panels: int, aspect: float, wanted: int | None
 ) -> tuple[list[Entry], list[tuple[int, int]], Box]:
-    """Return the entries for which there is space, their positions, and the part of the page that is left for the panels."""
+    """Return the entries with space, their positions, and the rest of the page for the panels."""
     width, height = size
     page = Box(0, 0, width, height)
     if not entries:
@@ -223,7 +223,7 @@ def _place_below(
 
 
 def _tiling(width: int, height: int, panels: int, aspect: float, wanted: int | None) -> tuple[int, int]:
-    """Return the wanted columns and their rows; or those in which panels of an aspect are largest, and of equal ones the most columns."""
+    """Return the given number of columns and its rows; by default those with the largest panels, and among equal ones the most columns."""
 
     def scale(columns: int) -> float:
         rows = -(-panels // columns)
@@ -249,7 +249,7 @@ def entry_width(entry: Entry, font: Any, size: int) -> int:
 
 
 def shorten(text: str, font: Any, room: float) -> str:
-    """Return a text that fits into a width in pixels; what was left out is shown by three dots."""
+    """Return a text, shortened with three dots to fit into a width in pixels."""
     if font.getlength(text) <= room:
         return text
     while text and font.getlength(f"{text}...") > room:

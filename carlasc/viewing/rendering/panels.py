@@ -1,4 +1,4 @@
-"""The panels of a picture: what is shown of a frame, from where, and which frames of which scenes are beside each other."""
+"""The panels of a picture: the contents of a frame, the camera, and the order of frames and scenes."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ class FrameRenderer:
 
     Attributes:
         reader: reads the scene; its `contents` are drawn side by side.
-        camera: from where each of the contents is seen. A camera that circles the scene has one distance, at which it shows the scene
-            from every side.
-        extent: what pictures of scans show, the same in all frames.
+        camera: the camera for each of the contents. A camera that circles the scene has one distance, from which the whole scene is visible
+            from each side.
+        extent: the extent of pictures of scans, the same in all frames.
         ego: whether the ego vehicle is drawn.
         color: what the colours of the grid mean.
         boxes: whether boxes around actors are drawn.
-        fixed_view: for a camera that does not follow the vehicle: extent of what it shows, and `world_T_view`, the frame of that
-            extent; or None.
+        fixed_view: for a camera that does not follow the vehicle: the extent to show, and `world_T_view`, the frame of that extent; or
+            None.
     """
 
     reader: SceneReader
@@ -72,13 +72,13 @@ class FrameRenderer:
 
         Args:
             reader: reads the scene.
-            camera: from where each of the contents is seen.
+            camera: the camera for each of the contents.
             ego: whether the ego vehicle is drawn.
             color: what the colours of the grid mean.
             boxes: whether boxes around actors are drawn.
 
         Raises:
-            MissingDataError: the camera stands still, and the sequence has no poses.
+            MissingDataError: the camera stays in place, and the sequence has no poses.
         """
         extent = _scan_extent_in(reader)
         return cls(reader, camera, extent, ego, color, boxes, _view_of_drive(reader, extent) if camera.still else None)
@@ -137,7 +137,7 @@ class FrameRenderer:
         return self.reader.data if content == "grid" or truth is None else truth
 
     def _view_of(self, drawing: Drawing, view: View, frame: int) -> tuple[Extent, Transform] | None:
-        """Return what the camera shows and `drawing_T_view`, or None if the camera is fitted to the drawing."""
+        """Return the extent to show and `drawing_T_view`, or None if the camera is fitted to the drawing."""
         orbits = self.camera.orbit and view == "perspective"
         if self.fixed_view is None:
             return (_swept_extent(drawing.extent), np.eye(4)) if orbits else None
@@ -153,7 +153,7 @@ class FrameRenderer:
 
 
 def _scan_extent_in(reader: SceneReader) -> Extent:
-    """Return what pictures of scans show in all frames: the grid beside them, or most of the first scan."""
+    """Return the extent of pictures of scans in all frames: the grid beside them, or most of the first scan."""
     if {"grid", "errors"} & set(reader.contents):
         return grid_extent(reader.data.spec)
     if "truth" in reader.contents and reader.truth is not None:
@@ -162,14 +162,14 @@ def _scan_extent_in(reader: SceneReader) -> Extent:
 
 
 def _view_of_drive(reader: SceneReader, extent: Extent) -> tuple[Extent, Transform]:
-    """Return what a camera that does not follow the vehicle shows: a box around the extents of all frames.
+    """Return the extent for a camera that does not follow the vehicle: a box around the extents of all frames.
 
     Returns:
         (8, 3) corners of the box in the frame of the middle pose, and `world_T_middle`.
 
     Raises:
         MissingDataError: the sequence has no poses.
-        FormatError: one of them is none.
+        FormatError: a pose is not valid.
     """
     world_T_middle = _pose_of(reader, reader.frames[len(reader.frames) // 2])
     middle_T_world = np.linalg.inv(world_T_middle)
@@ -217,9 +217,9 @@ class PictureRenderer:
     """Draws pictures of cells.
 
     Attributes:
-        sheet: size and type.
+        sheet: size and font size.
         legend: entries of the legend, the same in all pictures; empty for no legend.
-        captions: a text for each panel, which is put below it; empty for the titles of the contents.
+        captions: texts below the panels; empty for titles of the contents.
         columns: number of panels in a row; None takes the number with which panels are largest.
     """
 
@@ -250,11 +250,11 @@ class PictureRenderer:
 
 
 def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell]]:
-    """Return the cells of each picture: of a film, one frame of every source; otherwise all frames of every source.
+    """Return the cells of each picture: one frame of each source for a film, otherwise all frames of each source.
 
     Raises:
-        ArgumentError: sources of different handedness, or more panels than a picture can have.
-        MissingDataError: the sources of a film have no frame in common.
+        ArgumentError: sources of different handedness, or too many panels.
+        MissingDataError: the sources of a film have no common frame.
     """
     axes = {renderer.reader.axes for renderer in renderers}
     if len(axes) > 1:
@@ -262,7 +262,8 @@ def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell
     if film:
         frames = [frame for frame in renderers[0].reader.frames if all(frame in r.reader.frames for r in renderers)]
         if not frames:
-            raise MissingDataError(renderers[0].reader.path, expected="frames that all sources have", found="none")
+            where, advice = renderers[0].reader.path, "choose others with `frames`"
+            raise MissingDataError(where, expected="frames that all sources have", found="none", advice=advice)
         pictures = [[Cell(renderer, frame) for renderer in renderers] for frame in frames]
     else:
         pictures = [[Cell(renderer, frame) for renderer in renderers for frame in renderer.reader.frames]]
@@ -285,9 +286,9 @@ def caption_panels(cells: Sequence[Cell], texts: Sequence[str], film: bool) -> t
     """Return the captions of all panels: a letter in brackets, and a text.
 
     Args:
-        cells: what is drawn.
-        texts: one for each panel; empty takes what differs between the panels: sequence, grid, frame, content and view.
-        film: whether the frames follow each other in a film, so that they are not named.
+        cells: the cells of the panels.
+        texts: one for each panel; empty takes the differences between the panels: sequence, grid, frame, content and view.
+        film: whether the frames are those of a film, which are not named.
 
     Raises:
         ArgumentError: another number of texts than of panels.

@@ -36,11 +36,10 @@ class Panel:
     """A drawing seen from a view: one part of a picture.
 
     Attributes:
-        drawing: what is drawn.
+        drawing: the drawing.
         view: "perspective" or "bev" (bird's-eye view).
         title: line above the panel, or its caption; "" for none.
-        fixed_view: for a camera that is not fitted to the drawing: extent of what it shows, and `drawing_T_view`, the frame of
-            that extent.
+        fixed_view: for a camera that is not fitted to the drawing: the extent to show, and `drawing_T_view`, the frame of that extent.
     """
 
     drawing: Drawing
@@ -63,7 +62,7 @@ def draw_panels(
     """Draw panels side by side.
 
     Args:
-        panels: what is drawn.
+        panels: the panels.
         viewpoint: where perspective views are taken from; None takes a point behind and above the ego vehicle.
         size: (width, height) of the whole picture, pixels.
         legend: whether there is a legend; or its entries, so that all pictures of a film have the same legend.
@@ -200,7 +199,7 @@ def render_comparison(
     axes: Axes = "left",
     ego: bool = True,
 ) -> NDArray[np.uint8]:
-    """Draw a prediction beside the ground truth and, with `errors`, where it is right, wrong, missed or invented.
+    """Draw a prediction beside the ground truth and, with `errors`, its errors: right, wrong class, missed or invented.
 
     Args:
         prediction: a grid with the geometry of the truth.

@@ -1,8 +1,8 @@
-"""Which face of a mesh each sample of a picture shows, by filling triangles into a depth buffer.
+"""Rasterizing: the visible face of a mesh at each sample of a picture, by filling triangles into a depth buffer.
 
-The result is that of a ray through every sample, at a fraction of its cost. The triangle (A, B, C), relative to the camera, is hit by the
-ray d where d = a A + b B + c C with a, b and c of one sign: that also holds for triangles that reach behind the camera. Two triangles that
-share an edge compute the same number for it with opposite signs, so no sample falls between them.
+The result equals that of a ray through each sample, at a fraction of its cost. The ray d hits the triangle (A, B, C), relative to the
+camera, if d = a A + b B + c C with a, b and c of one sign, also for triangles that reach behind the camera. Two triangles that share an
+edge compute the same number for it with opposite signs, so that no sample is between them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import QuadMesh
 
 _Floats = NDArray[np.float32]
-_NEAR_M = 1e-3  # a pinhole camera sees nothing nearer
+_NEAR_M = 1e-3  # a pinhole camera shows nothing nearer
 
 
 def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -> NDArray[np.int32]:
@@ -36,7 +36,7 @@ def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -
     x, y = (np.arange(width) + 0.5 - width / 2) * step, (height / 2 - np.arange(height) - 0.5) * step
     if (
         camera.orthographic
-    ):  # seen from above, whole rows of samples are on edges of voxels: their rays start at float32 numbers
+    ):  # seen from above, whole rows of samples are on edges of voxels: their rays begin at float32 numbers
         x, y = (
             ((camera.position + offsets[:, None] * axis).astype(np.float32) - camera.position) @ axis
             for offsets, axis in ((x, camera.axes[0]), (y, camera.axes[1]))
@@ -125,8 +125,8 @@ def _cross(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
 def hits(corners: _Floats, triangle: NDArray[np.int32], origins: _Floats, directions: _Floats) -> _Floats:
     """Return where rays hit given triangles, (3, n): the weights u and v of the second and third corner, and the depth.
 
-    These are the steps that Embree takes in single precision: Pluecker coordinates with fused products. What depends on the triangle
-    and the origin alone is kept for the next ray.
+    The steps are those of Embree in single precision: Pluecker coordinates with fused products. Values that depend only on the triangle
+    and the origin are kept for the next ray.
 
     Args:
         corners: (Q, 4, 3), metres.

@@ -1,8 +1,7 @@
-"""Pictures of meshes and points, with light from rays that Embree casts on the CPU: no screen and no GPU are needed.
+"""Pictures of meshes and points, with light from rays that Embree casts on the CPU: neither a screen nor a GPU is needed.
 
-Light comes from a sun with soft shadows and from the sky: each face receives the share of the sky that a few rays from the face find
-free. Voxels have thin edges, which fade where a voxel is only a few pixels wide. Points
-are small balls: nearer ones hide farther ones, and points behind others are darker.
+Light comes from a sun with soft shadows and from the sky: a few rays per face measure the visible share of the sky. Voxels have thin edges,
+which fade if a voxel is only a few pixels wide. Points are small balls: nearer ones hide farther ones, and points behind others are darker.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from carlasc.viewing.rendering.rasterizing import hits, visible_triangles
 BACKGROUND = 255
 SAMPLES = 2  # per pixel and direction
 _SKY_RAYS = 12
-_SKY_RANGE_M = 6.0  # farther faces do not hide the sky
+_SKY_RANGE_M = 6.0  # only nearer faces hide the sky
 _TO_SUN = np.array([-0.42, -0.62, 1.0])  # the sun is behind the vehicle, on its left
 _AMBIENT = 0.6
 _SUN = (1 - _AMBIENT) * float(np.linalg.norm(_TO_SUN))  # so that a level face in the sun has exactly its own colour
@@ -65,9 +64,9 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
     """Draw a mesh onto a canvas, with light and shadows.
 
     Args:
-        mesh: what is drawn.
-        camera: from where it is seen.
-        canvas: is drawn onto, where the mesh is nearer than what the canvas already shows.
+        mesh: the mesh.
+        camera: the camera.
+        canvas: the canvas; it changes where the mesh is nearer than its present content.
         axes: handedness of the data: "left" or "right"; the sun is behind the vehicle on its left in both cases.
 
     Raises:
@@ -88,7 +87,7 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
         origins, directions = camera.rays(width, height, rows)
         triangle = seen[rows].reshape(-1)
         u, v, depth = hits(mesh.corners, triangle, origins, directions)
-        # Each sample of a pixel uses another point of the sun's disc, which gives soft shadows without further rays.
+        # Each sample of a pixel uses another point of the sun's disc, which gives soft shadows without more rays.
         columns = np.arange(width) % SAMPLES
         which = (columns[None, :] * SAMPLES + (np.arange(rows.start, rows.stop) % SAMPLES)[:, None]).reshape(-1)
         facing = np.empty(len(triangle), np.int64)
@@ -127,7 +126,7 @@ def _suns(axes: Axes) -> NDArray[np.float32]:
 
 
 def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
-    """Return (Q,) the share of the sky that each face sees, by rays from its middle, distributed about its normal by the cosine law."""
+    """Return (Q,) visible share of the sky of each face, by rays from its middle with a cosine distribution about its normal."""
     number = np.arange(_SKY_RAYS) + 0.5
     radius, angle = np.sqrt(number / _SKY_RAYS), number * (np.pi * (3 - np.sqrt(5)))
     local = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - number / _SKY_RAYS)])
@@ -182,7 +181,7 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     out,
     out_depth,
 ):
-    """Compute the light of every sample that a ray hit, and write it where it is nearer than what the canvas shows."""
+    """Compute the light of each sample that a ray hit, and write it where it is nearer than the content of the canvas."""
     for i in range(len(triangle)):
         if triangle[i] < 0 or depth[i] >= out_depth[i]:
             continue
@@ -235,8 +234,8 @@ def splat(
     Args:
         points: (N, 3) metres.
         colors: (N, 3) uint8 RGB.
-        camera: from where they are seen.
-        canvas: is drawn onto; what it shows hides points that are farther.
+        camera: the camera.
+        canvas: the canvas; its content hides points that are farther.
         radius_m: radius of a ball.
     """
     height, width = canvas.depth.shape

@@ -39,24 +39,24 @@ from carlasc.viewing.targets import check_target
 ORBIT_PICTURES = 120  # of an orbit around a single frame
 _DRIVE_FPS, _ORBIT_FPS = 10.0, 20.0  # frames are 0.1 s apart, so that a film runs at the speed of the drive
 
-_ONE = (Scene, str, os.PathLike, Source, StoredSequence)  # what is one source; anything else is a list of them
+_ONE = (Scene, str, os.PathLike, Source, StoredSequence)  # one source; anything else is a list of sources
 
 
 @dataclass(frozen=True)
 class RenderResult:
-    """What was drawn.
+    """The result of `render`.
 
     Attributes:
         out: the file.
-        sequence: path of the sequence; of several, separated by commas.
-        what: what is shown, side by side.
-        frames: the frames that are shown.
+        sequence: path of the sequence; several are separated by commas.
+        what: the contents, side by side.
+        frames: the shown frames.
         pictures: number of pictures in the file.
         size: (width, height) pixels.
         classes: name of the class table.
-        elapsed_s: how long it took, seconds.
-        notes: what was chosen where the scene left a choice, and which parts of a picture are empty.
-        legend: the file of the legend if it is apart, or None.
+        elapsed_s: duration, seconds.
+        notes: choices that were made for options that were not given, and empty parts of a picture.
+        legend: the file of the legend if it is a separate file, or None.
     """
 
     out: Path
@@ -84,10 +84,10 @@ def render(
     overwrite: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> RenderResult:
-    """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP). No screen and no GPU are needed.
+    """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP). Neither a screen nor a GPU is needed.
 
-    A list of scenes is drawn as panels of one size, from the same camera, with captions: a PNG has a panel for each frame of each
-    scene, a film one for each scene.
+    A list of scenes is drawn as panels of one size, from the same camera, with captions. A PNG has a panel per frame of each scene, a
+    film has a panel per scene.
 
     Args:
         source: a `Scene`; or anything that a scene's `source` may be; or a list of these.
@@ -96,22 +96,22 @@ def render(
         what: grid, scan, flow, truth, errors: several names, separated by commas, are drawn side by side. None draws the grid,
             with a ground truth also the truth and the errors; or the scan if there is no grid.
         color: what the colours of the grid mean: "class"; or "confidence" (the probability that a voxel is occupied), "views" (the
-            scans that saw it), "votes", "inferred" (where the knowledge comes from): see `docs/format.md#evidence`; "actor" (who is in it) or "seen" (by how
-            many cameras).
-        boxes: whether boxes around actors are drawn: those of the field `boxes`, or else the tightest ones around the points of each
+            scans that saw it), "votes", "inferred" (seen or inferred): see `docs/format.md#evidence`; "actor" (the number of its actor) or
+            "seen" (by how many cameras).
+        boxes: whether boxes around actors are drawn: those of the field `boxes`, otherwise the tightest ones around the points of each
             actor of `instances`.
-        camera: from where the scene is seen. By default the camera follows the ego vehicle, behind and above it, because grids and
+        camera: the camera. By default the camera follows the ego vehicle, behind and above it, because grids and
             scans are in the frame of its sensor.
-        style: size, legend, captions and type; for a screen or for a paper.
+        style: size, legend, captions and size of text, for a screen or for a paper.
         fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit around one frame).
         overwrite: whether an existing file is replaced.
-        run: how the pictures are spread over processes, and who is told of the progress.
+        run: how the pictures are spread over processes, with a callback for progress.
 
     Returns:
-        What was drawn, and the file that it is in.
+        The file, and its contents.
 
     Raises:
-        ArgumentError: an argument has no meaning, or arguments contradict each other.
+        ArgumentError: an argument has a wrong value, or arguments contradict each other.
         MissingDataError: a sequence, grid, field or frame does not exist.
         FormatError: the data do not have the format.
         ConflictError: `out` exists.
@@ -173,7 +173,7 @@ def render(
 def _open_scenes(
     scenes: Sequence[Scene], what: str | None, out: str | os.PathLike[str] | None, *, orbit: bool, together: bool
 ) -> tuple[list[SceneReader], bool]:
-    """Return readers of the frames that are drawn, and whether a film is made of them."""
+    """Return readers of the frames to draw, and whether they become a film."""
     readers = [scene.open(what) for scene in scenes]
     several = any(scene.frames is not None and len(r.frames) > 1 for scene, r in zip(scenes, readers, strict=True))
     film = is_film(Path(out)) if out is not None else orbit or (several and not together)
@@ -186,7 +186,7 @@ def _open_scenes(
 
 
 def _check_kind(target: Path, alone: SceneReader | None, style: StyleOptions, *, film: bool, orbit: bool) -> None:
-    """Raise ArgumentError if a still picture cannot hold what is asked for, or a film has the style of paper.
+    """Raise ArgumentError if several frames are given for one still picture, or the style of paper for a film.
 
     `alone` is the reader if each of its frames is a picture of its own, or None.
     """
@@ -202,7 +202,7 @@ def _check_kind(target: Path, alone: SceneReader | None, style: StyleOptions, *,
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """One picture: what is drawn, and from where."""
+    """One picture: its contents and its camera."""
 
     drawer: PictureRenderer
     cells: list[Cell]
@@ -213,7 +213,7 @@ class _Shot:
 
 
 def _plan_shots(drawer: PictureRenderer, pictures: list[list[Cell]], camera: CameraOptions) -> list[_Shot]:
-    """Return which frames are seen from where in each picture."""
+    """Return the frames and the viewpoint of each picture."""
     if not camera.orbit:
         return [_Shot(drawer, cells, camera.viewpoint) for cells in pictures]
     if len(pictures) == 1:
@@ -232,7 +232,7 @@ def _reported(
 
 
 def _name_after(reader: SceneReader, film: bool) -> Path:
-    """Return a file name made of the sequence, of what is shown and of the frames."""
+    """Return a file name from the sequence, the contents and the frames."""
     first, last = reader.frames[0], reader.frames[-1]
     what = "" if reader.contents == ("grid",) else f"_{'_'.join(reader.contents)}"
     numbers = f"{first:06d}" if first == last else f"{first:06d}-{last:06d}"
@@ -240,7 +240,7 @@ def _name_after(reader: SceneReader, film: bool) -> Path:
 
 
 def _notes_of(readers: Sequence[SceneReader], pictures: list[list[Cell]]) -> dict[str, None]:
-    """Return what readers chose and, for a single picture, which parts are empty; each note once, in order."""
+    """Return the notes of the readers and, for a single picture, notes on empty parts; each note once, in order."""
     notes = [note for reader in readers for note in reader.notes]
     for cell in pictures[0] if len(pictures) == 1 else []:
         drawings = ((content, cell.renderer.draw(content, cell.frame)) for content in cell.renderer.reader.contents)

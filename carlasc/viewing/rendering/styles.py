@@ -1,4 +1,4 @@
-"""The style of a picture: for a screen, or for a paper, where lengths are centimetres and the legend is a file of its own."""
+"""The style of a picture: for a screen, or for a paper, with lengths in centimetres and the legend in a separate file."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ class StyleOptions:
     """How a picture looks.
 
     Attributes:
-        name: "screen"; or "paper": PNG with 300 pixels per inch, type of 8 points, and the legend in a file of its own,
+        name: "screen"; or "paper": PNG with 300 pixels per inch, text of 8 points, and the legend in a separate file,
             `<name>.legend.png`.
         size: (width, height) of the picture in pixels; or a text such as "1280x720" (pixels), "8.8cm x 5cm", "88mm x 50mm" or
             "3.5in x 2in". None takes 1280 x 720 pixels, or 8.8 x 5 cm on paper.
-        dpi: pixels per inch, which a PNG says in its metadata. None takes 300 on paper and for a size with a unit.
-        captions: for a list of scenes: a text for each panel, after its letter. Empty names what differs between the panels.
-        columns: for a list of scenes: number of panels in a row. None takes the frames of one scene, or what fits best.
+        dpi: pixels per inch in the metadata of a PNG. None takes 300 on paper and for a size with a unit.
+        captions: for a list of scenes: a text for each panel, after its letter. Empty names the differences between the panels.
+        columns: for a list of scenes: number of panels in a row. None takes the number of frames of one scene, or the best fit.
         legend: whether the picture has a legend.
         ego: whether a plain car is drawn at the sensor.
 
     Raises:
-        ArgumentError: an unknown style, a size that is none or that no picture can have, an impossible `dpi` or number of columns.
+        ArgumentError: an unknown style, or an impossible size, `dpi` or number of columns.
     """
 
     name: StyleName = "screen"
@@ -58,7 +58,7 @@ class StyleOptions:
 
     @property
     def sheet(self) -> Sheet:
-        """What a picture in this style is drawn on."""
+        """The sheet of a picture in this style."""
         paper, dpi = self.name == "paper", self.dpi
         size = (_PAPER_SIZE if paper else _SCREEN_SIZE) if self.size is None else self.size
         if isinstance(size, str):
@@ -75,13 +75,13 @@ class StyleOptions:
 
 @dataclass(frozen=True)
 class Sheet:
-    """What a picture is drawn on.
+    """The sheet that a picture is drawn on.
 
     Attributes:
         size: (width, height), pixels.
-        dpi: pixels per inch, which a PNG says in its metadata; None says nothing.
+        dpi: pixels per inch in the metadata of a PNG; None for none.
         font_size: pixels; None takes one by the size of the picture.
-        legend_apart: whether the legend is a file of its own, next to the picture.
+        legend_apart: whether the legend is a separate file, next to the picture.
     """
 
     size: tuple[int, int]
@@ -110,7 +110,7 @@ def _read_lengths(text: str) -> tuple[tuple[float, float], bool]:
     pairs = [(float(match[1]), match[2]) for match in found if match is not None]
     if len(pairs) == 2:
         (width, first), (height, second) = pairs
-        first = first or second  # 8.8x5cm means both
+        first = first or second  # in 8.8x5cm, both are centimetres
         if first == second == "":
             if width.is_integer() and height.is_integer():
                 return (width, height), False

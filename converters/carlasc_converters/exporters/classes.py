@@ -17,7 +17,7 @@ _NONE = -2
 
 
 class Kind(NamedTuple):
-    """What a kind of object is in other data sets.
+    """The classes of a kind of object in other data sets.
 
     Attributes:
         occ3d: class of Occ3D; OpenOccupancy's are the same.
@@ -30,7 +30,7 @@ class Kind(NamedTuple):
     category: int
 
 
-_KINDS = {  # vehicles as CarlaOcc publishes them for CARLA's tags, where it has them
+_KINDS = {  # vehicles as in CarlaOcc, for CARLA's tags, if it has them
     "bicycle": Kind(2, 11, 3),
     "motorcycle": Kind(6, 15, 14),
     "truck": Kind(10, 18, 25),
@@ -84,17 +84,17 @@ KINDS: Mapping[str, Mapping[str, Kind]] = MappingProxyType(
         for table, kinds in _TABLES.items()
     }
 )
-"""Name of a class table -> name of a class -> what it is in other data sets.
+"""Name of a class table -> name of a class -> its kind in other data sets.
 
-These are classes that other data sets tell apart and CarlaSC does not, above all kinds of vehicles. CarlaSC has one class for vehicles, so a map
-by way of its classes makes cars of buses and bicycles. Tables of converters whose classes say more keep that.
+Other data sets have more classes than CarlaSC, above all for vehicles. CarlaSC has one class for vehicles, so that a map through its classes
+would turn buses and bicycles into cars. With these entries, the more detailed classes of converters are kept.
 """
 
 
 def mapping_of(
     maps: Mapping[str, Mapping[int, int]], kind: Literal["occ3d", "raw", "category"], table: ClassTable, where: str
 ) -> dict[int, int]:
-    """Return the map from the ids of a class table: its own if there is one, otherwise the one by way of CarlaSC's classes.
+    """Return the map from the ids of a class table: its own map if it exists, otherwise a map through CarlaSC's classes.
 
     In the second case, classes that CarlaSC does not have are mapped by their kind.
 
@@ -105,7 +105,7 @@ def mapping_of(
         where: the sequence, for errors.
 
     Raises:
-        FormatError: nothing maps the table.
+        FormatError: no map of the table exists.
     """
     if table.name in maps:
         return dict(maps[table.name])

@@ -1,4 +1,4 @@
-"""What exporters of voxel grids share: the grid that is taken, its classes, its axes and its voxels."""
+"""The common part of exporters of voxel grids: the choice of the grid, its classes, its axes and its voxels."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_
 
 GridName = Annotated[
     str | None,
-    "Grid that is exported. Default: the one with exactly the voxels of the other data set, else the one of the smallest voxels.",
+    "Grid to export. Default: the grid with exactly the voxels of the other data set, otherwise the grid with the smallest voxels.",
 ]
-Predictions = Annotated[bool, "The grids are the output of a network, without counts: all of their voxels are known."]
-_MOSTLY = 0.5  # of the occupied voxels: a share above which structure has no class of its own
+Predictions = Annotated[bool, "The grids are predictions without counts: all of their voxels are known."]
+_MOSTLY = 0.5  # share of the occupied voxels above which structure without a class gives a note
 _CARLASC_HEIGHT_M = 1.8  # docs/format.md#coordinate-frame
 
 
@@ -51,18 +51,18 @@ class GridExporter(FrameExporter):
         return TargetFrame()
 
     def check(self, sequence: storage.Sequence) -> list[str]:
-        """Return what resampling loses; raise if there is no such grid, or no map of its classes."""
+        """Return notes on what resampling loses; raise if the grid or the map of its classes does not exist."""
         name, axes, frame = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
         mapping_of(self.maps, self.kind, sequence.classes_of(name), f"{sequence.location}/{name}")
         if not self.predictions and f"{name}/counts" not in sequence.fields():
             raise MissingDataError(
                 f"{sequence.location}/{name}",
-                expected="counts, which say which voxels are known",
+                expected="counts, for the known voxels",
                 found="none",
                 advice="if the grids are predictions, give `predictions=True`",
             )
         notes = resampling_notes(frame.spec_in(sequence.grids[name], axes), self.target, name)
-        if notes and sequence.metadata.has_rays:  # without rays, scans give no grids
+        if notes and sequence.metadata.has_rays:  # no grids can be made from scans without rays
             exact = frame.spec_from(self.target, axes)
             size = ",".join(map(str, exact.size))
             bounds = ",".join(f"{value:g}" for pair in zip(exact.lower, exact.upper, strict=True) for value in pair)
@@ -72,7 +72,7 @@ class GridExporter(FrameExporter):
         return notes + self._structure_without_class(sequence, name)
 
     def _structure_without_class(self, sequence: storage.Sequence, name: str) -> list[str]:
-        """Return a note on what structure becomes, if the first frame shows that it has no class of its own, as where there were boxes only."""
+        """Return a note on the class of structure, if it has no class in the first frame, as in data with boxes only."""
         table, frames = sequence.classes_of(name), sequence.frames(f"{name}/labels")
         if not len(frames):
             return []
@@ -116,7 +116,7 @@ class GridExporter(FrameExporter):
     def read_codes(
         self, sequence: storage.Sequence, frame: int
     ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
-        """Return what `read` does, with 0 for voxels that are free or unknown, and class + 1 for others."""
+        """Return the result of `read`, with 0 for free or unknown voxels, and class + 1 for others."""
         name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
         grid, table = sequence.grid(name, frame), sequence.classes_of(name)
         where = f"{sequence.location}: {name} of frame {frame}"
@@ -142,7 +142,7 @@ def choose_grid(
     Args:
         sequence: the sequence.
         grids: geometry of its grids, by name.
-        wanted: the grid that was asked for; None takes the one that has the voxels of the target, else that of the smallest voxels.
+        wanted: the requested grid; None takes the one with the voxels of the target, otherwise the one with the smallest voxels.
         target: geometry that is written, and its frame.
 
     Raises:
@@ -172,12 +172,12 @@ def choose_grid(
 
 
 def number_folders(names: Sequence[str], prefix: str, digits: int) -> dict[str, str]:
-    """Return a number for each name: that of names which end in the prefix and a number, and the next free one of others.
+    """Return a number for each name: the number at its end, after the prefix, or the next free number.
 
     Args:
         names: names of sequences.
-        prefix: what stands before the number.
-        digits: number of its digits.
+        prefix: the text before the number.
+        digits: number of digits.
     """
     numbers = {name: match[1] for name in names if (match := re.search(rf"{prefix}(\d{{{digits}}})$", name))}
     free = (f"{number:0{digits}d}" for number in range(10_000) if f"{number:0{digits}d}" not in numbers.values())
@@ -187,7 +187,7 @@ def number_folders(names: Sequence[str], prefix: str, digits: int) -> dict[str, 
 def sensor_height(sequence: storage.Sequence, given: float | None) -> tuple[float, bool]:
     """Return the height of the sensor above the ground in metres, and whether it was assumed.
 
-    It is the one that was given, that of the first sensor in carlasc.json, or that of CarlaSC. Sequences without carlasc.json are CarlaSC's.
+    It is the given height, that of the first sensor in carlasc.json, or that of CarlaSC. Sequences without carlasc.json are CarlaSC's.
     """
     if given is not None:
         return given, False
@@ -211,7 +211,7 @@ def scan_occupancy(sequence: storage.Sequence, points: NDArray[np.float32], spec
     """Return the voxels that hold a point of a scan.
 
     Args:
-        sequence: says which ranges are used.
+        sequence: the sequence, for the ranges of points to use.
         points: (N, 4) points and remission, right-handed.
         spec: geometry of the grid, right-handed.
 

@@ -36,8 +36,8 @@ _FENCE, _BUILDING = 51, 50
 UNSCORED: Mapping[int, int] = {1: 0, 52: _BUILDING, 99: _BUILDING}
 """Raw id that SemanticKITTI's evaluator does not accept in a prediction -> id that is written instead.
 
-Its table maps outlier, other-structure and other-object to no class. What is occupied stays occupied: other structures are nearest in kind
-to buildings, and of the classes, building is among those whose score a few voxels of other objects change least."""
+Its table maps outlier, other-structure and other-object to no class. Their voxels stay occupied, as buildings: other structures are most
+similar to buildings, and a few voxels of other objects change the score of buildings least."""
 _WALL = 11  # CarlaSC's: other-structure in ground truth; a fence in predictions, as its paper's class Barrier
 TO_PREDICTED: Mapping[str, Mapping[int, int]] = {
     name: {label: UNSCORED.get(raw, raw) for label, raw in mapping.items()}
@@ -46,7 +46,7 @@ TO_PREDICTED: Mapping[str, Mapping[int, int]] = {
 }
 """Name of a class table -> id -> raw id in a prediction: only ids that the evaluator scores, and 0."""
 _STANDS, _MOVES = 9, 251  # the ids of moving-object segmentation; unlabelled points and outliers stay 0
-_MOVING_M_S = 0.5  # points that are faster than this move
+_MOVING_M_S = 0.5  # points that are faster than this are moving
 _TO_MOVING = np.arange(max(SEMANTICKITTI.names) + 1)
 _TO_MOVING[list(SEMANTICKITTI.standing.values())] = list(SEMANTICKITTI.standing)
 _CALIBRATION = "".join(
@@ -62,14 +62,12 @@ class KittiExporter(FrameExporter):
 
     def __init__(
         self,
-        grid: Annotated[str | None, "Grid that is exported. Default: the one of the smallest voxels."] = None,
+        grid: Annotated[str | None, "Grid to export. Default: the grid with the smallest voxels."] = None,
         *,
-        predictions: Annotated[
-            bool, "Grids are the output of a network. They go to predictions/, and nothing else is written."
-        ] = False,
+        predictions: Annotated[bool, "The grids are predictions: only predictions/ is written."] = False,
         labels: Annotated[
             Literal["semantic", "moving"],
-            "moving: the labels of moving-object segmentation, 9 for what stands, 251 for what moves.",
+            "moving: the labels of moving-object segmentation, 9 for static and 251 for moving points.",
         ] = "semantic",
         check: Annotated[
             Task | None,
@@ -92,15 +90,15 @@ class KittiExporter(FrameExporter):
         return {"grid": self.grid, "predictions": self.predictions, "labels": self.labels}
 
     def check_output(self, source: str, root: Path) -> tuple[int, list[str]] | None:
-        """Check, and pack, the predictions in `root` if an option asks for it."""
+        """Check and pack the predictions in `root`, if an option requests that."""
         if self.task is None:
             return None
         ids = set(TO_PREDICTED[SEMANTICKITTI.name].values()) if self.task == "completion" else set(SEMANTICKITTI.names)
         files = check_submission(root, Path(source), self.task, ids)
-        notes = [f"{root} is what SemanticKITTI's benchmark takes for {self.task}: {len(files)} files"]
+        notes = [f"{root} is a valid submission to SemanticKITTI's benchmark for {self.task}: {len(files)} files"]
         if self.archive is not None:
             pack_submission(root, files, Path(self.archive))
-            notes.append(f"{self.archive} holds them")
+            notes.append(f"{self.archive} contains them")
         return len(files), notes
 
     @property
@@ -172,7 +170,7 @@ class KittiExporter(FrameExporter):
         """Return (N,) ids of SemanticKITTI: those of moving actors where the class or the flow of a point says that it moves."""
         table, where = sequence.metadata.classes, f"{sequence.location}: labels of frame {frame}"
         labels = self._raw_ids(table, sequence.read("labels", frame), where)
-        if not table.moving and frame in sequence.frames("flow"):  # without classes of their own for actors that move
+        if not table.moving and frame in sequence.frames("flow"):  # without classes for moving actors
             flow = np.asarray(sequence.read("flow", frame))
             if len(flow) != len(labels):
                 where = f"{sequence.location}: flow of frame {frame}"
@@ -211,7 +209,7 @@ class KittiExporter(FrameExporter):
         if frame not in sequence.frames(f"{name}/counts"):
             raise MissingDataError(
                 f"{sequence.location}/{name}",
-                expected=f"counts of frame {frame}, which say which voxels are known",
+                expected=f"counts of frame {frame}, for the known voxels",
                 found="none",
                 advice="if the grids are predictions, give `predictions=True`",
             )
@@ -228,7 +226,7 @@ class KittiExporter(FrameExporter):
         return choose_grid(sequence, sequence.grids, self.grid)
 
     def _mapping(self, classes: ClassTable, where: str) -> dict[int, int]:
-        """Return the map from the ids of a class table to SemanticKITTI's; raise if there is none."""
+        """Return the map from the ids of a class table to SemanticKITTI's; raise if it does not exist."""
         if not self.predictions:
             return mapping_of(TO_RAW, "raw", classes, where)
         return {label: UNSCORED.get(raw, raw) for label, raw in mapping_of(TO_PREDICTED, "raw", classes, where).items()}
@@ -245,7 +243,7 @@ class KittiExporter(FrameExporter):
 def _instances(sequence: storage.Sequence, frame: int, count: int) -> NDArray[np.uint32]:
     """Return the (count,) numbers of actors in a frame as SemanticKITTI's files hold them, 0 for none.
 
-    Numbers that `convert` made of SemanticKITTI's own have the class in their upper half. The lower half is what they were.
+    Numbers that `convert` made from SemanticKITTI's own numbers have the class in the upper half. The lower half is the own number.
 
     Raises:
         FormatError: a number needs more than 16 bits, or there are not as many as labels.

@@ -1,7 +1,7 @@
 """Sequences of the layout as the files of Occ3D-nuScenes: `gts/{scene}/{token}/labels.npz` and annotations.json.
 
-The facts are those of the benchmark's own description and loaders. nuScenes has tokens; here they are made from the name of the sequence
-and the number of the frame.
+The format is that of the benchmark's description and loaders. nuScenes has tokens; here they are made from the name of the sequence and the
+number of the frame.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Occ3dExporter(GridExporter):
         *,
         predictions: Predictions = False,
         height_m: Annotated[
-            float | None, "Height of the sensor above the ground, metres. Default: that of carlasc.json, else 1.8."
+            float | None, "Height of the sensor above the ground, in metres. Default: that in carlasc.json, or 1.8."
         ] = None,
     ) -> None:
         super().__init__(grid, predictions=predictions)
@@ -68,13 +68,13 @@ class Occ3dExporter(GridExporter):
         return TargetFrame(sensor_height(sequence, self.height_m)[0])
 
     def check(self, sequence: storage.Sequence) -> list[str]:
-        """Return what resampling loses, and what is assumed."""
+        """Return notes on what resampling loses, and on what is assumed."""
         notes = []
         height, assumed = sensor_height(sequence, self.height_m)
         if assumed:
-            notes.append(f"the height of the sensor is not known, and taken to be {height:g} m: `height_m` sets it")
+            notes.append(f"the height of the sensor is not known: {height:g} m is assumed; `height_m` sets it")
         if layout.POSES not in sequence.documents():
-            notes.append(f"{sequence.location} has no poses: annotations.json has none either")
+            notes.append(f"{sequence.location} has no poses, and so annotations.json has none")
         if not self.predictions and not self._has_seen(sequence):
             notes.append(f"{_CAMERAS}: do not train or score with camera masks")
         return notes + super().check(sequence)
@@ -88,7 +88,7 @@ class Occ3dExporter(GridExporter):
         return (f"{frame_token(sequence.name, frame)}/labels.npz",)
 
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
-        """Return semantics and masks. Without the field `seen`, what the LiDAR observed counts as observed by cameras too."""
+        """Return semantics and masks. Without the field `seen`, voxels that the LiDAR observed count as observed by cameras."""
         labels, known = self.read(sequence, frame)
         semantics, mask = np.where(known, labels, self.free).astype(np.uint8), known.astype(np.uint8)
         seen = self._read_seen(sequence, frame) & mask if self._has_seen(sequence) else mask

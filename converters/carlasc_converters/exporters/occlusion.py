@@ -28,7 +28,7 @@ class _Columns(NamedTuple):
 
 
 class _Heights(NamedTuple):
-    """The heights of the lines of up to 32 voxels of any column: each time that one of them passes a horizontal face begins a stage.
+    """The heights of the lines of up to 32 voxels of any column. A new stage begins each time that a line passes a horizontal face.
 
     Attributes:
         times: (N + 1,) float64, the fraction of the way to the sensor at which each stage ends; infinite for the last one.
@@ -49,10 +49,10 @@ def occluded_voxels(occupied: NDArray[np.bool_], spec: GridSpec) -> NDArray[np.b
     """Return the occupied voxels, and the voxels whose line to the sensor passes through an occupied one.
 
     The line goes from the centre of a voxel to the sensor, which is at the origin, from voxel to voxel (Amanatides and Woo 1987): through
-    the face that comes first, of equally near ones x before y before z. It ends at the sensor, or where it leaves the grid.
+    the nearest face, and for equally near faces x before y before z. It ends at the sensor, or where it leaves the grid.
 
     The lines of all voxels of a column pass the same columns at the same times, and the times at which a line passes horizontal faces
-    depend on the height of its voxel alone. So one walk in 2-D serves a column, and the bits of an integer stand for its voxels.
+    depend only on the height of its voxel. One walk in 2-D is therefore enough per column; the bits of an integer are its voxels.
 
     Args:
         occupied: (X, Y, Z) bool.
@@ -84,7 +84,7 @@ def _heights(lowest: int, count: int, rows: int, sensor: float) -> _Heights:
     bits = np.uint32(1) << np.arange(count, dtype=np.uint32)
     way = sensor - start - 0.5
     with np.errstate(divide="ignore"):
-        between = 1 / np.abs(way)  # infinite on the height of the sensor
+        between = 1 / np.abs(way)  # infinite at the height of the sensor
     times = np.repeat(between[:, None], rows, axis=1)
     times[:, 0] /= 2  # the first face is half a voxel away
     times = np.cumsum(times, axis=1)
@@ -95,7 +95,7 @@ def _heights(lowest: int, count: int, rows: int, sensor: float) -> _Heights:
     voxel, step = voxel[order], step[order]
     below = np.empty((len(order) + 1, rows + 1), np.uint32)
     below[0] = np.bitwise_or.reduce(np.where(start[:, None] < np.arange(rows + 1), bits[:, None], 0), axis=0)
-    # Of all faces, a line that passes one changes from one side to the other of this one only.
+    # A line that passes a face changes its side of this face only.
     below[1:] = 0
     below[np.arange(1, len(below)), faces[voxel, step]] = bits[voxel]
     np.bitwise_xor.accumulate(below, axis=0, out=below)

@@ -1,6 +1,6 @@
 """Sequences of the layout as the files of OpenSceneFlow: one HDF5 file per log, with a group per scan, and the indices of its loader.
 
-The pickled indices are written, because the loader of the other project needs them. No pickle is ever read here.
+The pickled indices are written because the loader of the other project needs them. This module never reads a pickle.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from carlasc.motion import ground_points
 from carlasc.storage import layout
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
 
-_EVALUATED = 5  # every fifth scan with flow is evaluated, as by the project's own script
+_EVALUATED = 5  # every fifth scan with flow is evaluated, as in the project's own script
 _EVALUATED_M = 50.0  # points within this distance along x and y are evaluated, as in the challenge of Argoverse 2
 _FIRST_NS = (
     10**18
@@ -60,18 +60,18 @@ class OpenSceneFlowExporter(SequenceExporter):
         return dict.fromkeys(names, ".")
 
     def file(self, sequence: storage.Sequence) -> str:
-        """Return SPLIT/LOG.h5. The loader takes the name up to the first dot for that of the log."""
+        """Return SPLIT/LOG.h5. The loader takes the name up to the first dot as the name of the log."""
         split = "" if sequence.split is None else f"{sequence.split.lower()}/"
         return f"{split}{sequence.name.replace('.', '_') or 'log'}.h5"
 
     def check(self, sequence: storage.Sequence) -> list[str]:
-        """Check that there are scans, poses, and something that tells of motion."""
+        """Check that scans, poses, and flow or boxes exist."""
         import_extra("h5py", "hdf5")
         fields = sequence.fields()
         wanted = {
             "scans": "points" in fields,
             layout.POSES: layout.POSES in sequence.documents(),
-            "flow or boxes, which say how objects move": bool(fields & {"flow", "boxes"}),
+            "flow or boxes, for the motion of objects": bool(fields & {"flow", "boxes"}),
         }
         for expected, found in wanted.items():
             if not found:
@@ -82,7 +82,7 @@ class OpenSceneFlowExporter(SequenceExporter):
         else:
             mapping_of(CATEGORIES, "category", sequence.metadata.classes, sequence.location)
         if layout.TIMES not in sequence.documents():
-            notes.append(f"{sequence.location} has no times: {layout.FRAME_PERIOD_S} s a frame are assumed")
+            notes.append(f"{sequence.location} has no times: {layout.FRAME_PERIOD_S} s between frames is assumed")
         self._timestamps(sequence)
         return notes
 
@@ -184,10 +184,10 @@ class _Step:
         now: Boxes | None,
         later: Boxes | None,
     ) -> dict[str, NDArray[Any]]:
-        """Return where points are in the next scan's frame, less where they are now, and for which of them this is known.
+        """Return the displacement of points to the next scan, in its frame, and the points for which it is known.
 
-        An object that has boxes in both scans moves as its box does; its points are not valid where its box vanishes. Other points move
-        by their velocity. Without velocities, points outside boxes stand, and nothing is known of scans that were not annotated.
+        An object with boxes in both scans moves with its box; without a box in the next scan, its points are not valid. Other points move
+        by their velocity. Without velocities, points outside of boxes are static, and scans without annotation have no valid points.
         """
         moved = points.astype(np.float64) if velocity is None else points + velocity.astype(np.float64) * self.seconds
         there = transform_points(self.next_T_now, moved)

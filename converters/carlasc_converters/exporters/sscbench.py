@@ -23,7 +23,7 @@ from carlasc_converters.exporters.grid_exporter import (
 )
 from carlasc_converters.kitti_voxels import pack_bits
 
-# The files hold raw ids of SemanticKITTI, which therefore stay; the set has no outliers.
+# The files hold raw ids of SemanticKITTI, which are kept; the set has no outliers.
 _KITTI = {label: IGNORED if label == 1 else label for label in SEMANTICKITTI.names}
 _RAW = {
     name: {label: SSCBENCH_TO_RAW.get(target, IGNORED) for label, target in mapping.items()}
@@ -49,7 +49,7 @@ class SscBenchExporter(GridExporter):
         grid: GridName = None,
         *,
         predictions: Predictions = False,
-        every: Annotated[int, "Frames whose number is a multiple of this are written."] = 5,
+        every: Annotated[int, "Write only frames whose number is a multiple of this."] = 5,
     ) -> None:
         super().__init__(grid, predictions=predictions)
         if every < 1:
@@ -58,7 +58,7 @@ class SscBenchExporter(GridExporter):
 
     @property
     def product(self) -> str:
-        """Predictions go to a folder of their own."""
+        """Predictions are written to a separate folder."""
         return "predictions" if self.predictions else "data"
 
     def folders(self, names: Sequence[str]) -> dict[str, str]:

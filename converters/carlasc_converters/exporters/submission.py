@@ -1,4 +1,4 @@
-"""A folder of predictions as SemanticKITTI's benchmark takes it: checked as its `validate_submission.py` does, and packed."""
+"""Submissions to SemanticKITTI's benchmark: a folder of predictions is checked as by `validate_submission.py`, and packed."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def check_submission(root: Path, dataset: Path, task: Task, ids: Collection[int]
     Args:
         root: folder that holds `sequences/` with the predictions.
         dataset: the benchmark's data: `sequences/NN/voxels/000000.bin` for completion, `sequences/NN/velodyne/000000.bin` for segmentation.
-        task: what is predicted: uint16 per voxel, or uint32 per point with the class in the lower half.
-        ids: the class ids that the benchmark's evaluator takes.
+        task: "completion", uint16 per voxel, or "segmentation", uint32 per point with the class in the lower half.
+        ids: the class ids that the benchmark's evaluator accepts.
 
     Returns:
         The paths of the files of the submission, relative to `root`, sorted.
 
     Raises:
         MissingDataError: a sequence or a file is missing, in `root` or in `dataset`.
-        FormatError: a file has another size than its input asks for, an id that is no class, or is not needed.
+        FormatError: the size of a file does not match its input, an id is not a class, or a file is not needed.
     """
     wanted: list[Path] = []
     for number in SEQUENCES:
@@ -83,7 +83,7 @@ def _check_file(path: Path, scan: Path, task: Task, ids: Collection[int]) -> Non
 
 
 def pack_submission(root: Path, files: Iterable[Path], archive: Path) -> None:
-    """Write files of `root` to a zip with entries of their folders, as the benchmark wants it. It gets its name when it is whole.
+    """Write files of `root` to a zip with entries for their folders, as the benchmark requires. The zip is complete or does not exist.
 
     Raises:
         ArgumentError: its name does not end in .zip.
