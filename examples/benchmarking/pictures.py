@@ -51,7 +51,7 @@ def draw_scene(rows: Sequence[Row], size: Size, folder: Path, path: Path) -> Non
         Panel(grid_drawing(Grid(scenes.spec, np.where(seen, labels, 0).astype(np.uint8)), colors), title=title)
         for title, labels in grids.items()
     ]
-    Image.fromarray(draw_panels(panels, size=(1800, 460))).quantize(128).save(path, optimize=True)
+    Image.fromarray(draw_panels(panels, size=(1500, 760), columns=3)).quantize(128).save(path, optimize=True)
 
 
 def _trained(row: Row, size: Size, folder: Path) -> nn.Module:

@@ -108,7 +108,7 @@ def test_the_benchmark_keeps_its_results_and_a_second_run_trains_nothing(folder,
     (tmp_path / "tiny" / "data").symlink_to(folder / "data")
     arguments = {"size": "tiny", "study": list(benchmark.Study), "device": "cpu", "workers": 1}
     benchmark.main(tmp_path, **arguments, pictures=tmp_path / "pictures")
-    assert Image.open(tmp_path / "pictures" / "labels.png").size == (1800, 460)
+    assert Image.open(tmp_path / "pictures" / "labels.png").size == (1500, 760)
     results = tmp_path / "tiny" / "results.json"
     kept = read(results)
     assert {study: list(rows) for study, rows in kept.items()} == {

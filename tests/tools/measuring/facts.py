@@ -99,10 +99,6 @@ EXCEPTIONS: dict[tuple[str, str], str] = {  # (page, number or heading of a sect
     ("docs/sets/nuscenes.md", "20 s"): "how long a drive of the data set is, by its authors",
     ("docs/storage.md", "100 MiB"): "from where on s3fs sends parts",
     ("docs/studies/networks.md", "## Published results"): "the numbers of the paper",
-    (
-        "docs/studies/networks.md",
-        "## What an earlier version measured {#earlier}",
-    ): "the page says which version measured them",
 }
 
 _UNITS = {
