@@ -67,7 +67,7 @@ def test_the_options_of_poses_reach_the_run(drive, tmp_path):
         (("--poses", "guess"), "'guess' is not one of"),
         (("--frames", "0:2"), "--frames"),
         (("--part", "3/2"), "--part"),
-        (("--part", "1/2", "--overwrite"), "--overwrite: expected nothing with `--part`"),
+        (("--part", "1/2", "--overwrite"), "--overwrite: expected False with `--part`"),
     ],
 )
 def test_wrong_use_is_one_line(drive, tmp_path, options, message):

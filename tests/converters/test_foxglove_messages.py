@@ -80,7 +80,7 @@ def test_json_is_read_and_the_pose_of_a_cloud_is_applied(tmp_path, moved):
         np.testing.assert_allclose(cloud.points[:, :3], expected, atol=1e-5)
         assert cloud.points[:, 3].tobytes() == points[:, 3].tobytes()
     np.testing.assert_allclose(recording.poses().world_T_vehicle, POSES, atol=1e-12)
-    assert any("are those of lidar, as assumed" in note for note in recording.notes())
+    assert any("which is assumed" in note for note in recording.notes())
 
 
 @pytest.mark.parametrize(

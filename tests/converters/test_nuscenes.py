@@ -302,7 +302,7 @@ def test_tables_of_another_version_are_named(tables, values, found):
     change_table(tables / "category.json", **values)
     with pytest.raises(
         FormatError,
-        match=rf"category.json: expected the 32 categories of nuScenes v1.0.*found {found}: these are tables",
+        match=rf"category.json: expected the 32 categories of nuScenes v1.0.*found {found}: use the tables of nuScenes",
     ):
         NuScenes(tables).sequences()
 

@@ -130,7 +130,7 @@ def test_stats_count_the_voxels_of_actors(tmp_path):
     assert (found.actor_voxels, found.moving_voxels) == (3, 2)
     assert stats(tmp_path).to_dict()["total"]["moving_voxels"] == 2
     result = CliRunner().invoke(app, ["stats", str(tmp_path)])
-    assert "3 voxels belong to actors, 2 move" in result.output
+    assert "3 voxels belong to actors, 2 of them move" in result.output
 
 
 def test_info_lists_both_fields(tmp_path):
