@@ -23,7 +23,7 @@ import movers_drives
 import numpy as np
 import study
 from movers_drives import GRIDS, Recorded, Reference, Setting, record, reference
-from movers_rows import ABLATIONS, BASIC, MANY_CHANNELS, PARKED, ROWS, UNLABELLED, Row
+from movers_rows import ABLATIONS, BASIC, PARKED, ROWS, UNLABELLED, Row
 from movers_scores import Counts, count, figures
 from movers_tables import Table, write_tables
 
@@ -74,9 +74,7 @@ class Task:
 def tasks_of(given: argparse.Namespace) -> list[Task]:
     """Return what is to be done."""
     work: Path = given.work
-    every, basic, ablations, many, parked = (
-        tuple(row.name for row in rows) for rows in (ROWS, BASIC, ABLATIONS, MANY_CHANNELS, PARKED)
-    )
+    every, basic, ablations, parked = (tuple(row.name for row in rows) for rows in (ROWS, BASIC, ABLATIONS, PARKED))
     if given.parked:
         return [Task(Setting("parked", seed, 64), tuple(GRIDS), parked, work) for seed in (1, 2, 3)]
     if study.is_tiny():
@@ -88,11 +86,9 @@ def tasks_of(given: argparse.Namespace) -> list[Task]:
     def each(channels: int, grid: str, rows: tuple[str, ...]) -> list[Task]:
         return [Task(Setting(*drive, channels), (grid,), rows, work) for drive in drives]
 
-    coarse = [*each(16, "coarse", basic), *each(64, "coarse", basic), *each(128, "coarse", many)]
-    fine = [*each(16, "0.2 m", basic), *each(32, "0.2 m", basic), *each(64, "0.2 m", basic)]
     parts = {
         "rules": each(32, "coarse", every),
-        "lidars": coarse + fine,
+        "lidars": [*each(16, "coarse", basic), *each(64, "coarse", basic), *each(32, "0.2 m", basic)],
         "errors": each(32, "coarse", (*UNCHANGED, *ablations)),
         "held out": [replace(task, held_out=True) for task in each(32, "coarse", HELD_OUT)],
     }

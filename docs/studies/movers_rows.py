@@ -280,8 +280,6 @@ ABLATIONS = (
     Row("instances, 10 % wrong ids", _merging(motion=MotionOptions("instances")), wrong_ids),
 )
 """What is changed one at a time, at 32 channels on the coarse grid. The window is 30 frames elsewhere."""
-MANY_CHANNELS = tuple(Row(f"align, {hint}", observe) for hint, observe in _HINTS.items())
-"""The rows at 128 channels."""
 BASIC = tuple(
     row
     for row in ROWS

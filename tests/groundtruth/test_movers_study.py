@@ -223,8 +223,8 @@ def test_the_tasks_cover_the_report(tmp_path):
     tasks = tasks_of(argparse.Namespace(parked=False, **options))
     made = {(task.setting.channels, grid, row) for task in tasks for grid in task.grids for row in task.rows}
     assert {(32, "coarse", row.name) for row in (*ROWS, *ABLATIONS)} <= made
-    assert {(c, grid, "align, evidence") for c in (16, 32, 64) for grid in ("coarse", "0.2 m")} <= made
-    assert (128, "coarse", "align, flow") in made
+    others = {(16, "coarse"), (64, "coarse"), (32, "0.2 m")}
+    assert {(*other, "align, evidence") for other in others} <= made
     assert len({task.setting.drive for task in tasks}) == 10
     parked = tasks_of(argparse.Namespace(parked=True, **options))
     assert {task.setting.seed for task in parked} == {1, 2, 3}
