@@ -234,7 +234,7 @@ def test_one_sensor_loses_thin_things_and_the_finding_says_so(tmp_path):
     assert set(found) == {"false free"}
     assert "are in voxels called free: " in found["false free"].text
     assert "% of Pole" in found["false free"].text
-    assert "thin things are outvoted" in found["false free"].advice
+    assert "outvote their returns" in found["false free"].advice
     assert "Pole " in found["false free"].details
 
 
