@@ -151,13 +151,13 @@ def test_what_is_compared_takes_turns_and_the_least_time_counts() -> None:
 def test_a_run_replaces_what_it_measured_and_keeps_the_rest(tmp_path: Path) -> None:
     first = Figures({}, {}).updated(RUN, {"a": Figure(1.0, "s", "a"), "b": Figure(2.0, "s", "b")})
     second = first.updated(RUN | {"date": "2030-02-03"}, {"a": Figure(1.23456, "s", "a")})
-    assert set(second.runs) == {"2030-01-02 quick", "2030-02-03 quick"}
+    assert set(second.runs) == {"2030-01-02 quick beads", "2030-02-03 quick beads"}
     second.write(tmp_path / "figures.json")
     read = Figures.read(tmp_path / "figures.json")
-    assert read.figures["a"] == Figure(1.235, "s", "a", run="2030-02-03 quick")
-    assert read.figures["b"].run == "2030-01-02 quick"
+    assert read.figures["a"] == Figure(1.235, "s", "a", run="2030-02-03 quick beads")
+    assert read.figures["b"].run == "2030-01-02 quick beads"
     third = read.updated(RUN | {"date": "2030-02-03"}, {"b": Figure(2.0, "s", "b")})
-    assert set(third.runs) == {"2030-02-03 quick"}
+    assert set(third.runs) == {"2030-02-03 quick beads"}
 
 
 def test_a_group_that_fails_is_reported_and_keeps_its_figures(

@@ -89,7 +89,7 @@ class Figures:
 
     def updated(self, run: Mapping[str, Any], measured: Mapping[str, Figure]) -> Figures:
         """Return them with what a run measured in place of older figures, without runs of which nothing is left."""
-        name = f"{run['date']} {run['size']}"
+        name = f"{run['date']} {run['size']} {run['target']}"  # machines of one day are told apart
         new = {key: dataclasses.replace(figure, run=name) for key, figure in measured.items()}
         figures = dict(sorted((self.figures | new).items()))
         used = {figure.run for figure in figures.values()}
@@ -102,9 +102,8 @@ class Figures:
             key: {
                 name: _rounded(value)
                 for name, value in dataclasses.asdict(figure).items()
-                if value is not None and value != ""
+                if value is not None and (value != "" or name == "unit")
             }
-            | {"unit": figure.unit}
             for key, figure in self.figures.items()
         }
         file.write_text(json.dumps({"runs": self.runs, "figures": rows}, indent=1) + "\n")
