@@ -44,7 +44,8 @@ lint: $(VENV)/ready ## ruff
 
 types: $(VENV)/ready ## mypy
 	$(RUN)/mypy
-	cd examples && MYPYPATH=. ../$(RUN)/mypy --config-file ../pyproject.toml .
+	cd examples && MYPYPATH=. ../$(RUN)/mypy --cache-dir ../.mypy_cache --config-file ../pyproject.toml .
+	cd docs/studies && MYPYPATH=.:../../converters:../../tests ../../$(RUN)/mypy --cache-dir ../../.mypy_cache --config-file ../../pyproject.toml .
 
 unit: $(VENV)/ready ## the quick tests
 	$(RUN)/pytest $(SIDE_BY_SIDE)

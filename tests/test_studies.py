@@ -37,18 +37,34 @@ def test_a_study_runs_in_miniature(name: str, tmp_path: Path) -> None:
     assert after == before  # tiny figures never reach the pages
 
 
-@pytest.mark.slow
-@pytest.mark.needs("kiss_icp")
-def test_the_study_of_a_real_drive_runs_in_miniature(real: Path, tmp_path: Path) -> None:
+def run_on_the_real_drive(name: str, real: Path, work: Path) -> str:
+    """Return what a tiny run of a study prints that takes the archive of the real drive."""
     file = real / "kitti_tracking_0000.tar.xz"
     if not file.exists():
         pytest.skip("the archive of the real drive is absent")
     with tarfile.open(file) as archive:
-        archive.extractall(tmp_path, filter="data")
-    (training,) = tmp_path.rglob("training")
-    printed = run("real", tmp_path, "--archive", str(training.parent))
+        archive.extractall(work, filter="data")
+    (training,) = work.rglob("training")
+    return run(name, work, "--archive", str(training.parent))
+
+
+@pytest.mark.slow
+@pytest.mark.needs("kiss_icp")
+def test_the_study_of_a_real_drive_runs_in_miniature(real: Path, tmp_path: Path) -> None:
+    printed = run_on_the_real_drive("real", real, tmp_path)
     moving = dict(re.findall(r"\| track (\d) \| \d+ \| ([\d.]+)%", printed))
     assert float(moving["1"]) > 90 and float(moving["2"]) > 90 and float(moving["4"]) < 5
+
+
+@pytest.mark.slow
+@pytest.mark.needs("kiss_icp")
+def test_refining_repairs_errors_that_are_added_to_the_poses_of_a_real_drive(real: Path, tmp_path: Path) -> None:
+    printed = run_on_the_real_drive("poses", real, tmp_path)
+    exact, repaired, wrong, refined = (
+        float(share) for share in re.findall(r"^\| KISS.*? \| ([\d.]+)%", printed, re.MULTILINE)
+    )
+    assert wrong > exact + 2  # rays pass through what is doubled
+    assert abs(refined - repaired) < 0.5
 
 
 def test_every_study_is_on_a_page_and_every_other_module_belongs_to_a_study() -> None:

@@ -257,6 +257,10 @@ def _read_frames(text: str | None) -> FrameRange | None:
     return None if text is None else FrameRange.parse(text)
 
 
+SourceClassesOption = Annotated[
+    str | None,
+    typer.Option(help="Class table of the labels in SOURCE, if its metadata do not name it: carla, carlasc11, ..."),
+]
 FramesOption = Annotated[  # read in a callback: typer would replace the message of a parser's ValueError
     FrameRange | None,
     typer.Option(

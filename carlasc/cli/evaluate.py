@@ -14,6 +14,7 @@ import carlasc
 from carlasc.cli.common import (
     FramesOption,
     Json,
+    SourceClassesOption,
     console,
     echo,
     file_option,
@@ -42,10 +43,7 @@ class GridChoiceFlags(Flags):
     truth_grid: Annotated[
         str | None, typer.Option(help="Name of the grid with the ground truth. Default: evaluation, or the only grid.")
     ] = None
-    source_classes: Annotated[
-        str | None,
-        typer.Option(help="Class table of the labels in SOURCE, if its metadata do not name it: carla, carlasc11, ..."),
-    ] = None
+    source_classes: SourceClassesOption = None
     frames: FramesOption = None
 
 

@@ -12,6 +12,7 @@ import carlasc
 from carlasc.cli.common import (
     FramesOption,
     Json,
+    SourceClassesOption,
     echo,
     file_option,
     place_argument,
@@ -45,10 +46,7 @@ class SceneFlags(Flags):
         str | None,
         typer.Option(help="Class table to show, such as carlasc11 (the paper's eleven). Default: that of the data."),
     ] = None
-    source_classes: Annotated[
-        str | None,
-        typer.Option(help="Class table of the labels in SOURCE, if its metadata do not name it: carla, carlasc11, ..."),
-    ] = None
+    source_classes: SourceClassesOption = None
 
     def scene(self, source: str, palette: PaletteName) -> carlasc.Scene:
         """Return the scene of a source."""

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from carlasc_converters.kitti_tracking import KittiTracking
+from carlasc_converters.kitti_tracking import KittiTracking, TrackingSequence
 from numpy.typing import NDArray
 
 import carlasc
@@ -87,10 +87,12 @@ def plain_measures(drive: Path, spec: GridSpec = COARSE) -> None:
         see_voxels(occupied, spec, views, boxes)
         taken.append(time.process_time() - began)
     print(f"seen, 6 cameras of 1600 x 900, {spec}: {min(taken):.3f} s of a core")
-    wide = {"name": "a", "width": 1600, "height": 900, "matrix": views[0][0].matrix, "sensor_T_camera": np.eye(4)}
+    matrix, pose = views[0][0].matrix, np.eye(4)
     pixels = rng.uniform(0, [1600, 900], (10000, 2))
     for model, lens in LENSES.items():
-        camera = CameraModel(**wide, model=model, distortion=lens)
+        camera = CameraModel(
+            name="a", width=1600, height=900, matrix=matrix, sensor_T_camera=pose, model=model, distortion=lens
+        )
         off = np.abs(camera.project(camera.unproject(pixels)) - pixels).max()
         print(f"there and back, {model}: {off:.1e} pixels at most")
 
@@ -98,8 +100,10 @@ def plain_measures(drive: Path, spec: GridSpec = COARSE) -> None:
 def tracked_boxes(real: Path) -> None:
     """Print by how many pixels KITTI's fully visible boxes in space lie beside those in its images, for each track of the part of drive 0000."""
     (recording,) = KittiTracking(real).sequences()
+    assert isinstance(recording, TrackingSequence)
     (camera,) = (one for one in recording.cameras() if one.name == "image_02")
     boxes, errors = recording.boxes(), dict[str, list[NDArray[np.float64]]]()
+    assert boxes is not None
     corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
     for line in (Path(recording.folder) / "label_02/0000.txt").read_text().splitlines():
         row = line.split()

@@ -19,6 +19,7 @@ import carlasc
 from carlasc import Grid, GridSpec, Run
 from carlasc.captures import Lidar, TownDrive
 from carlasc.converting import FlowSource, LayoutOptions, convert
+from carlasc.core.choices import Dynamic
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import FromScans, Observation, count_votes, regrid
@@ -33,7 +34,7 @@ SEED, FRAMES, JUDGED = 1, range(101), (10, 30, 50, 70, 90)
 GRIDS = {"coarse": GridSpec.published(), "0.2 m": GridSpec.published().with_resolution(0.2)}
 CLASSES = ("Vehicle", "Pedestrian", "Road", "Building", "Sidewalk")
 VEHICLE = CARLA.id_of("Vehicle")
-RUNS = {  # name: rule for what moves, and whether flow is estimated by the converter
+RUNS: dict[str, tuple[Dynamic, FlowSource]] = {  # name: rule for what moves, and whether the converter estimates flow
     "tube": ("tube", "none"),
     "align, by instances": ("align", "none"),
     "align, by instances and their estimated flow": ("align", "auto"),
@@ -49,18 +50,18 @@ def reference(drive: TownDrive, frame: int) -> dict[str, Grid]:
     """Return what 60 sensors see at the instant of a frame, in each grid of the ego sensor."""
     grid_T_world = invert(drive.sensor_poses(frame, 1)[0])
     seen = drive.reference_observations(frame, 2 if study.is_tiny() else 60)
-    observations = [Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in seen]
+    observations = [Observation(r.scan.points, study.labels_of(r.scan), grid_T_world @ r.world_T_sensor) for r in seen]
     return {name: count_votes(observations, spec).to_grid() for name, spec in GRIDS.items()}
 
 
-def make(folder: Path, rule: str, name: str) -> dict[int, Grid]:
+def make(folder: Path, rule: Dynamic, name: str) -> dict[int, Grid]:
     """Make the judged frames of a converted drive by one rule."""
     grid = f"{rule}_{name.replace(' ', '')}"
     for frame in judged():
         result = regrid(
             folder,
             GRIDS[name],
-            observe=FromScans(dynamic=rule),  # type: ignore[arg-type]
+            observe=FromScans(dynamic=rule),
             frames=(frame, frame + 1),
             name=f"{grid}_{frame}",
             run=Run(workers=1),

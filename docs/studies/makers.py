@@ -206,11 +206,12 @@ def others(drive: Drive, frame: int) -> list[int]:
 def evidence(drive: Drive, frame: int, other: int) -> Grid:
     """Return what a held-out scan alone shows in the grid of a frame; of scans at other times, only what cannot move."""
     scan = drive.whole.scan(other, ("labels",))
-    keep = scan.labels > 0
+    labels = study.labels_of(scan)
+    keep = labels > 0
     if other != frame:
-        keep &= ~np.isin(scan.labels, sorted(CARLA.movable))
+        keep &= ~np.isin(labels, sorted(CARLA.movable))
     motion = invert(drive.whole.read_pose(frame)) @ drive.whole.read_pose(other)
-    return count_votes([Observation(scan.points[keep], scan.labels[keep], motion)], SPEC, CARLA).to_grid()
+    return count_votes([Observation(scan.points[keep], labels[keep], motion)], SPEC, CARLA).to_grid()
 
 
 def truth_of(grids: dict[int, Grid], references: dict[int, Grid]) -> float:
@@ -269,7 +270,7 @@ def see(town: TownDrive) -> dict[int, Grid]:
     for frame in study.few(JUDGED):
         grid_T_world = invert(town.sensor_poses(FIRST + frame, 1)[0])
         seen = town.reference_observations(FIRST + frame, 3 if study.is_tiny() else SENSORS)
-        observed = [Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in seen]
+        observed = [Observation(r.scan.points, study.labels_of(r.scan), grid_T_world @ r.world_T_sensor) for r in seen]
         references[frame] = count_votes(observed, SPEC, CARLA).to_grid()
     return references
 

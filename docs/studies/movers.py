@@ -81,7 +81,7 @@ def tasks_of(given: argparse.Namespace) -> list[Task]:
         some = ("tube", "align, flow", "align, evidence", UNLABELLED)
         return [Task(Setting(*study.drives(given, SEEDS)[0], 32), ("coarse",), some, work)]
     by_kind = [[(kind, seed) for seed in getattr(given, kind)] for kind in SEEDS]
-    drives = [drive for pair in zip(*by_kind, strict=True) for drive in pair]
+    drives: list[tuple[str, int]] = [drive for pair in zip(*by_kind, strict=True) for drive in pair]
 
     def each(channels: int, grid: str, rows: tuple[str, ...]) -> list[Task]:
         return [Task(Setting(*drive, channels), (grid,), rows, work) for drive in drives]
@@ -165,7 +165,7 @@ def judge(drive: Recorded, row: Row, grid: str, references: dict[int, Reference]
 
 def as_seen(grid: Grid, seen: Reference) -> Grid:
     """Return a grid without classes with those of the reference: only what is occupied is judged then."""
-    classes = np.where(seen.labels > 0, seen.labels, CARLA.geometry_only)
+    classes = np.where(seen.labels > 0, seen.labels, CARLA.geometry_id)
     return Grid(grid.spec, np.where(grid.labels > 0, classes, 0), grid.counts)
 
 

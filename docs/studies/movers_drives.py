@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from railed import RailedDrive
 from street import StreetDrive
-from study import is_tiny
+from study import is_tiny, labels_of
 
 import carlasc
 from carlasc import Boxes, GridSpec
@@ -178,15 +178,18 @@ def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
     sightings: dict[int, list[NDArray[np.float64]]] = {channels: [] for channels in folders}
     for writer in writers.values():
         writer.write_document(layout.POSES, layout.encode_poses(relative_to(poses[0], poses)))
-        writer.write_document(layout.TIMES, layout.encode_times(np.arange(frames) * layout.FRAME_PERIOD_S))
+        writer.write_document(
+            layout.TIMES, layout.encode_times(np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S)
+        )
     for frame in range(frames):
         snapshot = drive.snapshot(frame)
         for channels, writer in writers.items():
             noise = np.random.default_rng([seed, channels, frame])
             recording = scan_snapshot(snapshot, poses[frame], lidars[channels], noise)
             scan = recording.scan
+            assert scan.instances is not None
             writer.write("points", frame, np.column_stack([scan.points, np.zeros(len(scan), np.float32)]))
-            writer.write("labels", frame, scan.labels)
+            writer.write("labels", frame, labels_of(scan))
             writer.write("instances", frame, scan.instances)
             writer.write("flow", frame, recording.flow())
             numbers, points = np.unique(scan.instances[scan.instances > 0], return_counts=True)
@@ -221,7 +224,7 @@ def reference(kind: str, seed: int, work: Path) -> dict[tuple[str, int], Referen
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_name(f"{kind}{seed}.{os.getpid()}.npz")
-        np.savez_compressed(unfinished, **_see(kind, seed))
+        np.savez_compressed(unfinished, **_see(kind, seed))  # type: ignore[arg-type]  # no array is named like the option
         unfinished.rename(path)
     kept = np.load(path)
     found = {}
@@ -245,7 +248,7 @@ def _see(name: str, seed: int) -> dict[str, NDArray[Any]]:
     for frame in frames:
         pose = drive.sensor_poses(frame, 1)[0]
         seen = [
-            Observation(r.scan.points, r.scan.labels, invert(pose) @ r.world_T_sensor)
+            Observation(r.scan.points, labels_of(r.scan), invert(pose) @ r.world_T_sensor)
             for r in drive.reference_observations(frame, kind.sensors)
         ]
         actors = [actor for actor in drive.snapshot(frame).actors.values() if actor.id != EGO_ID]

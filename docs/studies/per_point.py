@@ -39,12 +39,12 @@ def main() -> None:
         for kind, seed in study.drives(given, SEEDS):
             (drive,) = record(kind, seed, [32], given.work)
             both, true, found = count(drive)
-            scores = (both / (true + found - both), both / max(found, 1), both / max(true, 1))
+            scores = (both / (true + found - both), both / np.maximum(found, 1), both / np.maximum(true, 1))
             rows.setdefault(kind, []).append(scores)
             print(kind, seed, *(f"{value:.3f}" for value in scores), flush=True)
     print("\n| world | drives | IoU of moving points | precision | recall |\n|---|---:|---:|---:|---:|")
-    for kind, found in rows.items():
-        print(f"| {kind} | {len(found)} | {' | '.join(study.interval(values) for values in np.array(found).T)} |")
+    for kind, drives in rows.items():
+        print(f"| {kind} | {len(drives)} | {' | '.join(study.interval(values) for values in np.array(drives).T)} |")
 
 
 if __name__ == "__main__":

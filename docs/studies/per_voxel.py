@@ -169,6 +169,7 @@ def score_row(
     score = Scores(one=numbers_seen(drive, actors))
     for frame, truth in truths.items():
         merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
+        assert merged.actors is not None  # the plan keeps them
         labels = merged.grid.labels
         if row.endswith("no labels"):  # the class is not known: that of the truth, where both are occupied
             own = np.isin(seen[frame].labels, sorted(THINGS)) | (labels == 0)

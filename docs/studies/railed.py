@@ -6,8 +6,10 @@ motion. The road and the movers are those of `street.py`, but only every third m
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from street import END_M, HALF_ROAD_M, START_M, WALK_M, Street, StreetDrive, Traffic, build_street
+from street import END_M, HALF_ROAD_M, START_M, WALK_M, StreetDrive, Traffic, build_street
 
 from carlasc.captures import Lidar
 from carlasc.captures.town import furniture
@@ -34,7 +36,7 @@ class RailedDrive(StreetDrive):
         edges = MeshBuilder()
         edges.add_mesh(street.mesh, np.eye(4))
         _add_edges(edges, rng)
-        self.town = Street(edges.build(), street.buildings)
+        self.town = replace(street, mesh=edges.build())
         self._population = traffic
 
 

@@ -12,8 +12,8 @@ from functools import reduce
 from operator import add
 
 import study
-from movers import BY_NAME, GRIDS, SEEDS, ActorStore, judge
-from movers_drives import record, reference
+from movers import BY_NAME, SEEDS, ActorStore, judge
+from movers_drives import GRIDS, record, reference
 from movers_rows import Row
 from movers_scores import Counts, figures
 

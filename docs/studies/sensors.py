@@ -33,7 +33,9 @@ def sensors() -> tuple[int, ...]:
 
 def vote(recordings: Iterable[SensorRecording], grid_T_world: np.ndarray, spec: GridSpec) -> Grid:
     """Return the grid of several recordings."""
-    observations = (Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in recordings)
+    observations = (
+        Observation(r.scan.points, study.labels_of(r.scan), grid_T_world @ r.world_T_sensor) for r in recordings
+    )
     return count_votes(observations, spec).to_grid()
 
 

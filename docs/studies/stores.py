@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -124,7 +124,7 @@ def codecs(points: np.ndarray) -> list[str]:
     return lines
 
 
-def _least_ms(function: Callable[[object], object], parts: list[object]) -> float:
+def _least_ms(function: Callable[[object], object], parts: Sequence[object]) -> float:
     turns = []
     for _ in range(1 if study.is_tiny() else 10):
         start = time.process_time()

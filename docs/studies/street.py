@@ -14,10 +14,10 @@ import numpy as np
 
 from carlasc.captures import Lidar, TownActor, TownDrive
 from carlasc.captures.town import furniture
-from carlasc.captures.town.actors import EGO_ID, STRIDE_M
+from carlasc.captures.town.actors import EGO_ID, STRIDE_M, Population
 from carlasc.captures.town.furniture import add_building
 from carlasc.captures.town.meshes import Mesh
-from carlasc.captures.town.plan import KERB_M, PlantCatalogue, Rectangle, TownPlan
+from carlasc.captures.town.plan import KERB_M, PAINT_M, PlantCatalogue, Rectangle, TownPlan
 from carlasc.captures.town.shapes import (
     EGO_KIND,
     GAIT_PHASES,
@@ -27,7 +27,8 @@ from carlasc.captures.town.shapes import (
     pedestrian_mesh,
     vehicle_mesh,
 )
-from carlasc.captures.town.town import GROUND, PAINT_M, ROAD, ROAD_LINE, SIDEWALK, TERRAIN
+from carlasc.captures.town.streets import Streets
+from carlasc.captures.town.town import GROUND, ROAD, ROAD_LINE, SIDEWALK, TERRAIN, Town
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
 
@@ -42,19 +43,7 @@ HALF_ROAD_M, WALK_M, LAND_M = 7.75, 4.0, 26.0  # half the road, the sidewalk, an
 _STREAM = 1000  # of random numbers, beside those of a drive
 _BUS = next(kind for kind in VEHICLE_KINDS if kind.name == "bus")
 _SHARES = np.array([kind.share for kind in VEHICLE_KINDS])
-
-
-@dataclass(frozen=True)
-class Street:
-    """What stands: the part of a town that a drive needs.
-
-    Attributes:
-        mesh: all static objects, world frame: x along the street, y to the right, z up, the road at z = 0.
-        buildings: footprints of the buildings with the heights of their roofs, metres.
-    """
-
-    mesh: Mesh
-    buildings: tuple[tuple[Rectangle, float], ...]
+_NO_STREETS = Streets(np.empty((0, 2)), np.empty((0, 2), np.int64), (), ())  # no network: nothing turns
 
 
 @dataclass(frozen=True)
@@ -88,7 +77,7 @@ class Mover:
         return TownActor(number, pose, np.array([sign * self.speed, 0.0, 0.0]), mesh)
 
 
-class Traffic:
+class Traffic(Population):
     """Everything that moves on a street, in any frame: the vehicle that records first."""
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -155,8 +144,11 @@ def _queue(
     return movers
 
 
-def build_street(rng: np.random.Generator, houses: tuple[float, ...] = (-1.0, 1.0)) -> Street:
-    """Build what stands along a random street, with houses on one side (y < 0: -1) or both."""
+def build_street(rng: np.random.Generator, houses: tuple[float, ...] = (-1.0, 1.0)) -> Town:
+    """Build what stands along a random street, with houses on one side (y < 0: -1) or both.
+
+    World frame: x along the street, y to the right, z up, the road at z = 0.
+    """
     plan = TownPlan(rng, PlantCatalogue(rng))
     _lay_strip(plan, ROAD, (-HALF_ROAD_M, 0.0), (HALF_ROAD_M, 0.0))
     for y in (-3.5, 0.0, 3.5):
@@ -171,7 +163,7 @@ def build_street(rng: np.random.Generator, houses: tuple[float, ...] = (-1.0, 1.
         if side in houses:
             _build_houses(plan, side)
         _add_furniture(plan, side)
-    return Street(plan.builder.build(), tuple(plan.buildings))
+    return Town(_NO_STREETS, plan.builder.build(), tuple(plan.buildings), ())
 
 
 def _lay_strip(plan: TownPlan, label: int, one: tuple[float, float], other: tuple[float, float]) -> None:

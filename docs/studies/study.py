@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.scans import Scan
 
 T = TypeVar("T")
 _TINY = ContextVar("tiny", default=False)
@@ -76,6 +79,13 @@ def do_all(function: Callable[[T], None], tasks: Iterable[T], workers: int) -> N
     with ProcessPoolExecutor(workers) as pool:
         for done in as_completed([pool.submit(function, task) for task in tasks]):
             done.result()
+
+
+def labels_of(scan: Scan) -> NDArray[np.unsignedinteger]:
+    """Return the class of each point of a scan, which every simulated scan has."""
+    if scan.labels is None:
+        raise ValueError("the scan has no labels")
+    return scan.labels
 
 
 def interval(values: Iterable[float], shown: str = ".2f") -> str:

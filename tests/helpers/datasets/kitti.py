@@ -5,7 +5,7 @@ Nothing here uses the converter: files are written as the format page describes 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,7 +47,7 @@ class KittiTruth:
 def write_kitti(
     root: Path,
     drive: TownDrive,
-    frames: range,
+    frames: Sequence[int],
     sequence: str = "00",
     *,
     labels: bool = True,
@@ -136,7 +136,7 @@ def write_voxels(folder: Path, frame: int, points: NDArray[np.float32], classes:
         np.packbits(mask).tofile(folder / "voxels" / f"{frame:06d}.{name}")
 
 
-def _movers(drive: TownDrive, frames: range) -> set[int]:
+def _movers(drive: TownDrive, frames: Sequence[int]) -> set[int]:
     """Return the actors that move at some time of the drive: they have a moving class in all frames."""
     return {
         actor.id for frame in frames for actor in drive.actors(frame) if float(np.square(actor.velocity).sum()) > 0.1**2
