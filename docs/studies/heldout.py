@@ -1,6 +1,6 @@
 """Held-out rays under several rules: `python docs/studies/heldout.py` prints the table of the page of `carlasc validate`.
 
-Three drives of `movers.py` (town 61, street 261 and railed 361; 32 channels), of which every 15th scan of the frames 30 to 74 is left out. `--drives FOLDER ...`
+Five drives of each world of `movers.py` (town, street and railed; 32 channels), of which every 15th scan of the frames 30 to 74 is left out. `--drives FOLDER ...`
 takes other drives: folders of sequences with scans and poses. The scores of all drives are added. `--res 0.2` makes finer grids.
 """
 
@@ -22,7 +22,7 @@ RULES |= {"align, evidence": EVIDENCE}
 
 def main() -> None:
     """Print the table."""
-    parser = study.options(__doc__, {kind: own[:1] for kind, own in SEEDS.items()})
+    parser = study.options(__doc__, SEEDS)
     parser.add_argument("--drives", nargs="+", type=Path)
     parser.add_argument("--res", type=float, help="size of a voxel, metres; default: the published grid")
     with study.begin(parser) as given:
@@ -45,7 +45,8 @@ def main() -> None:
 def row(scores: HeldOutScores) -> str:
     """Return the cells of a rule."""
     rays = (scores.all, scores.by_class().get("Vehicle"))
-    shares = [found and found.free for found in rays] + [found and found.passed_object for found in rays]
+    shares = [None if found is None else found.free for found in rays]
+    shares += [None if found is None else found.passed_object for found in rays]
     return " | ".join([*map(show, shares), f"{scores.all.error_90_m} m", show(scores.swept_share)])
 
 

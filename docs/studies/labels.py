@@ -1,6 +1,7 @@
 """What wrong labels do to ground truth from scans: `python docs/studies/labels.py [WORK]` prints the tables of docs/studies/wrong-labels.md as rows finish.
 
 The labels of the drives of `movers.py` are made wrong in several ways, and their grids are compared with what 40 other sensors saw at the same instant.
+The last row has right labels, but voxels with returns of the frame's own scan may be free: it says what the rule of own returns costs.
 WORK keeps drives and references, as that of `movers.py` does.
 `--hint evidence` takes nothing but free space for what moves, instead of the exact flow.
 """
@@ -8,6 +9,8 @@ WORK keeps drives and references, as that of `movers.py` does.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
+from unittest.mock import patch
 
 import numpy as np
 import study
@@ -22,7 +25,7 @@ from carlasc.core.geometry import transform_points
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Voting
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.frame import merge_frame
+from carlasc.groundtruth.from_scans.frame import _FrameSteps, merge_frame
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.voting.certainty import class_shares
@@ -58,11 +61,13 @@ def confused(labels: Labels, points: NDArray[np.float64], frame: int) -> Labels:
     return made
 
 
+RIGHT, MAY_BE_FREE = "right", "right, and own returns may be free"
 CASES: dict[str, Callable[[Labels, NDArray[np.float64], int], Labels] | None] = {
-    "right": None,
+    RIGHT: None,
     "20 % wrong, at random": at_random,
     "25 % wrong, in clumps of 1 m": in_clumps,
     "20 % confused with one other class": confused,
+    MAY_BE_FREE: None,
 }
 
 
@@ -74,9 +79,11 @@ class Score:
         self.right, self.occupied = np.zeros(2), np.zeros(3)
         self.returns = np.zeros((2, 2))
         self.shares: list[NDArray[np.float64]] = []
+        self.grids: dict[int, Grid] = {}
 
     def add(self, grid: Grid, seen: Reference, shares: NDArray[np.void], drive: Recorded, frame: int) -> None:
         """Count a frame."""
+        self.grids[frame] = grid
         made, truth, both = grid.labels, seen.labels, seen.judged & grid.known
         for index, name in enumerate(NAMES):
             own, found = both & (truth == CARLA.id_of(name)), both & (made == CARLA.id_of(name))
@@ -88,10 +95,10 @@ class Score:
         np.maximum.at(top, shares["voxel"], shares["votes"] / 65535)
         judged = (there & full).reshape(-1)
         self.shares.append(np.stack([top[judged], (truth == made).reshape(-1)[judged]]))
-        scan = drive.sequence.scan(frame, ("labels",))
+        scan, classes = drive.sequence.scan(frame, ()), drive.sequence.read("labels", frame)
         voxels = grid.spec.flat_index(scan.points)
-        solid = (voxels >= 0) & (scan.labels > 0) & ~np.isin(scan.labels, sorted(CARLA.ground))
-        for index, own in enumerate((solid, solid & (scan.labels == CARLA.id_of("Vehicle")))):
+        solid = (voxels >= 0) & (classes > 0) & ~np.isin(classes, sorted(CARLA.ground))
+        for index, own in enumerate((solid, solid & (classes == CARLA.id_of("Vehicle")))):
             self.returns[index] += (made.reshape(-1)[voxels[own]] > 0).sum(), own.sum()
 
     def figures(self) -> dict[str, float]:
@@ -125,16 +132,27 @@ def with_labels(drive: Recorded, case: str) -> Sequence:
     return Changed(drive.sequence, labels=labels)
 
 
-def judge(drive: Recorded, references: dict[int, Reference], case: str, observe: FromScans) -> dict[str, float]:
-    """Make the judged frames of a drive, and return the figures."""
+def judge(drive: Recorded, references: dict[int, Reference], case: str, observe: FromScans) -> Score:
+    """Make and count the judged frames of a drive."""
     plan = GridPlan(GRIDS["coarse"], "grid", observe, Voting(keep_evidence=True), FrameRange())
     feed, score = ScanFeed(with_labels(drive, case), observe), Score()
     actors = find_actors(feed)
     for frame, seen in references.items():
-        merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
+        with patch.object(_FrameSteps, "keep_returns") if case == MAY_BE_FREE else nullcontext():
+            merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
         shares = merged.evidence.classes if merged.evidence else class_shares(merged.votes.occupied, CARLA)
         score.add(merged.grid, seen, shares, drive, frame)
-    return score.figures()
+    return score
+
+
+def kept(scores: dict[str, Score], references: dict[int, Reference]) -> NDArray[np.int64]:
+    """Count the judged voxels that only the rule of own returns makes occupied, and those of them that other sensors call free."""
+    counts = np.zeros(2, np.int64)
+    for frame, seen in references.items():
+        full, may_be_free = (scores[case].grids[frame].labels > 0 for case in (RIGHT, MAY_BE_FREE))
+        by_rule = seen.judged & full & ~may_be_free
+        counts += by_rule.sum(), (by_rule & (seen.labels == 0)).sum()
+    return counts
 
 
 def main() -> None:
@@ -142,17 +160,25 @@ def main() -> None:
     parser = study.options(__doc__, SEEDS)
     parser.add_argument("--hint", choices=("flow", "evidence"), default="flow")
     found: dict[str, list[dict[str, float]]] = {case: [] for case in CASES}
+    by_rule = np.zeros(2, np.int64)
     with study.begin(parser) as given:
+        observe = FLOW if given.hint == "flow" else EVIDENCE
         for kind, seed in study.drives(given, SEEDS):
             (drive,) = record(kind, seed, [32], given.work)
             seen = {frame: one for (grid, frame), one in reference(kind, seed, given.work).items() if grid == "coarse"}
-            for case, rows in found.items():
-                rows.append(judge(drive, seen, case, FLOW if given.hint == "flow" else EVIDENCE))
-                print(kind, seed, case, " ".join(f"{k} {v:.3f}" for k, v in rows[-1].items()), flush=True)
-    names = list(found["right"][0])
+            scores = {case: judge(drive, seen, case, observe) for case in CASES}
+            by_rule += kept(scores, seen)
+            for case, score in scores.items():
+                found[case].append(score.figures())
+                print(kind, seed, case, " ".join(f"{k} {v:.3f}" for k, v in found[case][-1].items()), flush=True)
+    names = list(found[RIGHT][0])
     print(f"\n| labels | {' | '.join(names)} |\n|---|{'---:|' * len(names)}")
     for case, rows in found.items():
         print(f"| {case} | {' | '.join(f'{np.mean([row[name] for row in rows]):.3f}' for name in names)} |")
+    voxels, free = by_rule.tolist()
+    print(
+        f"\nVoxels that only the rule of own returns makes occupied: {voxels}; other sensors call {free / max(voxels, 1):.0%} of them free."
+    )
 
 
 if __name__ == "__main__":
