@@ -126,16 +126,18 @@ class Conversion:
         from carlasc.motion.odometry import MIN_POINTS, follow_scans
 
         waiting: deque[ConvertedFrame] = deque()
+        read_at: list[float] = []
 
         def scans() -> Iterator[tuple[NDArray[np.float32], None]]:
             for result in usable:
                 if result.points is not None and len(result.points) >= MIN_POINTS:
                     points, result.points = result.points, None
                     waiting.append(result)
+                    read_at.append(float(self.plan.times[result.number]))
                     yield points, None
 
         nearest, farthest = odometry_range(self.converter)
-        for pose in follow_scans(scans(), min_range_m=nearest, max_range_m=farthest):
+        for pose in follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest):
             yield waiting.popleft(), pose
 
     def _work(self, blocks: Sequence[StageBlock[Any]]) -> Iterator[ConvertedFrame]:

@@ -24,6 +24,14 @@ _NEAR_M = 8.0  # farther ground is left out
 _START = 10  # scans from which the motion at the start is estimated
 _PERIOD_S = 0.1  # between scans whose times are not known
 
+# Where scans are far apart, KISS-ICP may find that a vehicle stands that drives from the first scan on. Things above the sensor, seen from
+# above, tell: poles, trees and facades, but no cars that drive along.
+_TRIED = 4  # scans that are compared
+_CELL_M, _CELLS = 0.5, 256  # of their images from above
+_ABOVE_M = 0.2
+_FASTEST_M_S = 40.0
+_CLEARLY = 1.1  # so many times the overlap make another start the better one
+
 UsableScan = tuple[NDArray[np.floating], NDArray[np.floating] | None]
 """(N, 3) points that `usable_points` chose, metres, sensor frame, and the (N,) seconds of each after the time of its frame, or None."""
 
@@ -44,7 +52,7 @@ def estimate_poses(
     Args:
         scans: (N, 3) points of each scan, metres, sensor frame, right-handed or left-handed; the poses are in the same frame.
         seconds: (N,) time of each point of each scan, after the time of its frame.
-        times: (F,) seconds, increasing: the time of each frame, needed with the times of points; None for frames at 10 Hz.
+        times: (F,) seconds, increasing: the time of each frame; None for frames at 10 Hz.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
         voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
@@ -84,13 +92,14 @@ def follow_scans(
     the poses.
 
     Far ground is left out: its rings move with the sensor and hide the motion at the start of a drive. For the same reason the first scans
-    are registered forwards, backwards, and forwards again with the estimated motion: a drive may start at any speed. On a straight street
-    without structure the driven distance is not determined, and the estimate is too short.
+    are registered forwards, backwards, and forwards again with the estimated motion: a drive may start at any speed. At 5 Hz and less, this
+    may still find that the vehicle stands, so the motion under which things above the sensor overlap most is tried too. On a straight
+    street without structure the driven distance is not determined, and the estimate is too short.
 
     Args:
         scans: the usable points of each scan, sensor frame, right-handed or left-handed; the poses are in the same frame.
-        times: (F,) seconds, increasing: the time of each frame, needed with the times of points; None for frames at 10 Hz. A list may
-            grow during the run, if it has the time of a scan before the scan is read.
+        times: (F,) seconds, increasing: the time of each frame; None for frames at 10 Hz. A list may grow during the run, if it has
+            the time of a scan before the scan is read.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
         voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
@@ -111,12 +120,7 @@ def follow_scans(
     config.mapping.voxel_size = voxel_size_m if voxel_size_m is not None else max_range_m / 100.0
     scans = iter(scans)
     start = list(islice(scans, _START))
-    motion = np.eye(4)
-    for back in (False, True):  # forwards and backwards over the first scans
-        odometry = pipeline.KissICP(config)
-        for number in reversed(range(len(start))) if back else range(len(start)):
-            motion = _register(odometry, start[number], motion, _elapsed(times, number), back=back)
-        motion = invert(motion)
+    motion = _find_start(start, times, lambda: pipeline.KissICP(config))
     odometry = pipeline.KissICP(config)
     first_T_map: Transform | None = None
     for number, scan in enumerate(chain(start, scans)):
@@ -124,6 +128,66 @@ def follow_scans(
         pose = np.array(odometry.last_pose)
         first_T_map = invert(pose) if first_T_map is None else first_T_map
         yield first_T_map @ pose
+
+
+def _find_start(
+    start: Sequence[UsableScan], times: Sequence[float] | NDArray[np.floating] | None, begin: Callable[[], Any]
+) -> Transform:
+    """Return the motion from the first scan to the next one: `first_T_second`.
+
+    Args:
+        start: the first scans.
+        times: of the frames.
+        begin: makes a new odometry.
+    """
+    motion = np.eye(4)
+    for back in (False, True):  # forwards and backwards over the first scans
+        odometry = begin()
+        for number in reversed(range(len(start))) if back else range(len(start)):
+            motion = _register(odometry, start[number], motion, _elapsed(times, number), back=back)
+        motion = invert(motion)
+    above = [_cells_above(points) for points, _ in start[:_TRIED]]
+    if len(above) < _TRIED or not all(map(len, above)):
+        return motion
+    shift = np.eye(4)
+    shift[:2, 3] = _likely_shift(above, _FASTEST_M_S * _elapsed(times, 1))
+    overlaps = []
+    for guess in (motion, shift):
+        odometry, moved = begin(), guess
+        for number, scan in enumerate(start[:_TRIED]):
+            moved = _register(odometry, scan, moved, _elapsed(times, number))
+            if not number:
+                first = np.array(odometry.last_pose)
+        overlaps.append(_overlap(start[0][0], start[_TRIED - 1][0], invert(first) @ odometry.last_pose))
+    return shift if overlaps[1] > _CLEARLY * overlaps[0] else motion
+
+
+def _cells_above(points: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the distinct cells (row, column) that things above the sensor are in, seen from above."""
+    cells = np.floor(points[points[:, 2] > _ABOVE_M, :2] / _CELL_M).astype(np.int64) + _CELLS // 2
+    inside = ((cells >= 0) & (cells < _CELLS)).all(axis=1)
+    return np.unique(cells[inside], axis=0)
+
+
+def _likely_shift(above: Sequence[NDArray[np.int64]], reach_m: float) -> NDArray[np.float64]:
+    """Return the (x, y) motion in metres between scans under which their cells overlap most, if all move alike without a turn."""
+    images = np.zeros((len(above), _CELLS, _CELLS))
+    for image, cells in zip(images, above, strict=True):
+        image[tuple(cells.T)] = 1.0
+    waves = np.fft.rfft2(images)
+    overlap = np.fft.irfft2((waves[:-1] * waves[1:].conj()).sum(axis=0), s=images.shape[1:]).round()
+    shifts = np.fft.fftfreq(_CELLS, 1.0 / _CELLS) * _CELL_M
+    overlap[np.hypot(shifts[:, None], shifts) > reach_m] = -1.0
+    x, y = np.unravel_index(np.argmax(overlap), overlap.shape)
+    return np.array([shifts[x], shifts[y]])
+
+
+def _overlap(first: NDArray[np.floating], last: NDArray[np.floating], first_T_last: Transform) -> float:
+    """Return the share of the cells of what is above the last scan's sensor that the first scan has too."""
+    points = last[last[:, 2] > _ABOVE_M]
+    cells = _cells_above(points @ first_T_last[:3, :3].T + first_T_last[:3, 3])
+    both = np.unique(np.concatenate([_cells_above(first), cells]), axis=0)
+    return (len(_cells_above(first)) + len(cells) - len(both)) / max(len(cells), 1)
 
 
 def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:

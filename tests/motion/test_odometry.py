@@ -121,6 +121,33 @@ def test_frames_may_be_at_any_rate(bend):
     assert np.linalg.norm((estimated - true[::2])[-1, :2, 3]) < 0.1
 
 
+def long_street(speed):
+    """A street of houses, poles and trees, and cars that drive along with the vehicle at its speed."""
+    rng = np.random.default_rng(3)
+    for side in (-1, 1):
+        x = -70.0
+        while x < 160.0:
+            length, away = rng.uniform(8, 20), rng.uniform(13, 20)
+            yield Thing("building", (x + length / 2, side * away, 4.0), (length, 8.0, 8.0))
+            yield Thing("pole", (x, side * rng.uniform(7, 9), 3.5), (0.25, 0.25, 7.0))
+            yield Thing("vegetation", (x + length / 2, side * rng.uniform(7, 9), 3.5), (2.0, 2.0, 4.0))
+            x += length + rng.uniform(1, 12)
+    for ahead in (-24.0, -12.0, 12.0, 24.0, 36.0):
+        yield Thing("car", (ahead, rng.choice([0.0, 3.5, -3.5]), 0.8), (4.4, 1.8, 1.5), speed=speed)
+
+
+def test_a_drive_may_start_fast_at_a_low_rate():
+    things = tuple(long_street(11.0))
+    drive = SimulatedDrive(frames=12, period_s=0.5, speed=11.0, channels=32, columns=540, things=things)
+    true = invert(drive.world_T_vehicle(0.0)) @ drive.world_T_vehicle(drive.times)
+    scans = [drive.scan(frame).points[:, :3] for frame in range(12)]
+    estimated = estimate_poses(scans, times=drive.times, max_range_m=60.0)
+    assert step_errors(estimated, true).max() < 0.3  # by KISS-ICP alone, the vehicle stands: 5.5 m
+    turned = rotation_z(2.0)  # the sensor may be mounted in any direction
+    estimated = estimate_poses([transform_points(turned, scan) for scan in scans], times=drive.times, max_range_m=60.0)
+    assert step_errors(invert(turned) @ estimated @ turned, true).max() < 0.3
+
+
 def test_seconds_must_be_those_of_the_points():
     scans = [np.zeros((200, 3))] * 2
     with pytest.raises(ArgumentError, match="expected 200 of scan 1, one per point, found 199"):

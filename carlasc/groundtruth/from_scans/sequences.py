@@ -317,8 +317,9 @@ def with_estimated_poses(sequence: Sequence) -> Sequence:
     """
     frames = sequence.frames("points")
     scans = (sequence.read("points", int(frame))[:, :3] for frame in frames)
+    times = [sequence.read_time(frame) for frame in frames.tolist()] if layout.TIMES in sequence.documents() else None
     try:
-        poses = estimate_poses(scans, max_range_m=sequence.metadata.max_range_m or _RANGE_M)
+        poses = estimate_poses(scans, times=times, max_range_m=sequence.metadata.max_range_m or _RANGE_M)
     except ArgumentError as error:  # an argument there, data here
         raise FormatError(
             sequence.location, expected=f"poses, or {error.expected}", found=error.found, advice=error.advice
