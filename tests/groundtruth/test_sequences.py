@@ -114,8 +114,9 @@ def test_frames_without_a_scan_take_the_estimated_pose_of_the_scan_before(tmp_pa
     sequence = write(tmp_path, straight(10, 6), frames=[0, 2, 5])
     sizes = []
 
-    def estimate(scans, max_range_m):
+    def estimate(scans, times, max_range_m):
         sizes.extend(scan.shape for scan in scans)
+        assert times == pytest.approx([0.0, 0.2, 0.5])
         assert max_range_m == 100.0
         return np.stack([translation((number, 0, 0)) for number in range(len(sizes))])
 
