@@ -45,8 +45,7 @@ class FutureGrid(GridFrames):
         self.grid, self.around = grid, around
         self.path, self.location, self.spec, self.classes = grid.path, grid.location, grid.spec, grid.classes
         numbers, sequence = grid.frames(), grid.sequence
-        timed = layout.TIMES in sequence.documents()
-        times = np.array([sequence.read_time(n) if timed else n * layout.FRAME_PERIOD_S for n in numbers.tolist()])
+        times = sequence.times_of(numbers)
         wanted = times + horizon_s
         after = np.searchsorted(times, wanted).clip(max=len(times) - 1)
         before = np.maximum(after - 1, 0)

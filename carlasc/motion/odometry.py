@@ -6,6 +6,7 @@ The points of a scan are measured one after the other, while the sensor moves.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import chain, islice
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.cells import distinct
 from carlasc.core.compiling import cached
-from carlasc.core.geometry import Transform, invert, slerp
+from carlasc.core.geometry import Transform, invert, slerp, transform_points
 from carlasc.core.scans import finite
 from carlasc.errors import ArgumentError, import_extra
 from carlasc.motion.ground import ground_points
@@ -120,14 +121,8 @@ def follow_scans(
     config.mapping.voxel_size = voxel_size_m if voxel_size_m is not None else max_range_m / 100.0
     scans = iter(scans)
     start = list(islice(scans, _START))
-    motion = _find_start(start, times, lambda: pipeline.KissICP(config))
-    odometry = pipeline.KissICP(config)
-    first_T_map: Transform | None = None
-    for number, scan in enumerate(chain(start, scans)):
-        motion = _register(odometry, scan, motion, _elapsed(times, number))
-        pose = np.array(odometry.last_pose)
-        first_T_map = invert(pose) if first_T_map is None else first_T_map
-        yield first_T_map @ pose
+    begin = partial(pipeline.KissICP, config)
+    yield from _follow(begin(), enumerate(chain(start, scans)), times, _find_start(start, times, begin))
 
 
 def _find_start(
@@ -140,12 +135,12 @@ def _find_start(
         times: of the frames.
         begin: makes a new odometry.
     """
-    motion = np.eye(4)
+    numbered, motion = list(enumerate(start)), np.eye(4)
     for back in (False, True):  # forwards and backwards over the first scans
         odometry = begin()
-        for number in reversed(range(len(start))) if back else range(len(start)):
-            motion = _register(odometry, start[number], motion, _elapsed(times, number), back=back)
-        motion = invert(motion)
+        for _ in _follow(odometry, reversed(numbered) if back else numbered, times, motion, back=back):
+            pass  # only the last motion counts
+        motion = invert(np.array(odometry.last_delta))
     above = [_cells_above(points) for points, _ in start[:_TRIED]]
     if len(above) < _TRIED or not all(map(len, above)):
         return motion
@@ -153,13 +148,26 @@ def _find_start(
     shift[:2, 3] = _likely_shift(above, _FASTEST_M_S * _elapsed(times, 1))
     overlaps = []
     for guess in (motion, shift):
-        odometry, moved = begin(), guess
-        for number, scan in enumerate(start[:_TRIED]):
-            moved = _register(odometry, scan, moved, _elapsed(times, number))
-            if not number:
-                first = np.array(odometry.last_pose)
-        overlaps.append(_overlap(start[0][0], start[_TRIED - 1][0], invert(first) @ odometry.last_pose))
+        *_, first_T_last = _follow(begin(), numbered[:_TRIED], times, guess)
+        overlaps.append(_overlap(above[0], start[_TRIED - 1][0], first_T_last))
     return shift if overlaps[1] > _CLEARLY * overlaps[0] else motion
+
+
+def _follow(
+    odometry: Any,
+    numbered: Iterable[tuple[int, UsableScan]],
+    times: Sequence[float] | NDArray[np.floating] | None,
+    motion: Transform,
+    *,
+    back: bool = False,
+) -> Iterator[Transform]:
+    """Register scans with their numbers one after the other, and yield `first_T_scan` of each; `motion` and `back` are those of `_register`."""
+    first_T_map: Transform | None = None
+    for number, scan in numbered:
+        motion = _register(odometry, scan, motion, _elapsed(times, number), back=back)
+        pose = np.array(odometry.last_pose)
+        first_T_map = invert(pose) if first_T_map is None else first_T_map
+        yield first_T_map @ pose
 
 
 def _cells_above(points: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -182,12 +190,11 @@ def _likely_shift(above: Sequence[NDArray[np.int64]], reach_m: float) -> NDArray
     return np.array([shifts[x], shifts[y]])
 
 
-def _overlap(first: NDArray[np.floating], last: NDArray[np.floating], first_T_last: Transform) -> float:
-    """Return the share of the cells of what is above the last scan's sensor that the first scan has too."""
-    points = last[last[:, 2] > _ABOVE_M]
-    cells = _cells_above(points @ first_T_last[:3, :3].T + first_T_last[:3, 3])
-    both = np.unique(np.concatenate([_cells_above(first), cells]), axis=0)
-    return (len(_cells_above(first)) + len(cells) - len(both)) / max(len(cells), 1)
+def _overlap(first: NDArray[np.int64], last: NDArray[np.floating], first_T_last: Transform) -> float:
+    """Return the share of the cells of what is above the sensor in the last scan, (N, 3) points, that are among those of the first scan."""
+    cells = _cells_above(transform_points(first_T_last, last[last[:, 2] > _ABOVE_M]))
+    both = np.unique(np.concatenate([first, cells]), axis=0)
+    return (len(first) + len(cells) - len(both)) / max(len(cells), 1)
 
 
 def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -236,6 +236,12 @@ class Sequence(ABC):
         line = self.line_of(frame, len(self.times), layout.TIMES)
         return float(check_seconds(self.times[line : line + 1], f"{self.location}/{layout.TIMES}: line {line + 1}")[0])
 
+    def times_of(self, frames: Iterable[int]) -> NDArray[np.float64]:
+        """Return (F,) seconds of frames since the first frame: those of `read_time`, or at 10 Hz without times.txt."""
+        if layout.TIMES in self.documents():
+            return np.array([self.read_time(int(frame)) for frame in frames], np.float64)
+        return np.array([frame * layout.FRAME_PERIOD_S for frame in frames], np.float64)
+
     def line_of(self, frame: int, lines: int, document: str) -> int:
         """Return the number of the line of a text file that belongs to a frame.
 

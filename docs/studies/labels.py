@@ -95,7 +95,8 @@ class Score:
         np.maximum.at(top, shares["voxel"], shares["votes"] / 65535)
         judged = (there & full).reshape(-1)
         self.shares.append(np.stack([top[judged], (truth == made).reshape(-1)[judged]]))
-        scan, classes = drive.sequence.scan(frame, ()), drive.sequence.read("labels", frame)
+        scan = drive.sequence.scan(frame, ("labels",))
+        classes = study.labels_of(scan)
         voxels = grid.spec.flat_index(scan.points)
         solid = (voxels >= 0) & (classes > 0) & ~np.isin(classes, sorted(CARLA.ground))
         for index, own in enumerate((solid, solid & (classes == CARLA.id_of("Vehicle")))):

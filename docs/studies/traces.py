@@ -1,7 +1,8 @@
 """What stays of things that move: `python docs/studies/traces.py [WORK]` draws docs/images/traces.png, and prints what is in it.
 
 A frame of the street of seed 261, made without labels that tell what moves, as in SemanticKITTI and by carlasc, beside what 40 other sensors saw at the same
-instant. For each picture: how many voxels of vehicles are right and wrong, and how many of the reference's are missing, of the voxels known to both. WORK is the folder of `movers.py`.
+instant. For each picture: how many voxels of vehicles are right and wrong, and how many of the reference's are missing, of the voxels known to both.
+WORK is the folder of `movers.py`.
 """
 
 from __future__ import annotations

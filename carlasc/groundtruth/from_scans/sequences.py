@@ -317,7 +317,7 @@ def with_estimated_poses(sequence: Sequence) -> Sequence:
     """
     frames = sequence.frames("points")
     scans = (sequence.read("points", int(frame))[:, :3] for frame in frames)
-    times = _seconds_of(sequence, frames)
+    times = sequence.times_of(frames)
     try:
         poses = estimate_poses(scans, times=times, max_range_m=sequence.metadata.max_range_m or _RANGE_M)
     except ArgumentError as error:  # an argument there, data here
@@ -358,16 +358,9 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
         _check_speed(sequence, frames, where)
 
 
-def _seconds_of(sequence: Sequence, frames: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return (F,) seconds of frames, at 10 Hz if the sequence has no times."""
-    if layout.TIMES not in sequence.documents():
-        return np.asarray(frames * layout.FRAME_PERIOD_S, np.float64)
-    return np.array([sequence.read_time(frame) for frame in frames.tolist()], np.float64)
-
-
 def _check_speed(sequence: Sequence, frames: NDArray[np.int64], where: str) -> None:
     poses = np.stack([sequence.read_pose(int(frame)) for frame in frames])
-    elapsed_s = np.diff(_seconds_of(sequence, frames))
+    elapsed_s = np.diff(sequence.times_of(frames))
     speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / elapsed_s
     traces = np.einsum("fij,fij->f", poses[1:, :3, :3], poses[:-1, :3, :3])
     turn = np.arccos(np.clip((traces - 1) / 2, -1, 1)) / elapsed_s

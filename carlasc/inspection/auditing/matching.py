@@ -158,9 +158,8 @@ class MatchedGrids:
     def trajectory(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
         """(F,) frames with scans, their seconds, and their (F, 4, 4) poses, None without poses.txt."""
         frames, documents = self.scans.frames("points"), self.scans.documents()
-        seconds = [self.scans.read_time(f) for f in frames.tolist()] if layout.TIMES in documents else frames * layout.FRAME_PERIOD_S  # fmt: skip
         poses = np.stack([self.scans.read_pose(f) for f in frames.tolist()]) if layout.POSES in documents else None
-        return frames, np.asarray(seconds), poses
+        return frames, self.scans.times_of(frames), poses
 
     @property
     def period_s(self) -> float:

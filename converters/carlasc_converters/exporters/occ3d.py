@@ -129,8 +129,10 @@ class Occ3dExporter(GridExporter):
         tokens = ["", *(frame_token(sequence.name, frame) for frame in part.frames), ""]
         documents = sequence.documents()
         scene = {}
-        for before, frame, token, after in zip(tokens[:-2], part.frames, tokens[1:-1], tokens[2:], strict=True):
-            seconds = sequence.read_time(frame) if layout.TIMES in documents else frame * layout.FRAME_PERIOD_S
+        rows = zip(
+            tokens[:-2], part.frames, tokens[1:-1], tokens[2:], sequence.times_of(part.frames).tolist(), strict=True
+        )
+        for before, frame, token, after, seconds in rows:
             scene[token] = {
                 "timestamp": str(round(seconds * 1e6)),
                 "camera_sensor": {},

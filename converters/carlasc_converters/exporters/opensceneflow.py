@@ -147,9 +147,8 @@ class OpenSceneFlowExporter(SequenceExporter):
             flow = read.get("flow")
             velocity = None if flow is None else mirror_points(flow) if left else flow
             now, later = (_boxes(sequence, number) for number in (frame, following))
-            step = _Step(
-                invert(_pose(sequence, following)) @ pose, _seconds(sequence, following) - _seconds(sequence, frame)
-            )
+            (elapsed_s,) = np.diff(sequence.times_of([frame, following])).tolist()
+            step = _Step(invert(_pose(sequence, following)) @ pose, elapsed_s)
             made |= step.flow(points, velocity, read.get("instances"), now, later)
             near = (np.abs(points[:, :2]) <= _EVALUATED_M).all(axis=1)
             made["eval_mask"] = near & ~made["ground_mask"] & made["flow_is_valid"]
@@ -162,7 +161,7 @@ class OpenSceneFlowExporter(SequenceExporter):
             FormatError: times do not increase.
         """
         frames = self.frames(sequence)
-        times = [round(_seconds(sequence, frame) * 1e9) for frame in frames]
+        times = [round(seconds * 1e9) for seconds in sequence.times_of(frames).tolist()]
         for before, after, frame in zip(times, times[1:], frames[1:], strict=False):
             if after <= before:
                 where = f"{sequence.location}/{layout.TIMES}"
@@ -274,10 +273,6 @@ def _pose(sequence: storage.Sequence, frame: int) -> Transform:
     """Return first_T_scan of a frame, right-handed."""
     pose = sequence.read_pose(frame)
     return pose if sequence.metadata.axes == "right" else mirror_poses(pose)
-
-
-def _seconds(sequence: storage.Sequence, frame: int) -> float:
-    return sequence.read_time(frame) if layout.TIMES in sequence.documents() else frame * layout.FRAME_PERIOD_S
 
 
 def _boxes(sequence: storage.Sequence, frame: int) -> Boxes | None:
