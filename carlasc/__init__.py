@@ -1,6 +1,7 @@
 """`carlasc`: the SDK for CarlaSC, the data set of complete semantic scenes without ghost trails.
 
-Importing it is fast: a public name, or a subpackage such as `carlasc.metrics`, is loaded on first use.
+Importing it is fast: a public name, or a subpackage such as `carlasc.metrics`, is loaded on first
+use.
 """
 
 import lazy_loader

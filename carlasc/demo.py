@@ -65,17 +65,20 @@ def demonstrate(
     step: Step | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> DemoResult:
-    """Simulate two short drives, make their ground truth in the published grids, validate it, count classes, and draw pictures.
+    """Simulate two short drives, make their ground truth in the published grids, validate it, count
+    classes, and draw pictures.
 
-    One drive is for training, one for validation. A second run with the same arguments makes missing files only, and draws the pictures and
-    the page again.
+    One drive is for training, one for validation. A second run with the same arguments makes
+    missing files only, and draws the pictures and the page again.
 
     Args:
         out: folder to write to.
         count: number of frames of each drive, at least 5 to train with stacks of five scans.
-        sensors: number of LiDARs of the drive for training; a fifth of them record the drive for validation.
+        sensors: number of LiDARs of the drive for training; a fifth of them record the drive for
+            validation.
         seed: seed of the simulated towns.
-        step: called with the name of each step. Returns a context manager that yields the progress callback of the step.
+        step: called with the name of each step. Returns a context manager that yields the progress
+            callback of the step.
         run: how the work is distributed. Progress is reported to `step`.
 
     Returns:
@@ -97,7 +100,10 @@ def demonstrate(
     train, val = out / TRAIN, out / VAL
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not train.is_dir())):
         raise ConflictError(
-            out, expected="an empty folder or an earlier demo", found="other files", advice="choose another folder"
+            out,
+            expected="an empty folder or an earlier demo",
+            found="other files",
+            advice="choose another folder",
         )
 
     drives: tuple[tuple[Path, int, TrafficLevel], ...] = (
@@ -107,7 +113,14 @@ def demonstrate(
     for folder, own, traffic in drives:
         with step(f"simulate a town, {folder.parent.name}") as progress:
             spread = replace(run, progress=progress)
-            simulate(folder, count=count, sensors=own, seed=seed + (folder == val), traffic=traffic, run=spread)
+            simulate(
+                folder,
+                count=count,
+                sensors=own,
+                seed=seed + (folder == val),
+                traffic=traffic,
+                run=spread,
+            )
     grids = []
     for preset in get_args(Preset):
         with step(f"ground truth, {preset}") as progress:
@@ -130,10 +143,14 @@ def demonstrate(
     with step("write a page for a browser") as progress:
         view(Scene(grids[0]), page, overwrite=True, progress=progress)
     elapsed_s = time.perf_counter() - start
-    return DemoResult((train, val), tuple(grids), tuple(pictures), page, validation, statistics, elapsed_s)
+    return DemoResult(
+        (train, val), tuple(grids), tuple(pictures), page, validation, statistics, elapsed_s
+    )
 
 
-def _list_pictures(out: Path, grids: list[Path], frame: int) -> list[tuple[Path, Scene, str, CameraOptions]]:
+def _list_pictures(
+    out: Path, grids: list[Path], frame: int
+) -> list[tuple[Path, Scene, str, CameraOptions]]:
     """Return the file, the scene, the content and the camera of each picture."""
     from carlasc.viewing import CameraOptions, Scene
 

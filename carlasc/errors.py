@@ -1,7 +1,9 @@
-"""The exceptions of carlasc, helpers for messages, the check for optional packages, and postponed Ctrl-C.
+"""The exceptions of carlasc, helpers for messages, the check for optional packages, and postponed
+Ctrl-C.
 
-Every message is one line: where (a file, a field, an argument), what was expected, what was found, what to do. Parts of it come from files
-and other libraries, so `printable` escapes control characters, and long parts are shortened.
+Every message is one line: where (a file, a field, an argument), what was expected, what was found,
+what to do. Parts of it come from files and other libraries, so `printable` escapes control
+characters, and long parts are shortened.
 """
 
 from __future__ import annotations
@@ -18,60 +20,81 @@ from types import FrameType, ModuleType
 from typing import Any, Self, get_args
 
 _USER = re.compile(r"(?<=://)[^/\s@'\"]+@")  # user:password
-# Characters that control a terminal or change the order of a line: control characters (ESC starts commands of a terminal), marks for the
-# direction of writing (Bidi_Control of Unicode), ends of lines and paragraphs, and lone surrogates, which Python uses for bytes of file
-# names that are not UTF-8.
-_UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-_LONGEST = 400  # maximum characters of a part of a message; messages of other libraries can contain whole headers
-_QUERY = re.compile(
-    r"(\b[a-z][a-z0-9+.-]*://[^\s?'\"]*)\?[^\s'\"]+=[^\s'\"]*"
-)  # query, which may be a signature or a token
+# Characters that control a terminal or change the order of a line: control characters (ESC starts
+# commands of a terminal), marks for the direction of writing (Bidi_Control of Unicode), ends of
+# lines and paragraphs, and lone surrogates, which Python uses for bytes of file names that are not
+# UTF-8.
+_UNSAFE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+# maximum characters of a part of a message; messages of other libraries can contain whole headers
+_LONGEST = 400
+# query, which may be a signature or a token
+_QUERY = re.compile(r"(\b[a-z][a-z0-9+.-]*://[^\s?'\"]*)\?[^\s'\"]+=[^\s'\"]*")
 
 
 class CarlascError(Exception):
     """Base class of all exceptions of `carlasc`.
 
-    The message is one line of all attributes that are not empty: `WHERE: PROBLEM: expected EXPECTED, found FOUND: ADVICE`.
+    The message is one line of all attributes that are not empty: `WHERE: PROBLEM: expected
+    EXPECTED, found FOUND: ADVICE`.
 
     Attributes:
         where: place of the error: a file, a URL, a field, or the name of an argument.
         problem: what went wrong, if "expected ..., found ..." is not sufficient.
         expected: the expected value or state.
         found: the actual value or state.
-        advice: what the user can do. It names arguments as `` `overwrite=True` ``, which the command line replaces by its options.
+        advice: what the user can do. It names arguments as `` `overwrite=True` ``, which the
+            command line replaces by its options.
     """
 
     def __init__(
-        self, where: object, *, problem: str = "", expected: str = "", found: str = "", advice: str = ""
+        self,
+        where: object,
+        *,
+        problem: str = "",
+        expected: str = "",
+        found: str = "",
+        advice: str = "",
     ) -> None:
         shown = without_credentials(str(where))
         super().__init__(
             shown
-        )  # the only positional argument, so that errors can be pickled: other attributes are in __dict__
+            # the only positional argument, so that errors can be pickled: other attributes are in
+            # __dict__
+        )
         self.where, self.problem = shown, problem
         self.expected, self.found, self.advice = expected, found, advice
 
     def __str__(self) -> str:
         where, problem, expected, found, advice = (
-            _one_line(str(part)) for part in (self.where, self.problem, self.expected, self.found, self.advice)
+            _one_line(str(part))
+            for part in (self.where, self.problem, self.expected, self.found, self.advice)
         )
-        comparison = ", ".join(f"{verb} {text}" for verb, text in (("expected", expected), ("found", found)) if text)
-        return without_credentials(": ".join(part for part in (where, problem, comparison, advice) if part))
+        comparison = ", ".join(
+            f"{verb} {text}" for verb, text in (("expected", expected), ("found", found)) if text
+        )
+        return without_credentials(
+            ": ".join(part for part in (where, problem, comparison, advice) if part)
+        )
 
     def within(self, where: object) -> Self:
-        """Return a copy whose place is prefixed with the place that contains it: "b" becomes "a.zip: b" with `within("a.zip")`."""
-        error = type(self).__new__(
-            type(self), *self.args
-        )  # not copy.copy: packages that pickle tracebacks change what it does
+        """Return a copy whose place is prefixed with the place that contains it: "b" becomes
+        "a.zip: b" with `within("a.zip")`.
+        """
+        # not copy.copy: packages that pickle tracebacks change what it does
+        error = type(self).__new__(type(self), *self.args)
         vars(error).update(vars(self))
         error.where = f"{where}: {self.where}"
         return error
 
 
 def printable(text: str) -> str:
-    r"""Escape control characters, and marks for the direction of writing, as in `\\x1b`, so that a text can be printed in a terminal.
+    r"""Escape control characters, and marks for the direction of writing, as in `\\x1b`, so that a
+    text can be printed in a terminal.
 
-    Names of sequences, classes and files come from untrusted data. They must not clear a screen, hide a line, or write to a clipboard.
+    Names of sequences, classes and files come from untrusted data. They must not clear a screen,
+    hide a line, or write to a clipboard.
     """
     return _UNSAFE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
@@ -79,11 +102,17 @@ def printable(text: str) -> str:
 def _one_line(text: str) -> str:
     """Return a part of a message as a printable line. A long part is shortened in the middle."""
     line = printable(" ".join(text.splitlines()))
-    return line if len(line) <= _LONGEST else f"{line[: _LONGEST * 2 // 3]} [...] {line[-_LONGEST // 3 :]}"
+    return (
+        line
+        if len(line) <= _LONGEST
+        else f"{line[: _LONGEST * 2 // 3]} [...] {line[-_LONGEST // 3 :]}"
+    )
 
 
 def without_credentials(text: str) -> str:
-    """Remove credentials from the URLs in a text: user, password, and queries, which may be signatures."""
+    """Remove credentials from the URLs in a text: user, password, and queries, which may be
+    signatures.
+    """
     return _QUERY.sub(r"\1", _USER.sub("", text)) if "://" in text else text
 
 
@@ -95,8 +124,9 @@ class FormatError(CarlascError, ValueError):
 def reading(where: object, expected: str, advice: str = "") -> Iterator[None]:
     """Turn any error in a block that parses data from a file into a FormatError.
 
-    For untrusted data, NumPy, zlib, zipfile, h5py, pyarrow and the JSON parser raise two dozen types of exceptions, few of them documented.
-    The block should therefore contain only the call that parses the data.
+    For untrusted data, NumPy, zlib, zipfile, h5py, pyarrow and the JSON parser raise two dozen
+    types of exceptions, few of them documented. The block should therefore contain only the call
+    that parses the data.
 
     Args:
         where: the file.
@@ -117,7 +147,9 @@ def reading(where: object, expected: str, advice: str = "") -> Iterator[None]:
 
 
 def describe(error: BaseException) -> str:
-    """Return the message of an error of another library, or its type if the message is not sufficient."""
+    """Return the message of an error of another library, or its type if the message is not
+    sufficient.
+    """
     text = str(error).strip()
     if isinstance(error, LookupError):
         return f"{type(error).__name__}: {text}"  # the message of a KeyError is only the key
@@ -137,7 +169,10 @@ class DependencyError(CarlascError, ImportError):
 
 
 class ArgumentError(CarlascError, ValueError):
-    """An argument has an invalid value. `where` is the name of the argument. The command line exits with 2."""
+    """An argument has an invalid value.
+
+    `where` is the name of the argument. The command line exits with 2.
+    """
 
 
 class ConflictError(CarlascError):
@@ -145,7 +180,10 @@ class ConflictError(CarlascError):
 
 
 class StorageError(CarlascError):
-    """The output cannot be written: a full disk, a folder without write permission. Further writes would fail too."""
+    """The output cannot be written: a full disk, a folder without write permission.
+
+    Further writes would fail too.
+    """
 
 
 def check_choice(name: str, value: object, choices: Any) -> None:
@@ -183,19 +221,25 @@ def import_extra(module: str, extra: str) -> ModuleType:
     except ImportError as error:
         package = module.partition(".")[0]
         problem = "is not installed" if error.name == package else f"does not load ({error})"
-        raise DependencyError(f"{package} {problem}", advice=f"install it with `{install_command(extra)}`") from error
+        raise DependencyError(
+            f"{package} {problem}", advice=f"install it with `{install_command(extra)}`"
+        ) from error
 
 
 def install_command(extra: str) -> str:
-    """Return the pip command that adds an extra to this installation, from the same origin: a checkout, a file, or an index."""
+    """Return the pip command that adds an extra to this installation, from the same origin: a
+    checkout, a file, or an index.
+    """
     import json
     import shlex
     from importlib import metadata
     from urllib.parse import unquote, urlsplit
 
     found, editable = "carlasc", ""
-    with suppress(metadata.PackageNotFoundError, ValueError):  # not installed (only on the path), or not JSON
-        origin = json.loads(metadata.distribution("carlasc").read_text("direct_url.json") or "{}")  # PEP 610
+    # not installed (only on the path), or not JSON
+    with suppress(metadata.PackageNotFoundError, ValueError):
+        # PEP 610
+        origin = json.loads(metadata.distribution("carlasc").read_text("direct_url.json") or "{}")
         url = urlsplit(origin.get("url", ""))
         if url.scheme == "file":
             found = unquote(url.path)
@@ -207,9 +251,11 @@ def install_command(extra: str) -> str:
 def postponed_interrupts() -> Iterator[None]:
     """Postpone Ctrl-C to the end of the block.
 
-    This is for blocks that submit work to an executor: if the start of a thread is interrupted, the executor does not register the running
-    thread, and the interpreter hangs at exit. It is also for imports: packages such as trimesh catch all exceptions of their imports, and
-    continue without the imported package. In threads other than the main thread, which Ctrl-C does not reach, this has no effect.
+    This is for blocks that submit work to an executor: if the start of a thread is interrupted, the
+    executor does not register the running thread, and the interpreter hangs at exit. It is also for
+    imports: packages such as trimesh catch all exceptions of their imports, and continue without
+    the imported package. In threads other than the main thread, which Ctrl-C does not reach, this
+    has no effect.
     """
     handler = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or handler is None:

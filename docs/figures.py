@@ -1,4 +1,6 @@
-"""Draws the documentation's pictures: `python docs/figures.py [NAME ...]` writes docs/images/<name>."""
+"""Draws the documentation's pictures: `python docs/figures.py [NAME ...]` writes
+docs/images/<name>.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,14 @@ def draw_frames() -> bytes:
     _arrow(above, (0, 0), (3.0, 0), RIGHT, "y right", (1.75, -0.45))
     turn = np.linspace(np.pi / 2, np.pi / 10, 40)
     above.plot(2.2 * np.cos(turn), 2.2 * np.sin(turn), color=UP)
-    _arrow(above, (2.2 * np.cos(0.35), 2.2 * np.sin(0.35)), (2.2 * np.cos(0.31), 2.2 * np.sin(0.31)), UP, "", (0, 0))
+    _arrow(
+        above,
+        (2.2 * np.cos(0.35), 2.2 * np.sin(0.35)),
+        (2.2 * np.cos(0.31), 2.2 * np.sin(0.31)),
+        UP,
+        "",
+        (0, 0),
+    )
     above.text(1.75, 1.75, "azimuth, yaw\natan2(y, x)", color=UP)
     for x, y, text in ((-3.1, 0, "-π/2"), (0, -3.2, "±π"), (0, 3.85, "0"), (3.4, 0, "π/2")):
         above.text(x, y, text, color=INK, ha="center", va="center")
@@ -82,7 +91,9 @@ def draw_votes() -> bytes:
     for x in range(12):
         for y in range(4):
             inside = [s for s in samples if (np.floor(s) == (x, y)).all()]
-            color = "#cfe8cf" if inside else "#f3b4b4" if (np.floor(hit) == (x, y)).all() else "white"
+            color = (
+                "#cfe8cf" if inside else "#f3b4b4" if (np.floor(hit) == (x, y)).all() else "white"
+            )
             axes.add_patch(_rectangle((x, y), 1, 1, facecolor=color, edgecolor=PALE))
     axes.plot(*zip(start, hit, strict=True), color=INK, linewidth=1)
     axes.plot(*start, "s", color=INK, markersize=9)
@@ -98,7 +109,11 @@ def draw_votes() -> bytes:
         arrowprops={"arrowstyle": "-", "color": RIGHT},
     )  # fmt: skip
     axes.text(
-        6.0, -0.45, "white: no vote from here. A voxel that no sensor votes for is unknown", color=INK, ha="center"
+        6.0,
+        -0.45,
+        "white: no vote from here. A voxel that no sensor votes for is unknown",
+        color=INK,
+        ha="center",
     )
     axes.set_xlim(-0.1, 12.1)
     axes.set_ylim(-0.8, 4.8)
@@ -106,7 +121,9 @@ def draw_votes() -> bytes:
 
 
 def draw_town() -> bytes:
-    """Ground truth of twenty LiDARs at 0.2 m up to 4 m above the sensor, in the paper's classes and colours."""
+    """Ground truth of twenty LiDARs at 0.2 m up to 4 m above the sensor, in the paper's classes and
+    colours.
+    """
     published = GridSpec.published()
     spec = published.with_bounds(published.lower, (*published.upper[:2], 4.0)).with_resolution(0.2)
     picture = render_grid(
@@ -122,7 +139,10 @@ def draw_grids() -> bytes:
     """The published grids, coarse, fine and cylindrical, of one frame."""
     panels = [
         Panel(
-            grid_drawing(_ground_truth(GridSpec.published(name)), ClassColors(REMAPS["carlasc11"].target)), title=name
+            grid_drawing(
+                _ground_truth(GridSpec.published(name)), ClassColors(REMAPS["carlasc11"].target)
+            ),
+            title=name,
         )
         for name in get_args(Preset)
     ]
@@ -157,7 +177,12 @@ def _ground_truth(spec: GridSpec) -> Grid:
 
 
 def _canvas(columns: int, size: tuple[float, float], widths: list[float]) -> tuple[Any, Any]:
-    mpl.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "carlasc", "font.family": "sans-serif", "font.size": 10}
+    mpl.rcParams |= {
+        "svg.fonttype": "none",
+        "svg.hashsalt": "carlasc",
+        "font.family": "sans-serif",
+        "font.size": 10,
+    }
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, columns, squeeze=False, width_ratios=widths)[0]
@@ -182,13 +207,17 @@ def _arrow(axis: Any, tail: Any, head: Any, color: str, text: str, at: tuple[flo
 
 def _svg(figure: Any) -> bytes:
     buffer = BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, facecolor="white")
+    figure.savefig(
+        buffer, format="svg", metadata={"Date": None, "Creator": None}, facecolor="white"
+    )
     return buffer.getvalue()
 
 
 def _png(picture: NDArray[np.uint8]) -> bytes:
     """Return a small PNG, of 256 colours; rare ones, the legend's, are kept."""
-    small = Image.fromarray(picture).quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
+    small = Image.fromarray(picture).quantize(
+        256, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE
+    )
     buffer = BytesIO()
     small.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()

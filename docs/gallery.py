@@ -1,8 +1,10 @@
-"""Makes the pictures of the gallery by running the commands of its page: `python docs/gallery.py [SECTION ...]` writes docs/images/gallery.
+"""Makes the pictures of the gallery by running the commands of its page: `python docs/gallery.py
+[SECTION ...]` writes docs/images/gallery.
 
-Everything is simulated, so nothing has to be downloaded. The script prints how long each command takes: twelve minutes in all on two
-cores that other programs used at the same time. It needs three gigabytes of disk while it runs. With names of sections, only these are
-made, with the data that they need.
+Everything is simulated, so nothing has to be downloaded. The script prints how long each command
+takes: twelve minutes in all on two cores that other programs used at the same time. It needs three
+gigabytes of disk while it runs. With names of sections, only these are made, with the data that
+they need.
 """
 
 from __future__ import annotations
@@ -57,7 +59,8 @@ def make(folder: Path, images: Path, titles: Sequence[str] = ()) -> list[Path]:
     Args:
         folder: an empty folder, or one of an earlier call, whose data are used again.
         images: where the copies are written.
-        titles: headings of the sections whose pictures are made; empty makes all. The data of the sections before them are made too.
+        titles: headings of the sections whose pictures are made; empty makes all. The data of the
+            sections before them are made too.
 
     Returns:
         The copies.
@@ -73,7 +76,12 @@ def make(folder: Path, images: Path, titles: Sequence[str] = ()) -> list[Path]:
     copies = []
     for command, section in _needed(sections, titles):
         started = time.monotonic()
-        subprocess.run([sys.executable, "-m", *shlex.split(command)], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [sys.executable, "-m", *shlex.split(command)],
+            cwd=folder,
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
         print(f"{time.monotonic() - started:6.1f} s  {command}", flush=True)
         name = _output_of(command)
         if name in section.images:
@@ -82,22 +90,36 @@ def make(folder: Path, images: Path, titles: Sequence[str] = ()) -> list[Path]:
 
 
 def shrink(picture: Path, copy: Path) -> Path:
-    """Copy a picture; a PNG in 256 colours, of which rare ones, such as those of the legend, are kept."""
+    """Copy a picture; a PNG in 256 colours, of which rare ones, such as those of the legend, are
+    kept.
+    """
     if picture.suffix != ".png":
         shutil.copyfile(picture, copy)
         return copy
     with Image.open(picture) as image:
-        small = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
+        small = image.convert("RGB").quantize(
+            256, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE
+        )
     small.save(copy, "PNG", optimize=True)
     return copy
 
 
 def _needed(sections: Sequence[Section], titles: Sequence[str]) -> Iterator[tuple[str, Section]]:
-    """Yield the commands to run, with their sections: wanted pictures, and before them the data of the sequences that they show."""
+    """Yield the commands to run, with their sections: wanted pictures, and before them the data of
+    the sequences that they show.
+    """
     wanted = [section for section in sections if not titles or section.title in titles]
-    words = {section.title: [shlex.split(command) for command in section.commands] for section in sections}
+    words = {
+        section.title: [shlex.split(command) for command in section.commands]
+        for section in sections
+    }
     folders = {line[2] for lines in words.values() for line in lines if line[1] == "simulate"}
-    shown = {word.split("/")[0] for section in wanted for line in words[section.title] for word in line[2:]} & folders
+    shown = {
+        word.split("/")[0]
+        for section in wanted
+        for line in words[section.title]
+        for word in line[2:]
+    } & folders
     for section in sections[: 1 + max(map(sections.index, wanted), default=-1)]:
         for command in section.commands:
             _, name, place, *_ = shlex.split(command)
@@ -120,7 +142,8 @@ def main() -> None:
     for copy in copies:
         print(f"{copy.stat().st_size / 1000:8.0f} kB  {copy.name}")
     print(
-        f"{time.monotonic() - started:.0f} s, {sum(path.stat().st_size for path in IMAGES.iterdir()) / 1e6:.2f} MB in all"
+        f"{time.monotonic() - started:.0f} s, "
+        f"{sum(path.stat().st_size for path in IMAGES.iterdir()) / 1e6:.2f} MB in all"
     )
 
 

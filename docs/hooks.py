@@ -1,7 +1,9 @@
-"""What the documentation takes from the code as it is built: options, the layout, classes, and the pages of the navigation.
+"""What the documentation takes from the code as it is built: options, the layout, classes, and the
+pages of the navigation.
 
-A page says `<!-- generated: layout -->` where a table goes, and the page of a command ends with `<!-- generated: options -->`. Whoever reads the
-Markdown sees the tables too: `python docs/hooks.py` writes them into the pages, up to `<!-- generated end -->`, and a test compares.
+A page says `<!-- generated: layout -->` where a table goes, and the page of a command ends with
+`<!-- generated: options -->`. Whoever reads the Markdown sees the tables too: `python
+docs/hooks.py` writes them into the pages, up to `<!-- generated end -->`, and a test compares.
 """
 
 from __future__ import annotations
@@ -36,10 +38,18 @@ from carlasc.storage import layout
 sys.path.insert(0, str(Path(__file__).parent))
 import tutorials
 
-LOG = logging.getLogger("mkdocs.hooks.carlasc")  # below "mkdocs", so that a strict build counts its warnings
-PAGE_OF = {"unpack": "pack", "finish": "pack", "scores": "evaluate"}  # commands on the page of another one
-_MEMBER = re.compile(r'<h3 id="(carlasc[\w.]*)\.(\w+)" class="doc doc-heading">\s*<code[^>]*>')  # of a module
-_MODULE = re.compile(r"^::: (carlasc[\w.]*)$(?!\n    options:)", re.MULTILINE)  # without a list of members
+# below "mkdocs", so that a strict build counts its warnings
+LOG = logging.getLogger("mkdocs.hooks.carlasc")
+# commands on the page of another one
+PAGE_OF = {
+    "unpack": "pack",
+    "finish": "pack",
+    "scores": "evaluate",
+}
+# of a module
+_MEMBER = re.compile(r'<h3 id="(carlasc[\w.]*)\.(\w+)" class="doc doc-heading">\s*<code[^>]*>')
+# without a list of members
+_MODULE = re.compile(r"^::: (carlasc[\w.]*)$(?!\n    options:)", re.MULTILINE)
 _PLACE = re.compile(r"(<!-- generated: ([a-z-]+) -->\n).*?(<!-- generated end -->)", re.DOTALL)
 
 
@@ -59,43 +69,59 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Fill in generated tables, whatever the page has in their places, and link the pages of the notebooks."""
+    """Fill in generated tables, whatever the page has in their places, and link the pages of the
+    notebooks.
+    """
     markdown = _MODULE.sub(lambda match: match[0] + _members(match[1]), markdown)
-    text = re.sub(
-        r"\(\.\./examples/notebooks/(\w+)\.ipynb\)", r"(tutorials/\1.md)", markdown
-    )  # they are pages of the site
+    # they are pages of the site
+    text = re.sub(r"\(\.\./examples/notebooks/(\w+)\.ipynb\)", r"(tutorials/\1.md)", markdown)
     return _PLACE.sub(
-        lambda match: match[0].removeprefix(match[1]).removesuffix(match[3]), fill(text, page.file.src_uri)
+        lambda match: match[0].removeprefix(match[1]).removesuffix(match[3]),
+        fill(text, page.file.src_uri),
     )
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Give classes and functions the name by which they are imported, not that of the module that holds them."""
+    """Give classes and functions the name by which they are imported, not that of the module that
+    holds them.
+    """
     return _MEMBER.sub(lambda match: match[0] + _import_prefix(match[1], match[2]), html)
 
 
 def _import_prefix(module: str, name: str) -> str:
-    """Return "carlasc." or "carlasc.<room>.", whichever exports a name of a module; nothing if none does."""
+    """Return "carlasc." or "carlasc.<room>.", whichever exports a name of a module; nothing if none
+    does.
+    """
     member = getattr(importlib.import_module(module), name, None)
     room = ".".join(module.split(".")[:2])
     homes = ((home, importlib.import_module(home)) for home in ("carlasc", room))
-    return next((f"{home}." for home, package in homes if member is getattr(package, name, home)), "")
+    return next(
+        (f"{home}." for home, package in homes if member is getattr(package, name, home)), ""
+    )
 
 
 def _members(module: str) -> str:
-    """Return which members of a module are documented if its page names none: its classes, and what else of it is exported."""
+    """Return which members of a module are documented if its page names none: its classes, and what
+    else of it is exported.
+    """
     if importlib.util.find_spec(module) is None:  # it is a function
         return ""
     found = importlib.import_module(module)
     own = re.findall(r"^(?:class |def )?([A-Za-z]\w*)\b", inspect.getsource(found), re.MULTILINE)
     members = {name: vars(found)[name] for name in own if name in vars(found)}
-    names = [name for name, value in members.items() if inspect.isclass(value) or _import_prefix(module, name)]
+    names = [
+        name
+        for name, value in members.items()
+        if inspect.isclass(value) or _import_prefix(module, name)
+    ]
     return f"\n    options: {{ members: {names} }}"
 
 
 def fill(markdown: str, page: str) -> str:
     """Return the text of a page with its generated tables as the code has them now."""
-    return _PLACE.sub(lambda match: f"{match[1]}\n{_generate(match[2], page)}\n\n{match[3]}", markdown)
+    return _PLACE.sub(
+        lambda match: f"{match[1]}\n{_generate(match[2], page)}\n\n{match[3]}", markdown
+    )
 
 
 def command_names() -> list[str]:
@@ -104,13 +130,16 @@ def command_names() -> list[str]:
 
 
 def options_of(command: str) -> str:
-    """Return the section of a command's page that lists its arguments and options, by the panels of its `--help`."""
+    """Return the section of a command's page that lists its arguments and options, by the panels of
+    its `--help`.
+    """
     function = flatten(getattr(importlib.import_module(f"carlasc.cli.{command}"), command))
     panels: dict[str, list[str]] = {}
     for row, panel in _parameters(function):
         panels.setdefault(panel, []).append(row)
     parts = [f"## Options of carlasc {command}", ""]
-    for panel, rows in sorted(panels.items(), key=lambda item: item[0] != ""):  # those of the command alone come first
+    # those of the command alone come first
+    for panel, rows in sorted(panels.items(), key=lambda item: item[0] != ""):
         parts += [f"**{panel}**", ""] if panel else []
         parts += ["| option | default | |", "|---|---|---|", *rows, ""]
     return "\n".join(parts).rstrip()
@@ -132,7 +161,11 @@ def _parameters(function: Callable[..., None]) -> Iterator[tuple[str, str]]:
 def _names(name: str, annotation: Any, info: ParameterInfo) -> list[str]:
     if isinstance(info, ArgumentInfo):
         return [info.metavar or name.upper()]
-    given = (info.default, *(info.param_decls or ()))  # typer keeps the first name where a default would stand
+    # typer keeps the first name where a default would stand
+    given = (
+        info.default,
+        *(info.param_decls or ()),
+    )
     declared = [part for part in given if isinstance(part, str) and part.startswith("-")]
     is_switch = annotation in (bool, bool | None)
     if is_switch and len(declared) == 1:
@@ -169,22 +202,44 @@ def _layout() -> str:
     rows = ["| file | field | what it holds |", "|---|---|---|"]
     grid = [layout.field_named(f"{layout.EVALUATION}/{part}") for part in layout.GRID_FIELDS]
     for field in (*layout.SCAN_FIELDS.values(), *grid):
-        shape = "(X, Y, Z)" if field.per == "voxel" else "(N,)" if field.columns is None else f"(N, {field.columns})"
-        special = {"picture": "bytes", "votes": "npz", "velocities": "npz", "boxes": "[table](#boxes)"}
-        kind = special[field.kind] if field.kind in special else f"{np.dtype(field.dtype).name} {shape}"
+        shape = (
+            "(X, Y, Z)"
+            if field.per == "voxel"
+            else "(N,)"
+            if field.columns is None
+            else f"(N, {field.columns})"
+        )
+        special = {
+            "picture": "bytes",
+            "votes": "npz",
+            "velocities": "npz",
+            "boxes": "[table](#boxes)",
+        }
+        kind = (
+            special[field.kind]
+            if field.kind in special
+            else f"{np.dtype(field.dtype).name} {shape}"
+        )
         unit = f", {field.unit}" if field.unit in ("m", "m/s") else ""
         ours = "" if field.published else " *(ours)*"
-        rows.append(f"| `{field.file(0)}` | `{field.name}` | {kind}{unit}: {_escape(field.meaning)}{ours} |")
+        rows.append(
+            f"| `{field.file(0)}` | `{field.name}` | {kind}{unit}: {_escape(field.meaning)}{ours} |"
+        )
     return "\n".join(rows)
 
 
 def _grids() -> str:
-    rows = ["| grid | `--preset` | cells | lower bounds | upper bounds | cell |", "|---|---|---|---|---|---|"]
+    rows = [
+        "| grid | `--preset` | cells | lower bounds | upper bounds | cell |",
+        "|---|---|---|---|---|---|",
+    ]
     for preset in get_args(Preset):
         spec = GridSpec.published(preset)
         bounds = [", ".join(f"{value:.7g}" for value in side) for side in (spec.lower, spec.upper)]
         cell = " x ".join(f"{edge:.4g}" for edge in spec.voxel_size)
-        rows.append(f"| {spec} | `{preset}` | {spec.num_voxels:,} | {bounds[0]} | {bounds[1]} | {cell} |")
+        rows.append(
+            f"| {spec} | `{preset}` | {spec.num_voxels:,} | {bounds[0]} | {bounds[1]} | {cell} |"
+        )
     return "\n".join(rows)
 
 
@@ -206,12 +261,18 @@ def _classes() -> str:
 
 def _remaps() -> str:
     rows = ["| name | from | to |", "|---|---|---|"]
-    rows += [f"| `{name}` | `{remap.source.name}` | `{remap.target.name}` |" for name, remap in REMAPS.items()]
+    rows += [
+        f"| `{name}` | `{remap.source.name}` | `{remap.target.name}` |"
+        for name, remap in REMAPS.items()
+    ]
     return "\n".join(rows)
 
 
 def _conventions() -> str:
-    rows = ["| name | benchmark | mean over | an absent class | an unknown voxel | |", "|---|---|---|---|---|---|"]
+    rows = [
+        "| name | benchmark | mean over | an absent class | an unknown voxel | |",
+        "|---|---|---|---|---|---|",
+    ]
     absent = {
         "zero": "counts 0",
         "skip": "is left out",
@@ -236,7 +297,13 @@ def _conventions() -> str:
 
 def _exported_classes(table: ClassTable) -> str:
     """Return what each class of a table becomes in the files of other data sets."""
-    columns = ("`kitti`", "`kitti --predictions`", "`occ3d`, `openoccupancy`", "`sscbench`", "`opensceneflow`")
+    columns = (
+        "`kitti`",
+        "`kitti --predictions`",
+        "`occ3d`, `openoccupancy`",
+        "`sscbench`",
+        "`opensceneflow`",
+    )
     rows = [f"| {table.name} | {' | '.join(columns)} |", f"|{'---|' * (len(columns) + 1)}"]
     for index, name in table.names.items():
         occ3d, sscbench = TO_OCC3D[table.name][index], TO_SSCBENCH[table.name][index]
@@ -256,7 +323,9 @@ def _exported_classes(table: ClassTable) -> str:
 
 def _swatch(table: ClassTable, index: int) -> str:
     color = "#{:02x}{:02x}{:02x}".format(*table.colors[index])
-    return f'<span style="background:{color};border:1px solid #888;padding:0 .9em"></span> `{color}`'
+    return (
+        f'<span style="background:{color};border:1px solid #888;padding:0 .9em"></span> `{color}`'
+    )
 
 
 _TABLES: dict[str, Callable[[], str]] = {
@@ -273,10 +342,16 @@ _TABLES: dict[str, Callable[[], str]] = {
 def _generate(name: str, page: str) -> str:
     if name == "options":
         title = page.removeprefix("commands/").removesuffix(".md")
-        return "\n\n".join(options_of(command) for command in command_names() if PAGE_OF.get(command, command) == title)
+        return "\n\n".join(
+            options_of(command)
+            for command in command_names()
+            if PAGE_OF.get(command, command) == title
+        )
     if name in _TABLES:
         return _TABLES[name]()
-    LOG.warning("%s: expected options or one of %s to generate, found %s", page, ", ".join(_TABLES), name)
+    LOG.warning(
+        "%s: expected options or one of %s to generate, found %s", page, ", ".join(_TABLES), name
+    )
     return ""
 
 
@@ -295,7 +370,9 @@ def _pages(nav: Any) -> Iterator[str]:
 
 
 def _expand(nav: list[Any], docs: Path, named: set[str]) -> list[Any]:
-    """Replace each `folder/*` by the folder's pages that have no place of their own; commands in the order of `--help`."""
+    """Replace each `folder/*` by the folder's pages that have no place of their own; commands in
+    the order of `--help`.
+    """
     expanded: list[Any] = []
     order = {f"{name}.md": place for place, name in enumerate(cli._COMMANDS)}
     for item in nav:
@@ -307,8 +384,13 @@ def _expand(nav: list[Any], docs: Path, named: set[str]) -> list[Any]:
                 }
             )
         elif item.endswith("*"):
-            pages = sorted(docs.glob(f"{item}.md"), key=lambda path: (order.get(path.name, len(order)), path.name))
-            expanded += [uri for page in pages if (uri := page.relative_to(docs).as_posix()) not in named]
+            pages = sorted(
+                docs.glob(f"{item}.md"),
+                key=lambda path: (order.get(path.name, len(order)), path.name),
+            )
+            expanded += [
+                uri for page in pages if (uri := page.relative_to(docs).as_posix()) not in named
+            ]
         else:
             expanded.append(item)
     return expanded

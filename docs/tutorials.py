@@ -12,7 +12,9 @@ NOTEBOOKS = Path(__file__).parents[1] / "examples" / "notebooks"
 
 
 def pages(folder: Path = NOTEBOOKS) -> Iterator[tuple[str, str | bytes]]:
-    """Yield the path and the content of each page and picture, below the folder of the documentation."""
+    """Yield the path and the content of each page and picture, below the folder of the
+    documentation.
+    """
     for notebook in sorted(folder.glob("*.ipynb")):
         text, pictures = page(json.loads(notebook.read_text()), notebook.stem)
         yield (

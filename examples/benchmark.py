@@ -1,9 +1,12 @@
-"""A small benchmark that anyone can reproduce: `python examples/benchmark.py OUT --size small` (`--size full` on a GPU).
+"""A small benchmark that anyone can reproduce: `python examples/benchmark.py OUT --size small`
+(`--size full` on a GPU).
 
-Simulates drives, labels them in four ways, trains the networks, scores them on capture truth, and writes `results.json`, of which
-`benchmark_page.py` makes tables: the networks of the paper and our own, what labels are worth, and what history is worth. Seeds and
-settings are fixed in `benchmarking/`. Each drive and each run is kept when it is finished, and a training that was stopped continues after its
-last epoch. The first seeds of all rows are run first: a study that was stopped has equally many runs of each row, or one more of some.
+Simulates drives, labels them in four ways, trains the networks, scores them on capture truth, and
+writes `results.json`, of which `benchmark_page.py` makes tables: the networks of the paper and our
+own, what labels are worth, and what history is worth. Seeds and settings are fixed in
+`benchmarking/`. Each drive and each run is kept when it is finished, and a training that was
+stopped continues after its last epoch. The first seeds of all rows are run first: a study that was
+stopped has equally many runs of each row, or one more of some.
 """
 
 from __future__ import annotations
@@ -45,15 +48,21 @@ ROWS = {
 
 
 def main(
-    out: Annotated[Path, typer.Argument(help="Folder for drives, runs and results. A second run continues there.")],
+    out: Annotated[
+        Path,
+        typer.Argument(help="Folder for drives, runs and results. A second run continues there."),
+    ],
     size: Annotated[
         Literal["tiny", "small", "medium", "long", "full"],
-        typer.Option(help="small, medium and long: on a CPU, in minutes, hours and a day; full: on a GPU."),
+        typer.Option(
+            help="small, medium and long: on a CPU, in minutes, hours and a day; full: on a GPU."
+        ),
     ] = "tiny",
     study: Annotated[
         list[Study] | None,
         typer.Option(
-            help="networks, labels, parts (of our own network), history or js3cnet; may be given several times. Default: the first two."
+            help="networks, labels, parts (of our own network), history or js3cnet; may be given "
+            "several times. Default: the first two."
         ),
     ] = None,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
@@ -61,7 +70,10 @@ def main(
         int | None, typer.Option(help="Number of processes that merge scans. Default: all cores.")
     ] = None,
     pictures: Annotated[
-        Path | None, typer.Option(help="Folder for the pictures of the study of labels. Needs carlasc[plots,render].")
+        Path | None,
+        typer.Option(
+            help="Folder for the pictures of the study of labels. Needs carlasc[plots,render]."
+        ),
     ] = None,
 ) -> None:
     """Simulate, train, score, and write the results."""
@@ -70,7 +82,9 @@ def main(
     with join_processes(device) as processes:
         if processes.first:
             merge = Study.labels in studies
-            build_drives(folder / "data", chosen.scenes, merge=merge, workers=workers, progress=_print_drives)
+            build_drives(
+                folder / "data", chosen.scenes, merge=merge, workers=workers, progress=_print_drives
+            )
         processes.wait()
         for each in studies:
             for seed in range(chosen.seeds):
@@ -87,7 +101,9 @@ def _run(study: Study, row: Row, seed: int, size: Size, folder: Path, processes:
     if processes.first:
         print(f"{row.name}, seed {seed}", file=sys.stderr)
     rate = choose_rate(size.scenes, row.config, size.trial_epochs, folder, processes)
-    result = result_of(size.scenes, replace(row.config, seed=seed, learning_rate=rate), folder, processes)
+    result = result_of(
+        size.scenes, replace(row.config, seed=seed, learning_rate=rate), folder, processes
+    )
     if processes.first:
         note(folder / "results.json", study, row.name, result)
 

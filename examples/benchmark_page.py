@@ -1,7 +1,9 @@
-"""The tables of docs/studies/networks.md, made of the results of `benchmark.py`: `python examples/benchmark_page.py WORK/medium/results.json`.
+"""The tables of docs/studies/networks.md, made of the results of `benchmark.py`: `python
+examples/benchmark_page.py WORK/medium/results.json`.
 
-The results are kept beside the page (networks.json), and its tables are made of them. Without an argument the tables are made again of what is
-kept. A row has as many runs as every row of its study has: a study that was stopped shows fewer seeds, not rows that differ.
+The results are kept beside the page (networks.json), and its tables are made of them. Without an
+argument the tables are made again of what is kept. A row has as many runs as every row of its study
+has: a study that was stopped shows fewer seeds, not rows that differ.
 """
 
 from __future__ import annotations
@@ -37,7 +39,11 @@ from benchmarking.tables import (
 from carlasc.metrics import FigureTable
 
 STUDIES = Path(__file__).parents[1] / "docs" / "studies"
-KEPT, PAGE, EVERY_CLASS = STUDIES / "networks.json", STUDIES / "networks.md", STUDIES / "networks-1.csv"
+KEPT, PAGE, EVERY_CLASS = (
+    STUDIES / "networks.json",
+    STUDIES / "networks.md",
+    STUDIES / "networks-1.csv",
+)
 OURS = "Baseline T=5"
 _BLOCK = re.compile(r"(<!-- study: ([\w-]+) -->\n).*?(<!-- study end -->)", re.DOTALL)
 Groups = Mapping[str, Sequence[Result]]
@@ -61,7 +67,10 @@ def tables(kept: Mapping[str, Groups]) -> dict[str, str]:
         if groups := studies.get(study):
             made[name] = f"{make(groups)}\n\n{_runs(groups)}{_missing(study, groups)}"
         else:
-            made[name] = f"Not run: `python examples/benchmark.py WORK --size medium --study {study}` makes this table."
+            made[name] = (
+                f"Not run: `python examples/benchmark.py WORK --size medium --study {study}` "
+                f"makes this table."
+            )
     return made
 
 
@@ -71,7 +80,9 @@ def every_class(groups: Groups) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["network", *figures])
-    writer.writerows([name, *figure_row(runs, figures)] for name, runs in _equally("networks", groups).items())
+    writer.writerows(
+        [name, *figure_row(runs, figures)] for name, runs in _equally("networks", groups).items()
+    )
     return text.getvalue()
 
 
@@ -98,7 +109,9 @@ def _missing(study: str, groups: Groups) -> str:
     """Return which rows of a study, or which of its seeds, have not been run."""
     rows = ROWS[Study(study)](SIZES["medium"])
     text = (
-        [f"Not run yet: {'; '.join(names)}."] if (names := [row.name for row in rows if row.name not in groups]) else []
+        [f"Not run yet: {'; '.join(names)}."]
+        if (names := [row.name for row in rows if row.name not in groups])
+        else []
     )
     done = min(map(len, groups.values()))
     if done < max(row.seeds for row in rows):
@@ -115,11 +128,15 @@ def _networks(groups: Groups) -> str:
     for name, runs in groups.items():
         network, weighting = name.rsplit(", ", 1)
         rows.append((network, weighting, _rate(runs), *figure_row(runs, NETWORK)))
-    return to_markdown(FigureTable("", ("network", "class weights", "learning rate", *NETWORK), tuple(rows)))
+    return to_markdown(
+        FigureTable("", ("network", "class weights", "learning rate", *NETWORK), tuple(rows))
+    )
 
 
 def _differences(groups: Groups) -> str:
-    """Return how much each network is better than ours with the same weights, and what the weights change."""
+    """Return how much each network is better than ours with the same weights, and what the weights
+    change.
+    """
     rows = []
     for network in dict.fromkeys(name.rsplit(", ", 1)[0] for name in groups):
         of = [groups.get(f"{network}, {weighting}") for weighting in ("log", "root")]
@@ -137,13 +154,17 @@ def _differences(groups: Groups) -> str:
     return to_markdown(FigureTable("", header, tuple(rows)))
 
 
-def _compare(first: Sequence[Result] | None, second: Sequence[Result] | None, figure: Figure) -> str:
+def _compare(
+    first: Sequence[Result] | None, second: Sequence[Result] | None, figure: Figure
+) -> str:
     if not first or not second or first is second:
         return ""
     return with_interval(difference(first, second, figure))
 
 
-def _against(groups: Groups, rival: str, names: Sequence[str], figures: Mapping[str, Figure]) -> str:
+def _against(
+    groups: Groups, rival: str, names: Sequence[str], figures: Mapping[str, Figure]
+) -> str:
     """Return the differences of rows from one of them."""
     rows = tuple(
         (name, *(_compare(groups[name], groups[rival], figure) for figure in figures.values()))
@@ -158,7 +179,13 @@ def _labels(groups: Groups) -> str:
     if CAPTURE_TRUTH in groups:
         parts.append(_against(groups, CAPTURE_TRUTH, list(groups), LABELS))
     rows = tuple(
-        (name, *(spread([100 * getattr(run, error) for run in runs]) for error in ("ece_free", "ece_occupied")))
+        (
+            name,
+            *(
+                spread([100 * getattr(run, error) for run in runs])
+                for error in ("ece_free", "ece_occupied")
+            ),
+        )
         for name, runs in groups.items()
     )
     parts.append(to_markdown(FigureTable("", ("trained on", "ECE, free", "ECE, occupied"), rows)))

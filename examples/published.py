@@ -1,8 +1,9 @@
 """Score published weights on simulated towns: `python examples/published.py LMSC_11_T1B.pt OUT`.
 
-Simulates towns, makes their ground truth, completes the ego scans with the weights, and scores them with 11 classes. The weights were trained on
-CARLA's towns, so that this checks the whole pipeline: wrong axes, class ids, voxel sizes or sensor heights would give low scores. The towns were
-chosen before any of them was scored.
+Simulates towns, makes their ground truth, completes the ego scans with the weights, and scores them
+with 11 classes. The weights were trained on CARLA's towns, so that this checks the whole pipeline:
+wrong axes, class ids, voxel sizes or sensor heights would give low scores. The towns were chosen
+before any of them was scored.
 """
 
 from __future__ import annotations
@@ -32,7 +33,10 @@ TOWNS = tuple(
 def score_towns(
     weights: Path, out: Path, *, every: int = 1, lower_m: float = 0.0, workers: int | None = None
 ) -> Evaluation:
-    """Simulate the towns, complete their ego scans, and score them. Existing files in `out` are not made again."""
+    """Simulate the towns, complete their ego scans, and score them.
+
+    Existing files in `out` are not made again.
+    """
     spec = GridSpec.published()
     low, high = (np.float32(bound[2] - lower_m).item() for bound in (spec.lower, spec.upper))
     spec = spec.with_bounds((*spec.lower[:2], low), (*spec.upper[:2], high))
@@ -43,12 +47,19 @@ def score_towns(
 
 def main(
     weights: Annotated[Path, typer.Argument(help="Published weights of 11 classes.")],
-    out: Annotated[Path, typer.Argument(help="Folder for the towns. A second run continues with it.")],
+    out: Annotated[
+        Path, typer.Argument(help="Folder for the towns. A second run continues with it.")
+    ],
     every: Annotated[int, typer.Option(help="Use every N-th of the 30 frames.", min=1)] = 1,
     lower_m: Annotated[
-        float, typer.Option(help="Lower the grids by this many metres, as if the sensor were mounted lower.")
+        float,
+        typer.Option(
+            help="Lower the grids by this many metres, as if the sensor were mounted lower."
+        ),
     ] = 0.0,
-    workers: Annotated[int | None, typer.Option(help="Number of processes. Default: all cores.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Number of processes. Default: all cores.")
+    ] = None,
 ) -> None:
     """Score published weights on the simulated towns."""
     for table in score_towns(weights, out, every=every, lower_m=lower_m, workers=workers).tables():

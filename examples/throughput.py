@@ -1,4 +1,6 @@
-"""Measure samples per second of the loader and of the network: `python examples/throughput.py examples/motionsc/carlasc.yaml CarlaSC --set history=16`."""
+"""Measure samples per second of the loader and of the network: `python examples/throughput.py
+examples/motionsc/carlasc.yaml CarlaSC --set history=16`.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,13 @@ def main(
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
 ) -> None:
     """Print the samples per second of the loader and of the network."""
-    own = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
+    own = torch.device(
+        ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    )
     rates = measure_throughput(data, Config.read(config, settings or ()), own, batches)
-    print(f"loader {rates.loader:.1f} samples/s, network {rates.network:.1f} samples/s on {own.type}")
+    print(
+        f"loader {rates.loader:.1f} samples/s, network {rates.network:.1f} samples/s on {own.type}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
-"""Train a network: `python examples/train.py examples/motionsc/carlasc.yaml DATA --out runs/motionsc`.
+"""Train a network: `python examples/train.py examples/motionsc/carlasc.yaml DATA --out
+runs/motionsc`.
 
-On several GPUs: `torchrun --nproc-per-node 4 examples/train.py ...`. `--set key=value` changes a setting of the file.
+On several GPUs: `torchrun --nproc-per-node 4 examples/train.py ...`. `--set key=value` changes a
+setting of the file.
 """
 
 from __future__ import annotations
@@ -26,25 +28,41 @@ def main(
     ] = None,
     soft_labels: Annotated[
         bool,
-        typer.Option("--soft-labels", help="Train on probabilities instead of labels; the same as soft_labels=true."),
+        typer.Option(
+            "--soft-labels",
+            help="Train on probabilities instead of labels; the same as soft_labels=true.",
+        ),
     ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue from the last checkpoint of the run.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue from the last checkpoint of the run.")
+    ] = False,
     cache: Annotated[
         Path | None,
-        typer.Option(help="Folder on a local disk for files of a remote data set, each of which is fetched once."),
+        typer.Option(
+            help="Folder on a local disk for files of a remote data set, each of which is fetched "
+            "once."
+        ),
     ] = None,
     device: Annotated[str, typer.Option(help="auto, cuda or cpu.")] = "auto",
 ) -> None:
-    """Train a network on a data set. The weights with the best mIoU on the validation split are kept."""
+    """Train a network on a data set.
+
+    The weights with the best mIoU on the validation split are kept.
+    """
     with join_processes(device) as processes:
         overrides = [*(settings or ()), *(["soft_labels=true"] if soft_labels else [])]
         source = carlasc.open(data, cache=cache)
         progress = train(source, Config.read(config, overrides), out, processes, resume=resume)
         if processes.first:
-            print(f"best mIoU {100 * progress.best_miou:.2f} after epoch {progress.best_epoch}: {out / BEST}")
+            print(
+                f"best mIoU {100 * progress.best_miou:.2f} after epoch {progress.best_epoch}: "
+                f"{out / BEST}"
+            )
 
 
 if __name__ == "__main__":
     run(
-        main, "with --resume, the same command continues from the last checkpoint (one an epoch, or --set save_every=N)"
+        main,
+        "with --resume, the same command continues from the last checkpoint (one an epoch, or "
+        "--set save_every=N)",
     )

@@ -1,4 +1,6 @@
-"""The recipes of docs/contributing.md: their diffs are applied as they are printed, and must be enough."""
+"""The recipes of docs/contributing.md: their diffs are applied as they are printed, and must be
+enough.
+"""
 
 import re
 import shutil
@@ -25,7 +27,9 @@ PATH = "Train/Town01_Light/cartesian"
 
 def added_lines(file: str) -> str:
     """Return the lines that the page's diff adds to a file."""
-    (text,) = re.findall(rf'```diff title="{re.escape(file)}"\n(.*?)```', PAGE.read_text(), re.DOTALL)
+    (text,) = re.findall(
+        rf'```diff title="{re.escape(file)}"\n(.*?)```', PAGE.read_text(), re.DOTALL
+    )
     return "\n".join(line.strip()[1:] for line in text.splitlines() if line.strip().startswith("+"))
 
 
@@ -45,7 +49,11 @@ def folder(tmp_path: Path, rings: field_files.Field) -> Path:
         for frame in range(3):
             for name, array in scan(rng, 40 + frame).items():
                 writer.write(name, frame, array)
-            writer.write("rings", frame, rng.integers(0, 64 if frame < 2 else 2000, 40 + frame).astype(np.uint16))
+            writer.write(
+                "rings",
+                frame,
+                rng.integers(0, 64 if frame < 2 else 2000, 40 + frame).astype(np.uint16),
+            )
         writer.write_document("poses.txt", layout.encode_poses(np.tile(np.eye(4), (3, 1, 1))))
     return tmp_path / "data"
 
@@ -59,7 +67,9 @@ def rings_of(source: str | Path) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("store", ["zip", "zarr", "h5", "parquet"])
 def test_a_field_of_the_recipe_goes_through_every_store(folder, tmp_path, store):
-    pytest.importorskip({"zip": "zipfile", "zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}[store])
+    pytest.importorskip(
+        {"zip": "zipfile", "zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}[store]
+    )
     files = {file.name: file.read_bytes() for file in (folder / PATH / "rings").iterdir()}
     if store == "zip":
         out = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", folder))
@@ -68,13 +78,17 @@ def test_a_field_of_the_recipe_goes_through_every_store(folder, tmp_path, store)
     for found, wanted in zip(rings_of(out), rings_of(folder), strict=True):
         assert found.dtype == wanted.dtype == np.uint16 and np.array_equal(found, wanted)
     carlasc.unpack(out, tmp_path / "back")
-    assert {file.name: file.read_bytes() for file in (tmp_path / "back" / PATH / "rings").iterdir()} == files
+    assert {
+        file.name: file.read_bytes() for file in (tmp_path / "back" / PATH / "rings").iterdir()
+    } == files
 
 
 def test_info_lists_it_and_validate_compares_it_with_the_points(folder, rings):
     (sequence,) = carlasc.info(folder).sequences
     assert sequence.fields["rings"] == 3
-    assert not [finding for finding in carlasc.validate(folder).findings if finding.severity == "error"]
+    assert not [
+        finding for finding in carlasc.validate(folder).findings if finding.severity == "error"
+    ]
     (folder / PATH / rings.file(1)).write_bytes(bytes(2 * 39))
     (folder / PATH / rings.file(2)).unlink()
     found = {finding.check: str(finding) for finding in carlasc.validate(folder).findings}
@@ -93,7 +107,9 @@ def test_a_scan_keeps_it_with_its_points(folder):
 
 def test_a_converter_passes_it_on(rings):
     numbers = np.arange(5, dtype=np.uint16)
-    cloud = Cloud(np.ones((5, 4), np.float32), others={"rings": numbers, "flow": np.ones((5, 3), np.float32)})
+    cloud = Cloud(
+        np.ones((5, 4), np.float32), others={"rings": numbers, "flow": np.ones((5, 3), np.float32)}
+    )
     scan = assemble([cloud], Rig((Sensor(),), np.eye(4)), None, "a")
     fields = make_fields(scan, AxesAndClasses(CARLA, None, mirrored=True), "a")
     assert np.array_equal(fields["rings"], numbers)

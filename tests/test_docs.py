@@ -1,4 +1,6 @@
-"""The documentation is true: its commands and scripts run, its figures are up to date, each command and option exists and has a page."""
+"""The documentation is true: its commands and scripts run, its figures are up to date, each command
+and option exists and has a page.
+"""
 
 import ast
 import os
@@ -29,12 +31,18 @@ END = "\x1e"  # between the outputs of two commands
 
 def blocks(page, language):
     """Return (options, text) of the fenced blocks of a page in a language."""
-    return [(match[2], match[3]) for match in FENCE.finditer(PAGES[page].read_text()) if match[1] == language]
+    return [
+        (match[2], match[3])
+        for match in FENCE.finditer(PAGES[page].read_text())
+        if match[1] == language
+    ]
 
 
 def scripts(page):
     """Return the scripts that a page tells its reader to save, by name."""
-    named = [(re.search(r'title="([^"]+)"', options), text) for options, text in blocks(page, "python")]
+    named = [
+        (re.search(r'title="([^"]+)"', options), text) for options, text in blocks(page, "python")
+    ]
     return {name[1]: text for name, text in named if name}
 
 
@@ -51,19 +59,27 @@ def session(page):
 
 
 def packages_for(page):
-    """Return (extras, packages) that a page tells its reader to install before its last session; "start here" has told to install `demo`."""
+    """Return (extras, packages) that a page tells its reader to install before its last session;
+    "start here" has told to install `demo`.
+    """
     before = PAGES[page].read_text().rpartition("```console")[0]
     lines = [
-        line for block in re.findall(r"```(?:sh|bash)\n(.*?)```", before, re.DOTALL) for line in block.splitlines()
+        line
+        for block in re.findall(r"```(?:sh|bash)\n(.*?)```", before, re.DOTALL)
+        for line in block.splitlines()
     ]
     wanted = " ".join(line.partition("#")[0] for line in lines if line.startswith("pip install "))
-    extras = {extra for group in re.findall(r"\.\[([\w,]+)\]", wanted) for extra in group.split(",")}
+    extras = {
+        extra for group in re.findall(r"\.\[([\w,]+)\]", wanted) for extra in group.split(",")
+    }
     return extras | {"demo"}, set(re.findall(r"(?<= )[a-z][\w-]+", wanted)) - {"install"}
 
 
 @pytest.fixture(scope="session")
 def environment(tmp_path_factory):
-    """Makes the environment of a page's reader, with nothing but what the page tells to install; the folder of its programs."""
+    """Makes the environment of a page's reader, with nothing but what the page tells to install;
+    the folder of its programs.
+    """
     made = {}
 
     def make(page):
@@ -73,7 +89,12 @@ def environment(tmp_path_factory):
             folder = tmp_path_factory.mktemp("environment") / ".venv"
             subprocess.run([sys.executable, "-m", "venv", folder], check=True)
             torch = ["torch==2.13.0"] if {"train", "torch"} & extras else []
-            wanted = [*torch, *sorted(packages), "--editable", f"{ROOT}[{','.join(sorted(extras))}]"]
+            wanted = [
+                *torch,
+                *sorted(packages),
+                "--editable",
+                f"{ROOT}[{','.join(sorted(extras))}]",
+            ]
             wanted += ["--constraint", str(ROOT / "constraints.txt")]
             python = folder / "bin" / "python"
             ways = (
@@ -81,7 +102,9 @@ def environment(tmp_path_factory):
                 [python, "-m", "pip", "install"],
             )
             for way in ways:  # uv is faster and does not read pip's settings, such as a mirror
-                ran = subprocess.run([*way, "--quiet", *wanted], check=False, capture_output=True, text=True)
+                ran = subprocess.run(
+                    [*way, "--quiet", *wanted], check=False, capture_output=True, text=True
+                )
                 if ran.returncode == 0:
                     break
             if ran.returncode and re.search(
@@ -96,11 +119,15 @@ def environment(tmp_path_factory):
 
 
 def play(page, folder, programs):
-    """Run a page's commands in one shell, with the programs of an environment; return (command, expected, found, exit code) of each."""
+    """Run a page's commands in one shell, with the programs of an environment; return (command,
+    expected, found, exit code) of each.
+    """
     for name, text in scripts(page).items():
         (folder / name).write_text(text)
     steps = session(page)
-    script = "".join(f"{command}\n__code=$?; printf '%d{END}' $__code; (exit $__code)\n" for command, _ in steps)
+    script = "".join(
+        f"{command}\n__code=$?; printf '%d{END}' $__code; (exit $__code)\n" for command, _ in steps
+    )
     environment = os.environ | {"PATH": f"{programs}:{os.environ['PATH']}", "COLUMNS": "160"}
     ran = subprocess.run(
         ["bash"],
@@ -114,19 +141,28 @@ def play(page, folder, programs):
     )
     progress = rf"(?:^|(?<={END}))[^{END}\n]+: \d+ of \d+ [\w ]+, \d+ s\n"  # on slow machines
     printed = re.sub(progress, "", ran.stdout, flags=re.MULTILINE)
-    outputs = [re.fullmatch(r"(.*?)(\d+)", output, re.DOTALL).groups() for output in printed.split(END)[:-1]]
+    outputs = [
+        re.fullmatch(r"(.*?)(\d+)", output, re.DOTALL).groups()
+        for output in printed.split(END)[:-1]
+    ]
     assert len(outputs) == len(steps), ran.stdout
     return [(*step, found, int(code)) for step, (found, code) in zip(steps, outputs, strict=True)]
 
 
 def check(results):
-    """Compare what commands printed; those whose output is an error must have failed, the others not."""
+    """Compare what commands printed; those whose output is an error must have failed, the others
+    not.
+    """
     checker = OutputChecker()
     for command, expected, found, code in results:
         assert checker.check_output(
-            f"{expected}\n", found if found.endswith("\n") else f"{found}\n", ELLIPSIS | NORMALIZE_WHITESPACE
+            f"{expected}\n",
+            found if found.endswith("\n") else f"{found}\n",
+            ELLIPSIS | NORMALIZE_WHITESPACE,
         ), f"$ {command}\nexpected:\n{expected}\nfound:\n{found}"
-        assert (code != 0) == expected.startswith("carlasc: "), f"$ {command}\nexit code {code}:\n{found}"
+        assert (code != 0) == expected.startswith("carlasc: "), (
+            f"$ {command}\nexit code {code}:\n{found}"
+        )
 
 
 @pytest.fixture(scope="session")
@@ -155,7 +191,9 @@ def test_commands_of_a_page_print_what_it_shows(page, started, environment, tmp_
 def command_lines():
     """Return (page, line) of every line in the documentation that runs carlasc."""
     for page, path in PAGES.items():
-        texts = [text for language in ("bash", "sh", "console") for _, text in blocks(page, language)]
+        texts = [
+            text for language in ("bash", "sh", "console") for _, text in blocks(page, language)
+        ]
         texts += re.findall(r"(?:^    .*\n)+", path.read_text(), re.MULTILINE)
         for line in "\n".join(texts).splitlines():
             found = re.match(r"\s*(?:\$ )?(carlasc [a-z]+(?: .*)?)$", line)
@@ -167,7 +205,9 @@ def command_lines():
 def test_commands_in_the_docs_have_the_options_that_they_are_given(page, line):
     name, *arguments = shlex.split(line, comments=True)[1:]
     command = group().commands[name]
-    arguments = arguments[: next((i for i, part in enumerate(arguments) if part in (">", "|", "&&")), None)]
+    arguments = arguments[
+        : next((i for i, part in enumerate(arguments) if part in (">", "|", "&&")), None)
+    ]
     command.make_context(name, arguments)  # reads the arguments and runs nothing
 
 
@@ -178,7 +218,9 @@ def group():
 
 
 def inline_code():
-    """Return (page, text) of the code between backticks in the prose of the documentation and of the README."""
+    """Return (page, text) of the code between backticks in the prose of the documentation and of
+    the README.
+    """
     for page, path in {"README.md": ROOT / "README.md", **PAGES}.items():
         prose = re.sub(r"^```.*?^```$", "", path.read_text(), flags=re.MULTILINE | re.DOTALL)
         yield from ((page, text) for text in re.findall(r"`([^`\n]+)`", prose))
@@ -189,12 +231,15 @@ def options_named_in(text):
 
 
 def options_of_examples():
-    """Return the options of the scripts in examples/: those that are declared, and those made of the names of parameters."""
+    """Return the options of the scripts in examples/: those that are declared, and those made of
+    the names of parameters.
+    """
     found = set()
     for path in (ROOT / "examples").rglob("*.py"):
         found.update(re.findall(r'Option\(\s*"(--[a-z-]+)"', path.read_text()))
         found.update(
-            "--" + name.replace("_", "-") for name in re.findall(r"^    (\w+): Annotated", path.read_text(), re.M)
+            "--" + name.replace("_", "-")
+            for name in re.findall(r"^    (\w+): Annotated", path.read_text(), re.M)
         )
     return found
 
@@ -211,16 +256,25 @@ def problems_of(page, text, commands):
     else:  # another program
         return []
     return [
-        f"{page}: `{text}`: there is no option {option}" for option in options_named_in(text) if option not in known
+        f"{page}: `{text}`: there is no option {option}"
+        for option in options_named_in(text)
+        if option not in known
     ]
 
 
 def options_of_commands():
-    return {name: options_of(command) | declared_options(name) for name, command in group().commands.items()}
+    return {
+        name: options_of(command) | declared_options(name)
+        for name, command in group().commands.items()
+    }
 
 
 def options_of(command):
-    return {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+    return {
+        option
+        for parameter in command.params
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
 
 
 def declared_options(name):
@@ -236,7 +290,9 @@ def declared_options(name):
 
 def test_commands_and_options_in_the_text_exist():
     commands = options_of_commands()
-    assert not [problem for page, text in inline_code() for problem in problems_of(page, text, commands)]
+    assert not [
+        problem for page, text in inline_code() for problem in problems_of(page, text, commands)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -265,7 +321,9 @@ def messages(part):
                             yield re.escape(text.value)
                         elif isinstance(text, ast.JoinedStr):
                             pieces = (
-                                re.escape(str(getattr(piece, "value", ""))) if isinstance(piece, ast.Constant) else ".+"
+                                re.escape(str(getattr(piece, "value", "")))
+                                if isinstance(piece, ast.Constant)
+                                else ".+"
                                 for piece in text.values
                             )
                             yield "".join(pieces)
@@ -283,7 +341,9 @@ def test_error_messages_that_are_quoted_exist():
     patterns = [re.compile(pattern) for pattern in messages("expected")]
     assert len(quoted) > 5
     for page, expected in quoted:
-        assert any(pattern.fullmatch(expected) for pattern in patterns), f"{page}: no error says: expected {expected}"
+        assert any(pattern.fullmatch(expected) for pattern in patterns), (
+            f"{page}: no error says: expected {expected}"
+        )
 
 
 @pytest.fixture(scope="session")
@@ -297,7 +357,11 @@ def hooks():
 
 
 def test_every_command_has_a_page_and_every_page_a_command(hooks):
-    pages = {page.removeprefix("commands/").removesuffix(".md") for page in PAGES if page.startswith("commands/")}
+    pages = {
+        page.removeprefix("commands/").removesuffix(".md")
+        for page in PAGES
+        if page.startswith("commands/")
+    }
     assert pages == {hooks.PAGE_OF.get(command, command) for command in group().commands}
     for command, page in hooks.PAGE_OF.items():
         assert f"## carlasc {command}\n" in PAGES[f"commands/{page}.md"].read_text()
@@ -309,17 +373,25 @@ def test_option_tables_name_every_option(hooks):
     for name, command in group().commands.items():
         table = options_of(name)
         for parameter in command.params:
-            names = parameter.opts if parameter.opts[0].startswith("-") else [parameter.name.upper()]
+            names = (
+                parameter.opts if parameter.opts[0].startswith("-") else [parameter.name.upper()]
+            )
             for option in names:
                 if option != "--help":
                     assert f"`{option}`" in table, f"{name}: {option}"
 
 
 def test_pages_hold_the_tables_that_the_code_has_now(hooks):
-    filled = [page for page, path in PAGES.items() if path.read_text() != hooks.fill(path.read_text(), page)]
+    filled = [
+        page
+        for page, path in PAGES.items()
+        if path.read_text() != hooks.fill(path.read_text(), page)
+    ]
     assert not filled, "python docs/hooks.py"
     assert all(
-        "<!-- generated: options -->" in PAGES[page].read_text() for page in PAGES if page.startswith("commands/")
+        "<!-- generated: options -->" in PAGES[page].read_text()
+        for page in PAGES
+        if page.startswith("commands/")
     )
 
 
@@ -348,7 +420,10 @@ def figures():
 
 @pytest.mark.parametrize("name", ["frames.svg", "votes.svg"])
 def test_drawings_are_those_that_the_script_draws(name, figures):
-    if f"matplotlib=={version('matplotlib')}" not in (ROOT / "constraints.txt").read_text().splitlines():
+    if (
+        f"matplotlib=={version('matplotlib')}"
+        not in (ROOT / "constraints.txt").read_text().splitlines()
+    ):
         pytest.skip("drawn by another version of matplotlib")
     assert figures.draw(name).decode() == (figures.IMAGES / name).read_text()
 
@@ -359,7 +434,10 @@ def test_pictures_are_those_that_the_script_draws(name, figures, tmp_path):
     from PIL import Image
 
     (tmp_path / name).write_bytes(figures.draw(name))
-    ours, theirs = (np.asarray(Image.open(folder / name).convert("RGB"), int) for folder in (tmp_path, figures.IMAGES))
+    ours, theirs = (
+        np.asarray(Image.open(folder / name).convert("RGB"), int)
+        for folder in (tmp_path, figures.IMAGES)
+    )
     assert ours.shape == theirs.shape
     assert np.abs(ours - theirs).mean() < 2  # of 255; quantising may choose other colours elsewhere
 
@@ -376,25 +454,42 @@ def test_help_loads_nothing_heavy():
     heavy = "{'numba', 'scipy', 'trimesh', 'torch', 'zarr', 'h5py', 'pyarrow', 'matplotlib', 'PIL', 'fsspec'}"
     for name in group().commands:
         code = (
-            "import sys; from carlasc.cli import main; sys.argv = ['carlasc', sys.argv[1], '--help']\n"
+            "import sys; from carlasc.cli import main; sys.argv = ['carlasc', sys.argv[1], "
+            "'--help']\n"
             f"try: main()\nfinally: print('loaded:', sorted({heavy} & set(sys.modules)))"
         )
-        ran = subprocess.run([sys.executable, "-c", code, name], capture_output=True, text=True, check=True)
+        ran = subprocess.run(
+            [sys.executable, "-c", code, name], capture_output=True, text=True, check=True
+        )
         assert "Usage: carlasc" in ran.stdout and ran.stdout.rstrip().endswith("loaded: []"), name
 
 
-@pytest.mark.parametrize(("typed", "offered"), [("carlasc reg", "regrid"), ("carlasc regrid --pre", "--preset")])
+@pytest.mark.parametrize(
+    ("typed", "offered"), [("carlasc reg", "regrid"), ("carlasc regrid --pre", "--preset")]
+)
 def test_shells_complete_commands_and_options(typed, offered):
-    carlasc = [sys.executable, "-c", "import sys; sys.argv = ['carlasc']; from carlasc.cli import main; main()"]
-    asked = {"_CARLASC_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1)}
-    ran = subprocess.run(carlasc, check=False, env=os.environ | asked, capture_output=True, text=True)
+    carlasc = [
+        sys.executable,
+        "-c",
+        "import sys; sys.argv = ['carlasc']; from carlasc.cli import main; main()",
+    ]
+    asked = {
+        "_CARLASC_COMPLETE": "complete_bash",
+        "COMP_WORDS": typed,
+        "COMP_CWORD": str(len(typed.split()) - 1),
+    }
+    ran = subprocess.run(
+        carlasc, check=False, env=os.environ | asked, capture_output=True, text=True
+    )
     assert offered in ran.stdout.split()
 
 
 def anchors(page):
     """Return the anchors of the headings of a page, as GitHub makes them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
+    return {
+        re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings
+    }
 
 
 def test_links_lead_somewhere_on_github_too():

@@ -47,9 +47,17 @@ def test_every_kind_is_a_carlasc_error_and_some_are_errors_of_python_too():
         ({"problem": "cannot be read"}, "a.bin: cannot be read"),
         ({"expected": "4 bytes", "found": "3"}, "a.bin: expected 4 bytes, found 3"),
         ({"found": "3"}, "a.bin: found 3"),
-        ({"expected": "4 bytes", "advice": "copy it again"}, "a.bin: expected 4 bytes: copy it again"),
         (
-            {"problem": "is damaged", "expected": "4 bytes", "found": "3", "advice": "copy it again"},
+            {"expected": "4 bytes", "advice": "copy it again"},
+            "a.bin: expected 4 bytes: copy it again",
+        ),
+        (
+            {
+                "problem": "is damaged",
+                "expected": "4 bytes",
+                "found": "3",
+                "advice": "copy it again",
+            },
             "a.bin: is damaged: expected 4 bytes, found 3: copy it again",
         ),
         ({"problem": "one\ntwo\r\nthree", "advice": "four\n"}, "a.bin: one two three: four"),
@@ -68,7 +76,9 @@ def test_errors_come_back_whole_from_another_process():
             found = pool.submit(jobs.raise_error, error).exception()
             assert type(found) is kind
             assert str(found) == str(error) == "a: b: expected c, found d: e"
-            assert (found.where, found.problem, found.expected, found.found, found.advice) == tuple("abcde")
+            assert (found.where, found.problem, found.expected, found.found, found.advice) == tuple(
+                "abcde"
+            )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -84,7 +94,10 @@ def test_an_error_within_a_place_names_both_and_leaves_the_first_as_it_is(kind):
 @pytest.mark.parametrize("part", ["where", "problem", "expected", "found", "advice"])
 def test_no_part_of_a_message_steers_a_terminal_or_fills_it(part):
     hostile = "a\x1b[2J\x07\u202eb\nc\x85d\udcff\u2066" + "x" * 5000 + "end"
-    parts = {name: hostile if name == part else "fine" for name in ("where", "problem", "expected", "found", "advice")}
+    parts = {
+        name: hostile if name == part else "fine"
+        for name in ("where", "problem", "expected", "found", "advice")
+    }
     message = str(FormatError(parts.pop("where"), **parts))
     assert "a\\x1b[2J\\x07\\u202eb c d\\udcff\\u2066xxx" in message
     assert message.isprintable()
@@ -106,7 +119,10 @@ def test_whatever_a_block_raises_is_one_error_that_names_the_file_and_keeps_its_
     ):
         with pytest.raises(FormatError) as caught, reading("x.bin", "numbers", "copy it again"):
             raise error
-        assert str(caught.value) == f"x.bin: expected numbers, found something else ({found}): copy it again"
+        assert (
+            str(caught.value)
+            == f"x.bin: expected numbers, found something else ({found}): copy it again"
+        )
         assert caught.value.__cause__ is error
     own = MissingDataError("y.bin")
     with pytest.raises(MissingDataError) as caught, reading("x.bin", "numbers"):
@@ -117,15 +133,20 @@ def test_whatever_a_block_raises_is_one_error_that_names_the_file_and_keeps_its_
 
 
 def test_a_missing_extra_is_one_line_that_says_what_to_install():
-    with pytest.raises(DependencyError, match=r"no_such_module is not installed: .*pip install .*\[zarr\]'") as caught:
+    with pytest.raises(
+        DependencyError, match=r"no_such_module is not installed: .*pip install .*\[zarr\]'"
+    ) as caught:
         import_extra("no_such_module.part", "zarr")
     assert "\n" not in str(caught.value)
 
 
 ORIGINS = {
-    '{"url": "file:///home/a%20b/carlasc", "dir_info": {"editable": true}}': "pip install -e '/home/a b/carlasc[zarr]'",
+    '{"url": "file:///home/a%20b/carlasc", "dir_info": {"editable": true}}': "pip install -e "
+    "'/home/a "
+    "b/carlasc[zarr]'",
     '{"url": "file:///tmp/carlasc", "dir_info": {}}': "pip install '/tmp/carlasc[zarr]'",
-    '{"url": "file:///tmp/carlasc-1.whl", "archive_info": {}}': "pip install '/tmp/carlasc-1.whl[zarr]'",
+    '{"url": "file:///tmp/carlasc-1.whl", "archive_info": {}}': "pip install "
+    "'/tmp/carlasc-1.whl[zarr]'",
     '{"url": "https://example.org/carlasc.whl", "archive_info": {}}': "pip install 'carlasc[zarr]'",
     "broken": "pip install 'carlasc[zarr]'",
     None: "pip install 'carlasc[zarr]'",  # from an index
@@ -135,7 +156,9 @@ ORIGINS = {
 @pytest.mark.parametrize(("origin", "command"), ORIGINS.items(), ids=map(str, ORIGINS))
 def test_an_extra_is_installed_from_where_carlasc_came(origin, command, monkeypatch):
     monkeypatch.setattr(
-        metadata, "distribution", lambda name: SimpleNamespace(read_text={"direct_url.json": origin}.get)
+        metadata,
+        "distribution",
+        lambda name: SimpleNamespace(read_text={"direct_url.json": origin}.get),
     )
     assert install_command("zarr") == command
 
@@ -143,17 +166,25 @@ def test_an_extra_is_installed_from_where_carlasc_came(origin, command, monkeypa
 def test_a_module_that_fails_to_load_says_why(tmp_path, monkeypatch):
     (tmp_path / "broken_module.py").write_text("import libfoo_that_is_not_there\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(DependencyError, match="broken_module does not load .*libfoo_that_is_not_there"):
+    with pytest.raises(
+        DependencyError, match="broken_module does not load .*libfoo_that_is_not_there"
+    ):
         import_extra("broken_module", "view")
 
 
 def test_ctrl_c_is_not_lost_in_a_module_that_catches_everything(tmp_path, monkeypatch):
-    lines = ("import os, signal", "try:", "    os.kill(os.getpid(), signal.SIGINT)", "    sum(range(1000))")
-    (tmp_path / "catches_all.py").write_text("\n".join([*lines, "except BaseException:", "    pass", ""]))
+    lines = (
+        "import os, signal",
+        "try:",
+        "    os.kill(os.getpid(), signal.SIGINT)",
+        "    sum(range(1000))",
+    )
+    (tmp_path / "catches_all.py").write_text(
+        "\n".join([*lines, "except BaseException:", "    pass", ""])
+    )
     monkeypatch.syspath_prepend(tmp_path)
-    usual = signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # a program that a shell starts with "&" ignores Ctrl-C
+    # a program that a shell starts with "&" ignores Ctrl-C
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
             import_extra("catches_all", "view")
@@ -163,10 +194,13 @@ def test_ctrl_c_is_not_lost_in_a_module_that_catches_everything(tmp_path, monkey
 
 def test_importing_carlasc_loads_numpy_and_nothing_heavier():
     code = (
-        "import sys, carlasc; heavy = {'numba', 'torch', 'typer', 'rich', 'zarr', 'h5py', 'pyarrow', 'trimesh', 'open3d', 'fsspec'};"
+        "import sys, carlasc; heavy = {'numba', 'torch', 'typer', 'rich', 'zarr', 'h5py', "
+        "'pyarrow', 'trimesh', 'open3d', 'fsspec'};"
         "print(sorted(heavy & set(sys.modules)), 'numpy' in sys.modules or True)"
     )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
     assert out.startswith("[]")
 
 
@@ -226,7 +260,12 @@ def test_other_threads_are_left_alone():
 
 def test_a_program_that_is_interrupted_while_its_threads_start_ends():
     ran = subprocess.run(
-        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=60, check=False, start_new_session=True
+        [sys.executable, "-c", PROGRAM],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        start_new_session=True,
     )
     assert (ran.returncode, ran.stdout) == (0, "interrupted\n"), ran.stderr
 

@@ -24,7 +24,9 @@ def gallery():
 def test_the_page_shows_what_its_commands_draw_and_nothing_else(gallery):
     sections = gallery.read_sections()
     shown = [name for section in sections for name in section.images]
-    drawn = [shlex.split(line) for section in sections for line in section.commands if " render " in line]
+    drawn = [
+        shlex.split(line) for section in sections for line in section.commands if " render " in line
+    ]
     assert [words[words.index("-o") + 1] for words in drawn] == shown
     assert sorted(shown) == sorted(path.name for path in gallery.IMAGES.iterdir())
     assert len([name for name in shown if name.endswith(".png")]) == 15
@@ -85,7 +87,9 @@ def test_only_the_data_that_a_section_needs_are_made(gallery):
     ]
     lines = [line.split()[1:3] for line, _ in gallery._needed(sections, ["Scene flow"])]
     assert lines == [["simulate", "town"], ["regrid", "town"], ["render", "town"]]
-    assert len(list(gallery._needed(sections, []))) == sum(len(section.commands) for section in sections)
+    assert len(list(gallery._needed(sections, []))) == sum(
+        len(section.commands) for section in sections
+    )
     with pytest.raises(KeyError, match="Nothing"):
         gallery.make(ROOT, ROOT, ["Nothing"])
 
@@ -93,11 +97,15 @@ def test_only_the_data_that_a_section_needs_are_made(gallery):
 @pytest.mark.slow
 def test_pictures_are_those_that_the_commands_draw(gallery, tmp_path):
     pytest.importorskip("embreex")
-    copies = gallery.make(tmp_path, tmp_path, ["The published grid", "A cylindrical grid", "How many sensors"])
+    copies = gallery.make(
+        tmp_path, tmp_path, ["The published grid", "A cylindrical grid", "How many sensors"]
+    )
     assert [copy.name for copy in copies] == ["coarse.png", "cylindrical.png", "sensors.png"]
     for copy in copies:
         ours, theirs = (
-            np.asarray(Image.open(folder / copy.name).convert("RGB"), int) for folder in (tmp_path, gallery.IMAGES)
+            np.asarray(Image.open(folder / copy.name).convert("RGB"), int)
+            for folder in (tmp_path, gallery.IMAGES)
         )
         assert ours.shape == theirs.shape
-        assert np.abs(ours - theirs).mean() < 2  # of 255; quantising may choose other colours elsewhere
+        # of 255; quantising may choose other colours elsewhere
+        assert np.abs(ours - theirs).mean() < 2

@@ -1,4 +1,6 @@
-"""Objects behave as Python's own do: stores are mappings, sequences are collections of frames, data sets take slices, and all show themselves."""
+"""Objects behave as Python's own do: stores are mappings, sequences are collections of frames, data
+sets take slices, and all show themselves.
+"""
 
 import base64
 import json
@@ -33,10 +35,20 @@ def world(tmp_path_factory):
 def test_a_source_is_a_mapping_of_paths(world):
     source = carlasc.open(world)
     assert list(source) == list(source.sequences()) and len(source) == 3
-    assert source["Train/Town01_Light"].path == source["Train/Town01_Light/cartesian"].path == next(iter(source))
+    assert (
+        source["Train/Town01_Light"].path
+        == source["Train/Town01_Light/cartesian"].path
+        == next(iter(source))
+    )
     assert "Val/Town07_Light" in source and "Town99" not in source and source.get("Town99") is None
-    assert [sequence.path for sequence in source.values()] == [path for path, _ in source.items()] == list(source)
-    with pytest.raises(KeyError, match="expected the sequence Town99, found Train/Town01_Light/cartesian") as raised:
+    assert (
+        [sequence.path for sequence in source.values()]
+        == [path for path, _ in source.items()]
+        == list(source)
+    )
+    with pytest.raises(
+        KeyError, match="expected the sequence Town99, found Train/Town01_Light/cartesian"
+    ) as raised:
         source["Town99"]
     assert isinstance(raised.value, MissingDataError)
     assert source == source and source != carlasc.open(world) and len({source, source}) == 1  # noqa: PLR0124
@@ -60,7 +72,14 @@ def test_what_is_empty_is_still_true(tmp_path):
     assert len(empty) == 0 and bool(empty)
 
 
-SLICES = (slice(2, 5), slice(None, None, 3), slice(-4, None), slice(7, 2), slice(0, 100), slice(1, 8, 2))
+SLICES = (
+    slice(2, 5),
+    slice(None, None, 3),
+    slice(-4, None),
+    slice(7, 2),
+    slice(0, 100),
+    slice(1, 8, 2),
+)
 
 
 @pytest.mark.parametrize("chosen", SLICES, ids=str)
@@ -72,19 +91,27 @@ def test_a_slice_of_a_data_set_holds_the_samples_of_the_slice(world, chosen):
     assert len(part) == len(every[chosen]) and len(whole) == 10
     for name, frame in every[chosen]:
         mine, same = part[part.index_of(name, frame)], whole[whole.index_of(name, frame)]
-        assert all(np.array_equal(mine[field], same[field]) for field in mine)  # with the scans before the slice
+        # with the scans before the slice
+        assert all(np.array_equal(mine[field], same[field]) for field in mine)
     again = pickle.loads(pickle.dumps(part))
     assert [sample["frame"] for sample in again] == [frame for _, frame in every[chosen]]
 
 
 def test_a_slice_backwards_is_one_line(world):
-    with pytest.raises(ArgumentError, match="index: expected a slice with a step of 1 or more, found -1"):
+    with pytest.raises(
+        ArgumentError, match="index: expected a slice with a step of 1 or more, found -1"
+    ):
         Dataset(world, "train")[::-1]
 
 
 def test_one_name_of_a_sequence_is_taken_as_a_list_of_one(world):
     alone = Dataset(world, "Town02_Light")
-    assert len(alone) == len(Dataset(world, ["Town02_Light"])) == len(Dataset(world, "Train/Town02_Light")) == 4
+    assert (
+        len(alone)
+        == len(Dataset(world, ["Town02_Light"]))
+        == len(Dataset(world, "Train/Town02_Light"))
+        == 4
+    )
 
 
 FRAMES = {
@@ -103,10 +130,16 @@ FRAMES = {
 @pytest.mark.parametrize(("given", "chosen"), FRAMES.values(), ids=FRAMES)
 def test_frames_are_taken_as_python_says_them(given, chosen):
     frames = FrameRange.of(given)
-    assert frames.select(np.arange(10)).tolist() == chosen == [frame for frame in range(10) if frame in frames]
+    assert (
+        frames.select(np.arange(10)).tolist()
+        == chosen
+        == [frame for frame in range(10) if frame in frames]
+    )
 
 
-@pytest.mark.parametrize("wrong", [3, 2.5, slice(0, 9, 2), [1.5], [], range(0), "a:b", (1, 2, 3), {"a": 1}], ids=str)
+@pytest.mark.parametrize(
+    "wrong", [3, 2.5, slice(0, 9, 2), [1.5], [], range(0), "a:b", (1, 2, 3), {"a": 1}], ids=str
+)
 def test_wrong_frames_are_one_line(wrong):
     with pytest.raises(ArgumentError, match="frames: expected"):
         FrameRange.of(wrong)
@@ -124,8 +157,13 @@ def test_representations_are_short(world):
     sequence = carlasc.open(world)["Train/Town01_Light"]
     scan, grid = sequence.scan(0), sequence.grid("evaluation", 0)
     assert re.fullmatch(r"<Scan of [\d,]+ points: labels, flow, remission>", repr(scan))
-    assert re.fullmatch(r"<Grid cartesian 16 x 16 x 4: [\d,]+ occupied and [\d,]+ free voxels>", repr(grid))
-    assert repr(Dataset(world, "Town02_Light")) == "<Dataset of 4 frames in 1 sequence: occupancy, labels, known>"
+    assert re.fullmatch(
+        r"<Grid cartesian 16 x 16 x 4: [\d,]+ occupied and [\d,]+ free voxels>", repr(grid)
+    )
+    assert (
+        repr(Dataset(world, "Town02_Light"))
+        == "<Dataset of 4 frames in 1 sequence: occupancy, labels, known>"
+    )
 
 
 def pixels(html):
@@ -134,7 +172,9 @@ def pixels(html):
     width, height = np.frombuffer(data[16:24], ">u4").tolist()
     start = data.index(b"IDAT") + 4
     length = int.from_bytes(data[start - 8 : start - 4], "big")
-    rows = np.frombuffer(zlib.decompress(data[start : start + length]), np.uint8).reshape(height, 1 + 3 * width)
+    rows = np.frombuffer(zlib.decompress(data[start : start + length]), np.uint8).reshape(
+        height, 1 + 3 * width
+    )
     return rows[:, 1:].reshape(height, width, 3)
 
 
@@ -150,7 +190,10 @@ def test_a_grid_in_a_notebook_shows_its_voxels_where_they_are(coordinates):
 
 
 def test_a_sequence_and_a_data_set_show_their_classes_in_their_own_axes(world):
-    for html in (carlasc.open(world)["Train/Town01_Light"]._repr_html_(), Dataset(world, "train")._repr_html_()):
+    for html in (
+        carlasc.open(world)["Train/Town01_Light"]._repr_html_(),
+        Dataset(world, "train")._repr_html_(),
+    ):
         assert (pixels(html) < 255).any() and "cartesian 16 x 16 x 4" in html
     labels = np.zeros(SMALL.size, np.uint8)
     labels[12, 3, 1] = 10
@@ -193,7 +236,9 @@ def test_tables_of_pandas_hold_what_the_objects_hold(world, tmp_path):
     pandas = pytest.importorskip("pandas")
     found = carlasc.info(world)
     overview = found.to_pandas()
-    assert overview.index.name == "path" and list(overview.index) == [one.path for one in found.sequences]
+    assert overview.index.name == "path" and list(overview.index) == [
+        one.path for one in found.sequences
+    ]
     assert list(overview["frames"]) == [one.frames for one in found.sequences]
     counted = carlasc.stats(world, grid="evaluation_0")
     table = counted.to_pandas()
@@ -202,12 +247,19 @@ def test_tables_of_pandas_hold_what_the_objects_hold(world, tmp_path):
         "split", "class", "points", "voxels",
     ]  # fmt: skip
     file = tmp_path / "net.json"
-    result = {"name": "net", "convention": "carlasc", "frames": 2, "class_iou": {"Road": 0.5, "Pole": None}}
+    result = {
+        "name": "net",
+        "convention": "carlasc",
+        "frames": 2,
+        "class_iou": {"Road": 0.5, "Pole": None},
+    }
     figures = {"miou": 0.25, "iou": 0.5, "precision": 0.5, "recall": 1.0, "false_free": None}
     file.write_text(json.dumps(result | figures))
     scores = carlasc.scores([file]).to_pandas()
     assert (
-        scores.loc["net", "Road"] == 0.5 and pandas.isna(scores.loc["net", "Pole"]) and scores.index.name == "Network"
+        scores.loc["net", "Road"] == 0.5
+        and pandas.isna(scores.loc["net", "Pole"])
+        and scores.index.name == "Network"
     )
 
 
@@ -223,7 +275,17 @@ def test_a_table_of_nothing_has_no_rows_and_missing_pandas_is_one_line(tmp_path,
 def test_editors_know_the_fields_of_a_sample(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT)
     (tmp_path / "mypy.ini").write_text("[mypy]\n[mypy-pandas.*]\nignore_missing_imports = true\n")
-    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), "script.py"]
-    found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--cache-dir",
+        str(tmp_path / "cache"),
+        "script.py",
+    ]
+    found = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False
+    ).stdout
     assert 'has no key "nothing"' in found and found.count(": error:") == 1, found
     assert re.search(r"Revealed type is .*ndarray.*bool", found)

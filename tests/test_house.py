@@ -11,9 +11,8 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
 FILES = sorted([*PACKAGE.rglob("*.py"), *(ROOT / "converters").rglob("*.py")])
 MOST_LINES, MOST_PARAMETERS, MOST_FIELDS, MOST_ENTRIES = 400, 12, 12, 15
-OPTIONS = re.compile(
-    r"\w*(Options|Settings|Scoring|Details|Address)|From\w+|Voting|Run|Lidar"
-)  # names of classes that hold options
+# names of classes that hold options
+OPTIONS = re.compile(r"\w*(Options|Settings|Scoring|Details|Address)|From\w+|Voting|Run|Lidar")
 
 
 def parsed():
@@ -40,12 +39,16 @@ def test_no_file_name_occurs_more_than_twice():
 
 
 def test_no_module_is_long():
-    lengths = {path.relative_to(ROOT).as_posix(): len(path.read_text().splitlines()) for path in FILES}
+    lengths = {
+        path.relative_to(ROOT).as_posix(): len(path.read_text().splitlines()) for path in FILES
+    }
     assert {path: length for path, length in lengths.items() if length > MOST_LINES} == {}
 
 
 def is_public(path):
-    """Whether a file belongs to the library, not to the command line, whose functions have a parameter per option."""
+    """Whether a file belongs to the library, not to the command line, whose functions have a
+    parameter per option.
+    """
     return not path.startswith("carlasc/cli/")
 
 
@@ -55,8 +58,12 @@ def test_no_public_function_has_many_parameters():
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and is_public(path):
                 arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-                names = [argument.arg for argument in arguments if argument.arg not in ("self", "cls")]
-                if len(names) > MOST_PARAMETERS and (not node.name.startswith("_") or node.name == "__init__"):
+                names = [
+                    argument.arg for argument in arguments if argument.arg not in ("self", "cls")
+                ]
+                if len(names) > MOST_PARAMETERS and (
+                    not node.name.startswith("_") or node.name == "__init__"
+                ):
                     many[f"{path}: {node.name}"] = len(names)
     assert many == {}
 
@@ -73,7 +80,9 @@ def test_no_options_object_has_many_fields():
 
 
 def test_the_package_has_few_entries():
-    entries = {path.stem for path in PACKAGE.iterdir() if path.name not in ("__pycache__", "py.typed")}
+    entries = {
+        path.stem for path in PACKAGE.iterdir() if path.name not in ("__pycache__", "py.typed")
+    }
     assert len(entries - {"__init__", "__main__"}) <= MOST_ENTRIES, sorted(entries)
 
 
@@ -82,7 +91,11 @@ def test_rooms_do_not_import_the_top_package(room):
     rooms = {path.stem for path in PACKAGE.iterdir()}
     for path in (PACKAGE / room).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+            names = (
+                [alias.name for alias in node.names]
+                if isinstance(node, ast.Import | ast.ImportFrom)
+                else []
+            )
             if isinstance(node, ast.Import):
                 assert "carlasc" not in names, f"{path.relative_to(ROOT)}, line {node.lineno}"
             elif isinstance(node, ast.ImportFrom) and node.module == "carlasc":

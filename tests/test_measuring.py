@@ -1,4 +1,6 @@
-"""The pages show the figures of docs/figures.json, and no others; a measurement that fails leaves the figure of before."""
+"""The pages show the figures of docs/figures.json, and no others; a measurement that fails leaves
+the figure of before.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +17,31 @@ from measuring.figures import FILE, PAGES, ROOT, Figure, Figures, pages, ratio, 
 from measuring.places import commands, fill, keys, typed_by_hand
 from measuring.sizes import SIZES, by_turns
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT / "tests" / "tools")])}
-RUN = {"date": "2030-01-02", "size": "quick", "processor": "Abacus", "target": "beads", "cores": 2, "load": 0.1}
+ENVIRONMENT = os.environ | {
+    "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT / "tests" / "tools")])
+}
+RUN = {
+    "date": "2030-01-02",
+    "size": "quick",
+    "processor": "Abacus",
+    "target": "beads",
+    "cores": 2,
+    "load": 0.1,
+}
 RUN |= {"python": "3.11", "system": "wood", "versions": {"carlasc": "0.1.0"}}
 
 
 def test_the_pages_show_the_figures_of_the_file() -> None:
     made = pages(Figures.read())
-    assert {ROOT / "README.md", ROOT / "docs" / "performance.md", ROOT / "docs" / "reliability.md"} <= set(made)
+    assert {
+        ROOT / "README.md",
+        ROOT / "docs" / "performance.md",
+        ROOT / "docs" / "reliability.md",
+    } <= set(made)
     for path, text in made.items():
         assert path.read_text() == text, (
-            f"{path.relative_to(ROOT)}: run `PYTHONPATH=tests:tests/tools python -m measuring --fill`"
+            f"{path.relative_to(ROOT)}: run `PYTHONPATH=tests:tests/tools python -m measuring "
+            f"--fill`"
         )
 
 
@@ -33,8 +49,10 @@ def test_the_pages_show_the_figures_of_the_file() -> None:
 def test_every_number_of_a_page_has_a_command(path: Path) -> None:
     page, new = path.relative_to(ROOT).as_posix(), unwritten(path)
     assert not new, (
-        f"{page}: {new}: nothing writes these numbers. Name the study that makes them in their section (docs/studies/NAME.py), measure them"
-        " (tests/tools/measuring) and put them into a place, name the constant of the code (tests/tools/measuring/facts.py), or leave them out"
+        f"{page}: {new}: nothing writes these numbers. Name the study that makes them in their "
+        f"section (docs/studies/NAME.py), measure them"
+        " (tests/tools/measuring) and put them into a place, name the constant of the code "
+        "(tests/tools/measuring/facts.py), or leave them out"
     )
 
 
@@ -48,7 +66,9 @@ def test_pages_name_studies_that_there_are() -> None:
 def test_constants_of_pages_are_those_of_the_code(page: str) -> None:
     found = typed_by_hand((ROOT / page).read_text())
     for text, name in CONSTANTS[page].items():
-        assert text in found, f"{page} does not hold {text} any more: remove it from tests/tools/measuring/facts.py"
+        assert text in found, (
+            f"{page} does not hold {text} any more: remove it from tests/tools/measuring/facts.py"
+        )
         assert is_right(text, name), f"{page} says {text}, {name} is {value_of(name)}"
 
 
@@ -57,10 +77,14 @@ def test_there_are_few_exceptions_and_all_are_on_their_pages() -> None:
     for (page, text), reason in EXCEPTIONS.items():
         assert reason
         whole = (ROOT / page).read_text()
-        assert text in whole if text.startswith("## ") else text in typed_by_hand(whole), f"{page} does not hold {text}"
+        assert text in whole if text.startswith("## ") else text in typed_by_hand(whole), (
+            f"{page} does not hold {text}"
+        )
 
 
-def test_every_figure_says_how_and_where_it_was_measured_and_belongs_to_what_the_pages_show() -> None:
+def test_every_figure_says_how_and_where_it_was_measured_and_belongs_to_what_the_pages_show() -> (
+    None
+):
     held = Figures.read()
     for key, figure in held.figures.items():
         assert figure.how, key
@@ -78,7 +102,10 @@ def test_a_place_is_made_again_from_its_template() -> None:
     assert fill(line, {"a.b": "4 to 5"}) == line.replace(">3 times", ">4 to 5 times")
     block = "x\n\n<!-- figures\n| {a} |\n|---|\n-->old<!-- figures end -->\n\ny"
     made = fill(block, {"a": "1 ms"})
-    assert made == "x\n\n<!-- figures\n| {a} |\n|---|\n-->\n\n| 1 ms |\n|---|\n\n<!-- figures end -->\n\ny"
+    assert (
+        made
+        == "x\n\n<!-- figures\n| {a} |\n|---|\n-->\n\n| 1 ms |\n|---|\n\n<!-- figures end -->\n\ny"
+    )
     assert fill(made, {"a": "1 ms"}) == made
     assert keys(line + block) == {"a.b", "a"}
     with pytest.raises(KeyError):
@@ -88,7 +115,9 @@ def test_a_place_is_made_again_from_its_template() -> None:
 def test_no_place_of_a_line_begins_a_line_where_markdown_would_end_the_paragraph() -> None:
     for path in PAGES:
         wrong = [
-            line for line in path.read_text().splitlines() if line.startswith("<!-- figures ") and "end -->" in line
+            line
+            for line in path.read_text().splitlines()
+            if line.startswith("<!-- figures ") and "end -->" in line
         ]
         assert not [line for line in wrong if not line.startswith("<!-- figures end")], path
 
@@ -98,16 +127,21 @@ def test_no_place_of_a_line_begins_a_line_where_markdown_would_end_the_paragraph
     [
         ("It takes 12.5 ms, or 3 to 4 s.", ["12.5 ms", "3 to 4 s"]),
         ("16x as fast, 1,442 MB, 2.5 times", ["16x", "1,442 MB", "2.5 times"]),
-        ("IoU 0.74 instead of 0.39, 7% and 3 to 16 % called free", ["0.74", "0.39", "7%", "3 to 16 %"]),
+        (
+            "IoU 0.74 instead of 0.39, 7% and 3 to 16 % called free",
+            ["0.74", "0.39", "7%", "3 to 16 %"],
+        ),
         ("a grid of 128 x 128 x 8 voxels of 0.25 m, T = 16, 20 LiDARs, 0.15 m or 0.5 degrees", []),
         (
-            "| rule | IoU | false |\n|---|---:|---:|\n| tube | 0.11 ± 0.03 | 6,675 |\n| 0.4 m | **51.2 %** | 7 ms |",
+            "| rule | IoU | false |\n|---|---:|---:|\n| tube | 0.11 ± 0.03 | 6,675 |\n| 0.4 m | "
+            "**51.2 %** | 7 ms |",
             None,
         ),
         ("`--timeout 10 s` and\n```\n5 ms\n```\n<!-- 3 s --> [x](1.25.md)", []),
         ("<!-- figures {a} -->7 ms<!-- figures end --> and 8 ms", ["8 ms"]),
         (
-            "# a\n\n8 ms\n\n## b\n\n`docs/studies/movers.py` finds 7%.\n\n### c\n\n9 ms\n\n## d\n\n6 ms",
+            "# a\n\n8 ms\n\n## b\n\n`docs/studies/movers.py` finds 7%.\n\n### c\n\n9 ms\n\n## "
+            "d\n\n6 ms",
             ["8 ms", "6 ms"],
         ),
     ],
@@ -164,24 +198,37 @@ def test_a_group_that_fails_is_reported_and_keeps_its_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "figures.json"
-    Figures({}, {}).updated(RUN, {"a": Figure(1.0, "s", "a"), "b": Figure(2.0, "s", "b")}).write(file)
-    answers = {"loading": ({"a": Figure(3.0, "s", "a")}, "it failed:\nValueError: too slow"), "stores": ({}, "")}
+    Figures({}, {}).updated(RUN, {"a": Figure(1.0, "s", "a"), "b": Figure(2.0, "s", "b")}).write(
+        file
+    )
+    answers = {
+        "loading": ({"a": Figure(3.0, "s", "a")}, "it failed:\nValueError: too slow"),
+        "stores": ({}, ""),
+    }
     monkeypatch.setattr(command, "_describe_run", lambda size: RUN | {"date": "2030-02-03"})
     monkeypatch.setattr(command, "_measure_in_a_process", lambda group, size: answers[group])
     assert command.measure_all(["loading", "stores"], "quick", file) == ["loading"]
     figures = Figures.read(file).figures
     assert (figures["a"].value, figures["b"].value) == (3.0, 2.0)
     printed = capsys.readouterr().out
-    assert "loading: 1 figures in 0 s, then it failed" in printed and "ValueError: too slow" in printed
+    assert (
+        "loading: 1 figures in 0 s, then it failed" in printed and "ValueError: too slow" in printed
+    )
     assert "loading failed: these figures are those of before" in printed
 
 
-def test_a_benchmark_that_fails_does_not_hide_the_others(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_benchmark_that_fails_does_not_hide_the_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     runs = iter([1.0, 0.5])
 
     def run(name: str, size: object, out: Path) -> tuple[list[dict[str, object]], str]:
         return [
-            {"name": "test_bench_encode", "stats": {"min": next(runs)}, "extra_info": {"peak_mb": 7}}
+            {
+                "name": "test_bench_encode",
+                "stats": {"min": next(runs)},
+                "extra_info": {"peak_mb": 7},
+            }
         ], "E  too slow"
 
     monkeypatch.setattr(benchmarks, "_run", run)
@@ -214,8 +261,25 @@ def test_tiny_figures_never_reach_the_pages() -> None:
 def test_a_group_measures_the_figures_that_the_file_has_of_it(group: str, tmp_path: Path) -> None:
     file = tmp_path / "figures.json"
     before = FILE.read_bytes()
-    command_line = [sys.executable, "-m", "measuring", "--size", "tiny", "--only", group, "--out", str(file)]
-    ran = subprocess.run(command_line, cwd=ROOT / "tests", env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    command_line = [
+        sys.executable,
+        "-m",
+        "measuring",
+        "--size",
+        "tiny",
+        "--only",
+        group,
+        "--out",
+        str(file),
+    ]
+    ran = subprocess.run(
+        command_line,
+        cwd=ROOT / "tests",
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert ran.returncode == 0, ran.stdout + ran.stderr
     measured = Figures.read(file)
     first = {key.split(".")[0] for key in measured.figures}

@@ -1,4 +1,6 @@
-"""The notebooks run from top to bottom, and the outputs that are kept in them are small and of today."""
+"""The notebooks run from top to bottom, and the outputs that are kept in them are small and of
+today.
+"""
 
 import base64
 import importlib.util
@@ -12,13 +14,19 @@ nbformat = pytest.importorskip("nbformat")
 
 FOLDER = Path(__file__).parents[1] / "examples" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-DIFFERENCE = 6  # of 255, on average: other versions of Embree and torch draw and train a little differently
+DIFFERENCE = (
+    6  # of 255, on average: other versions of Embree and torch draw and train a little differently
+)
 
 
 def pictures(notebook):
     """Return the bytes of the notebook's pictures, in order."""
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
-    return [base64.b64decode(o["data"]["image/png"]) for o in outputs if "image/png" in o.get("data", {})]
+    return [
+        base64.b64decode(o["data"]["image/png"])
+        for o in outputs
+        if "image/png" in o.get("data", {})
+    ]
 
 
 @pytest.mark.slow
@@ -36,7 +44,9 @@ def test_a_notebook_runs_and_draws_what_it_shows(path):
     ours, theirs = pictures(runner.run(path)), pictures(nbformat.read(path, as_version=4))
     assert len(ours) == len(theirs) >= 2
     for pair in zip(ours, theirs, strict=True):
-        drawn, kept = (np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), int) for data in pair)
+        drawn, kept = (
+            np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), int) for data in pair
+        )
         assert drawn.shape == kept.shape
         assert np.abs(drawn - kept).mean() < DIFFERENCE
 
@@ -50,4 +60,7 @@ def test_notebooks_are_small_and_every_cell_has_run():
         code = [cell for cell in notebook.cells if cell.cell_type == "code"]
         assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), path.name
         for cell in code:
-            assert not any(output.output_type == "error" or output.get("name") == "stderr" for output in cell.outputs)
+            assert not any(
+                output.output_type == "error" or output.get("name") == "stderr"
+                for output in cell.outputs
+            )

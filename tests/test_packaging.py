@@ -25,11 +25,16 @@ BUILD_ONLY = {"build.sh", "three.entry.mjs"}  # files of the page that only its 
 def pins():
     """Return the version of each package in constraints.txt."""
     lines = (ROOT / "constraints.txt").read_text().splitlines()
-    return {canonicalize_name(name): pin for name, pin in (ln.split("==") for ln in lines if not ln.startswith("#"))}
+    return {
+        canonicalize_name(name): pin
+        for name, pin in (ln.split("==") for ln in lines if not ln.startswith("#"))
+    }
 
 
 def installed_for(name, extras=frozenset()):
-    """Return the names of all packages that a package with these extras needs in this environment, its own included."""
+    """Return the names of all packages that a package with these extras needs in this environment,
+    its own included.
+    """
     found, open_ends = {}, [(canonicalize_name(name), frozenset(extras))]
     while open_ends:
         package, chosen = open_ends.pop()
@@ -38,14 +43,25 @@ def installed_for(name, extras=frozenset()):
         found.setdefault(package, set()).update(chosen | {""})
         for line in requires(package) or ():
             needed = Requirement(line)
-            if needed.marker is None or any(needed.marker.evaluate({"extra": extra}) for extra in chosen | {""}):
+            if needed.marker is None or any(
+                needed.marker.evaluate({"extra": extra}) for extra in chosen | {""}
+            ):
                 open_ends.append((canonicalize_name(needed.name), frozenset(needed.extras)))
     return set(found)
 
 
 def test_the_wheel_holds_the_packages_and_nothing_that_only_builds_them(tmp_path):
     pytest.importorskip("hatchling")
-    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "hatchling",
+        "build",
+        "--target",
+        "wheel",
+        "--directory",
+        str(tmp_path),
+    ]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
     assert wheel.name == f"carlasc-{carlasc.__version__}-py3-none-any.whl"
@@ -72,9 +88,15 @@ def test_the_version_is_in_one_place():
 
 
 def test_every_requirement_has_a_lowest_version():
-    lines = PROJECT["dependencies"] + [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
+    lines = PROJECT["dependencies"] + [
+        line for lines in PROJECT["optional-dependencies"].values() for line in lines
+    ]
     for needed in map(Requirement, lines):
-        if needed.name not in ("carlasc", "types-PyYAML"):  # the package's own extras; the stubs follow PyYAML
+        # the package's own extras; the stubs follow PyYAML
+        if needed.name not in (
+            "carlasc",
+            "types-PyYAML",
+        ):
             assert any(one.operator == ">=" for one in needed.specifier), needed
 
 
@@ -89,12 +111,18 @@ def test_all_is_every_extra_but_sets_of_others_the_heavy_ones_and_those_of_devel
 
 
 def test_the_table_of_extras_names_each_and_nothing_that_is_none():
-    page = (ROOT / "docs" / "index.md").read_text().partition("## Extras")[2].partition("## Next")[0]
+    page = (
+        (ROOT / "docs" / "index.md").read_text().partition("## Extras")[2].partition("## Next")[0]
+    )
     rows = re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
-    assert set(re.findall(r"`([a-z0-9]+)`", " ".join(rows))) == set(PROJECT["optional-dependencies"])
+    assert set(re.findall(r"`([a-z0-9]+)`", " ".join(rows))) == set(
+        PROJECT["optional-dependencies"]
+    )
 
 
-@pytest.mark.skipif(sys.version_info[:2] != (3, 11) or sys.platform != "linux", reason="where the pins were made")
+@pytest.mark.skipif(
+    sys.version_info[:2] != (3, 11) or sys.platform != "linux", reason="where the pins were made"
+)
 def test_constraints_pin_what_the_tests_install_and_nothing_else():
     try:
         needed = installed_for("carlasc", ("all", "torch", "view", "rerun", "dev")) - {"carlasc"}
@@ -111,7 +139,9 @@ def test_the_release_checklist_lists_the_relative_links_of_the_readme():
     links = re.findall(r"\]\(([^)]+)\)", (ROOT / "README.md").read_text())
     relative = {link for link in links if not link.startswith(("http", "#"))}
     checklist = (ROOT / "docs" / "releasing.md").read_text()
-    listed = re.search(r"<!-- relative links begin -->(.*)<!-- relative links end -->", checklist, re.DOTALL)
+    listed = re.search(
+        r"<!-- relative links begin -->(.*)<!-- relative links end -->", checklist, re.DOTALL
+    )
     assert set(re.findall(r"`([^`]+)`", listed[1])) == relative
     assert all((ROOT / link.partition("#")[0]).is_file() for link in relative)
 
@@ -121,9 +151,13 @@ def test_files_that_contributors_are_sent_to_exist():
         text = (ROOT / page).read_text()
         named = re.findall(r"`((?:carlasc|converters|docs|tests|examples)/[\w./-]+)`", text)
         linked = [
-            (ROOT / page).parent / link for link in re.findall(r"\]\(([^)#:]+)[^)]*\)", text) if "http" not in link
+            (ROOT / page).parent / link
+            for link in re.findall(r"\]\(([^)#:]+)[^)]*\)", text)
+            if "http" not in link
         ]
-        missing = [str(path) for path in [*map(ROOT.__truediv__, named), *linked] if not path.exists()]
+        missing = [
+            str(path) for path in [*map(ROOT.__truediv__, named), *linked] if not path.exists()
+        ]
         assert not missing, f"{page}: {missing}"
 
 
@@ -132,27 +166,47 @@ def test_the_types_are_right_on_macos_too(tmp_path):
     pytest.importorskip("mypy")
     command = [sys.executable, "-m", "mypy", "--platform", "darwin", "--cache-dir", str(tmp_path)]
     ran = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stdout  # names that only Linux has, such as os.sched_getaffinity
+    # names that only Linux has, such as os.sched_getaffinity
+    assert ran.returncode == 0, ran.stdout
 
 
 @pytest.fixture(scope="module")
 def from_wheel(tmp_path_factory):
-    """Runs `carlasc` from the built wheel in an environment that is made for it, as `uvx` and `pipx run` do."""
+    """Runs `carlasc` from the built wheel in an environment that is made for it, as `uvx` and `pipx
+    run` do.
+    """
     pytest.importorskip("hatchling")
     pytest.importorskip("uv")
     folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
+    build = [
+        sys.executable,
+        "-m",
+        "hatchling",
+        "build",
+        "--target",
+        "wheel",
+        "--directory",
+        str(folder),
+    ]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
-    clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    clean = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
+    }
     tool = [sys.executable, "-m", "uv", "tool", "run", "--no-config", "--python", sys.executable]
 
     def run(*arguments, extras="", archive=wheel):
         command = [*tool, "--from", f"carlasc{extras} @ {archive.as_uri()}", "carlasc", *arguments]
-        return subprocess.run(command, cwd=folder, env=clean, check=False, capture_output=True, text=True)
+        return subprocess.run(
+            command, cwd=folder, env=clean, check=False, capture_output=True, text=True
+        )
 
     ran = run("--version")
-    if ran.returncode and re.search(r"error sending request|No solution found|dns error|not found in the", ran.stderr):
+    if ran.returncode and re.search(
+        r"error sending request|No solution found|dns error|not found in the", ran.stderr
+    ):
         pytest.skip(f"no package index within reach: {ran.stderr.strip().splitlines()[0]}")
     assert (ran.returncode, ran.stdout.strip()) == (0, carlasc.__version__), ran.stderr
     return run
@@ -164,13 +218,19 @@ def test_the_wheel_runs_without_extras_and_says_which_are_missing(from_wheel):
     assert ran.returncode == 0, ran.stdout + ran.stderr
     found = json.loads(ran.stdout)
     assert found["problems"] == [] and "uv" in found["folder"]
-    missing = {extra["name"] for extra in found["extras"] if None in [one["version"] for one in extra["packages"]]}
+    missing = {
+        extra["name"]
+        for extra in found["extras"]
+        if None in [one["version"] for one in extra["packages"]]
+    }
     assert {"render", "simulate", "zarr"} <= missing
 
 
 @pytest.mark.slow
 def test_the_demo_runs_from_the_wheel_and_ends_with_the_page(from_wheel, tmp_path):
-    ran = from_wheel("demo", str(tmp_path / "town"), "--count", "1", "--sensors", "2", extras="[demo]")
+    ran = from_wheel(
+        "demo", str(tmp_path / "town"), "--count", "1", "--sensors", "2", extras="[demo]"
+    )
     assert ran.returncode == 0, ran.stderr
     lines = ran.stdout.splitlines()
     assert re.fullmatch(r"simulate a town, Train \.\.\. \d+\.\d s", lines[0])
@@ -180,21 +240,47 @@ def test_the_demo_runs_from_the_wheel_and_ends_with_the_page(from_wheel, tmp_pat
 
 @pytest.mark.slow
 def test_the_source_archive_installs_and_makes_the_same_wheel(from_wheel, tmp_path):
-    command = [sys.executable, "-m", "hatchling", "build", "--target", "sdist", "--directory", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "hatchling",
+        "build",
+        "--target",
+        "sdist",
+        "--directory",
+        str(tmp_path),
+    ]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     (archive,) = tmp_path.glob("*.tar.gz")
     with tarfile.open(archive) as tar:
         tar.extractall(tmp_path, filter="data")
     (folder,) = tmp_path.glob("carlasc-*/")
-    assert {"carlasc", "converters", "examples", "docs", "tests"} <= {path.name for path in folder.iterdir()}
+    assert {"carlasc", "converters", "examples", "docs", "tests"} <= {
+        path.name for path in folder.iterdir()
+    }
     assert not (folder / "tests" / "data").exists() and not (folder / ".ci").exists()
     held = []
     for place in (ROOT, folder):
         out = tmp_path / f"wheel of {place.name}"
-        command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(out)]
+        command = [
+            sys.executable,
+            "-m",
+            "hatchling",
+            "build",
+            "--target",
+            "wheel",
+            "--directory",
+            str(out),
+        ]
         subprocess.run(command, cwd=place, check=True, capture_output=True)
         with ZipFile(next(out.glob("*.whl"))) as wheel:
-            held.append({one.filename: one.CRC for one in wheel.infolist() if ".dist-info/" not in one.filename})
+            held.append(
+                {
+                    one.filename: one.CRC
+                    for one in wheel.infolist()
+                    if ".dist-info/" not in one.filename
+                }
+            )
     assert held[0] == held[1]
     ran = from_wheel("--version", archive=archive)
     assert (ran.returncode, ran.stdout.strip()) == (0, carlasc.__version__), ran.stderr

@@ -1,4 +1,6 @@
-"""The public names as a type checker sees them: `mypy --strict` runs once, on scripts as users write them."""
+"""The public names as a type checker sees them: `mypy --strict` runs once, on scripts as users
+write them.
+"""
 
 from __future__ import annotations
 
@@ -77,9 +79,20 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     for name, text in scripts.items():
         lines = text.splitlines()
         indent = next((len(line) - len(line.lstrip()) for line in lines if line.strip()), 0)
-        (folder / f"{name}.py").write_text("\n".join(line[indent:] for line in lines).strip() + "\n")
+        (folder / f"{name}.py").write_text(
+            "\n".join(line[indent:] for line in lines).strip() + "\n"
+        )
     (folder / "mypy.ini").write_text("[mypy]\nstrict = True\n")
-    command = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini", "--cache-dir", str(folder / "cache"), "."]
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--config-file",
+        "mypy.ini",
+        "--cache-dir",
+        str(folder / "cache"),
+        ".",
+    ]
     ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert ran.returncode == 1, ran.stdout + ran.stderr  # the wrong script has errors
     found: dict[str, list[str]] = {name: [] for name in scripts}
@@ -95,9 +108,13 @@ def test_a_sound_script_passes(report: dict[str, list[str]], name: str) -> None:
     assert report[name] == []
 
 
-def test_a_misspelt_name_or_a_wrong_value_is_an_error_on_its_line(report: dict[str, list[str]]) -> None:
+def test_a_misspelt_name_or_a_wrong_value_is_an_error_on_its_line(
+    report: dict[str, list[str]],
+) -> None:
     for number, word in enumerate(("histroy", "axis", "axes", "worker", "no_such_name"), start=3):
-        messages = [line for line in report["misspelt"] if line.startswith(f"misspelt.py:{number}: error:")]
+        messages = [
+            line for line in report["misspelt"] if line.startswith(f"misspelt.py:{number}: error:")
+        ]
         assert any(word in message for message in messages), report["misspelt"]
 
 
@@ -108,7 +125,9 @@ def test_no_public_name_is_any(report: dict[str, list[str]]) -> None:
         assert text, line
         types[carlasc.__all__[int(number) - 2]] = text
     assert set(types) == set(carlasc.__all__)
-    assert not [name for name, text in types.items() if text.strip('"') in ("Any", "builtins.object")]
+    assert not [
+        name for name, text in types.items() if text.strip('"') in ("Any", "builtins.object")
+    ]
     assert "carlasc.core.grids.GridSpec" in types["regrid"]
     assert "carlasc.groundtruth" in types["regrid"].rpartition("->")[2]
     assert "carlasc.dataset.samples.Dataset" in types["Dataset"]

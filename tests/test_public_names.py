@@ -1,4 +1,6 @@
-"""The public names of the package and of its rooms: each stands once, in a stub that type checkers and `lazy_loader` read."""
+"""The public names of the package and of its rooms: each stands once, in a stub that type checkers
+and `lazy_loader` read.
+"""
 
 import ast
 import importlib
@@ -28,7 +30,9 @@ def homes(package):
         if isinstance(node, ast.ImportFrom)
     ]
     for node in imports:
-        assert node.level == 1 and all(alias.name == alias.asname for alias in node.names), ast.unparse(node)
+        assert node.level == 1 and all(alias.name == alias.asname for alias in node.names), (
+            ast.unparse(node)
+        )
     return [(alias.name, node.module) for node in imports for alias in node.names]
 
 
@@ -59,7 +63,10 @@ def test_every_public_name_resolves_and_hides_no_module(package):
             assert getattr(module, name) is importlib.import_module(f"{package}.{name}")
             continue
         assert getattr(module, name) is getattr(importlib.import_module(f"{package}.{home}"), name)
-        assert not (folder_of(package) / f"{name}.py").exists() and not (folder_of(package) / name).exists()
+        assert (
+            not (folder_of(package) / f"{name}.py").exists()
+            and not (folder_of(package) / name).exists()
+        )
     with pytest.raises(AttributeError, match=rf"{package}\b.* attribute '?no_such_name"):
         module.no_such_name  # noqa: B018
 
@@ -71,7 +78,10 @@ def test_importing_a_package_loads_none_of_its_modules(package):
 
 
 def test_public_names_work_without_docstrings_and_assertions():
-    assert run("import carlasc; print(carlasc.open.__name__, carlasc.core.Grid.__name__)", "-OO") == "open Grid"
+    assert (
+        run("import carlasc; print(carlasc.open.__name__, carlasc.core.Grid.__name__)", "-OO")
+        == "open Grid"
+    )
 
 
 def test_all_public_names_are_what_a_star_imports():

@@ -23,7 +23,9 @@ def blocks(text):
 
 def quick_start(path):
     """Return the one snippet between the markers; skips where there are none yet."""
-    found = re.search(r"<!-- quick start begins -->(.*?)<!-- quick start ends -->", path.read_text(), re.DOTALL)
+    found = re.search(
+        r"<!-- quick start begins -->(.*?)<!-- quick start ends -->", path.read_text(), re.DOTALL
+    )
     if found is None:
         pytest.skip(f"{path.name} has no quick start between its markers")
     (snippet,) = blocks(found[1])
@@ -32,12 +34,21 @@ def quick_start(path):
 
 @pytest.fixture
 def downloads(tmp_path, monkeypatch):
-    """A folder with CarlaSC, eval_fine and eval_cylindrical in it: one short sequence; the current folder."""
+    """A folder with CarlaSC, eval_fine and eval_cylindrical in it: one short sequence; the current
+    folder.
+    """
     sequence = Path("Train") / "Town01_Light"
     write_drive(tmp_path / "CarlaSC" / sequence / "cartesian", range(4))
     fine, cylindrical = GridSpec.published("fine"), GridSpec.published("cylindrical")
-    write_drive(tmp_path / "eval_fine" / sequence / "cartesian", [], grid_frames=range(4), spec=fine)
-    write_drive(tmp_path / "eval_cylindrical" / sequence / "cylindrical", [], grid_frames=range(4), spec=cylindrical)
+    write_drive(
+        tmp_path / "eval_fine" / sequence / "cartesian", [], grid_frames=range(4), spec=fine
+    )
+    write_drive(
+        tmp_path / "eval_cylindrical" / sequence / "cylindrical",
+        [],
+        grid_frames=range(4),
+        spec=cylindrical,
+    )
     monkeypatch.chdir(tmp_path)
 
 
@@ -49,7 +60,10 @@ def test_the_quick_start_makes_one_training_step_in_ten_lines(path, downloads):
     names: dict = {}
     exec(snippet, names)
     network = names["network"]
-    assert all(p.grad is not None and p.grad.isfinite().all() and p.grad.any() for p in network.parameters())
+    assert all(
+        p.grad is not None and p.grad.isfinite().all() and p.grad.any()
+        for p in network.parameters()
+    )
     assert names["batch"]["occupancy"].shape == (2, 5, 128, 128, 8)
     assert names["optimizer"].state[next(network.parameters())]["step"] == 1
 
@@ -64,7 +78,8 @@ def test_the_how_to_runs_from_top_to_bottom(downloads, capsys, tmp_path):
             exec(block.replace("s3://bucket/", f"{served.url}/bucket/"), names)
     assert names["state"]["position"] == 4 and list((tmp_path / "cache").glob("??/*"))
     assert capsys.readouterr().out == (
-        "[(300, 3), (300, 3)] (2, 128, 128, 8)\ncartesian 256 x 256 x 16 cylindrical 128 x 128 x 8\n"
+        "[(300, 3), (300, 3)] (2, 128, 128, 8)\ncartesian 256 x 256 x 16 cylindrical 128 x 128 x "
+        "8\n"
     )
     assert names["weights"].shape == (11,) and names["cylindrical"][0]["occupancy"].any()
 

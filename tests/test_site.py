@@ -1,4 +1,6 @@
-"""The documentation as a site: it builds, pages are short, tables are narrow, and a browser cuts nothing off without a hint."""
+"""The documentation as a site: it builds, pages are short, tables are narrow, and a browser cuts
+nothing off without a hint.
+"""
 
 import os
 import re
@@ -37,7 +39,9 @@ DRAWN = "requestAnimationFrame(() => requestAnimationFrame(arguments[0]))"  # at
 
 
 def words(page: Path) -> int:
-    """Return the number of words of a page outside of code, tables, comments, addresses and directives for the API."""
+    """Return the number of words of a page outside of code, tables, comments, addresses and
+    directives for the API.
+    """
     text = page.read_text()
     for pattern in (
         r"<!--.*?-->",
@@ -47,7 +51,9 @@ def words(page: Path) -> int:
         r"(?<=\])\([^)]*\)",
         r"\{#[\w-]+\}",
     ):
-        text = re.sub(pattern, "", text, flags=re.DOTALL | re.MULTILINE if pattern[0] != ":" else re.MULTILINE)
+        text = re.sub(
+            pattern, "", text, flags=re.DOTALL | re.MULTILINE if pattern[0] != ":" else re.MULTILINE
+        )
     return len(re.findall(r"\S*\w\S*", text))
 
 
@@ -71,7 +77,8 @@ def test_the_documentation_is_short():
 def test_words_are_counted_outside_of_code_and_tables(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
-        "# Two words {#anchor}\n\nA [link](far/away.md), 3 m.\n\n```sh\ncode code\n```\n\n| a | b |\n|---|---|\n<!-- no\nword -->\n::: carlasc.x\n    options: { a: b }\n"
+        "# Two words {#anchor}\n\nA [link](far/away.md), 3 m.\n\n```sh\ncode code\n```\n\n| a | b "
+        "|\n|---|---|\n<!-- no\nword -->\n::: carlasc.x\n    options: { a: b }\n"
     )
     assert (words(page), columns(page)) == (6, [2])
 
@@ -89,7 +96,9 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     arguments = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(folder)]
-    ran = subprocess.run(arguments, check=False, cwd=ROOT, env=environment, capture_output=True, text=True)
+    ran = subprocess.run(
+        arguments, check=False, cwd=ROOT, env=environment, capture_output=True, text=True
+    )
     assert ran.returncode == 0, ran.stderr
     return folder
 
@@ -99,21 +108,28 @@ def test_the_site_builds_without_a_warning(site):
     assert "velodyne/000000.bin" in html and "generated:" not in html
     assert "--free-step-m" in (site / "commands" / "regrid.html").read_text()
     pack = (site / "commands" / "pack.html").read_text()
-    assert "--lossy-mm" in pack and "--incomplete" in pack  # the options of all commands of the page
+    # the options of all commands of the page
+    assert "--lossy-mm" in pack and "--incomplete" in pack
     api = re.sub(r"<[^>]*>", "", (site / "api" / "groundtruth.html").read_text())
-    assert "carlasc.regrid(source" in api and "carlasc.groundtruth.RegridResult" in api  # public names
+    # public names
+    assert "carlasc.regrid(source" in api and "carlasc.groundtruth.RegridResult" in api
     assert not list(site.rglob("*.py"))
-    # Opened from the disk, the menu leads to files and the search has its index; nothing is fetched from another host.
+    # Opened from the disk, the menu leads to files and the search has its index; nothing is fetched
+    # from another host.
     assert (site / "search" / "search_index.js").is_file()
     assert 'href="commands/regrid.html"' in (site / "index.html").read_text()
-    assert not [page for page in site.rglob("*.html") if re.search(r'src="https?:', page.read_text())]
+    assert not [
+        page for page in site.rglob("*.html") if re.search(r'src="https?:', page.read_text())
+    ]
     tutorial = (site / "tutorials" / "1_first_look.html").read_text()
     assert 'src="1_first_look_1.png"' in tutorial
     assert (site / "tutorials" / "1_first_look_1.png").stat().st_size > 10_000
 
 
 def test_the_menu_has_at_most_twelve_entries():
-    (menu,) = re.findall(r"^nav:\n(.*)", (ROOT / "mkdocs.yml").read_text(), re.DOTALL | re.MULTILINE)
+    (menu,) = re.findall(
+        r"^nav:\n(.*)", (ROOT / "mkdocs.yml").read_text(), re.DOTALL | re.MULTILINE
+    )
     assert 5 < len(re.findall(r"^  - ", menu, re.MULTILINE)) <= 12
     assert "navigation.expand" not in (ROOT / "mkdocs.yml").read_text()  # it is folded
 
@@ -127,7 +143,8 @@ def browser(tmp_path_factory):
 
 def resize(browser, width):
     browser.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride", {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        "Emulation.setDeviceMetricsOverride",
+        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False},
     )
 
 
@@ -152,7 +169,9 @@ def test_the_search_finds_pages_from_the_disk_and_over_http(site, browser):
             browser.get(start)
             browser.find_element("css selector", "input.md-search__input").send_keys("slurm")
             found = browser.execute_async_script(
-                "const done = arguments[0], look = () => { const links = document.querySelectorAll('.md-search-result__link');"
-                " links.length ? done([...links].map((link) => link.href)) : setTimeout(look, 50); }; look();"
+                "const done = arguments[0], look = () => { const links = "
+                "document.querySelectorAll('.md-search-result__link');"
+                " links.length ? done([...links].map((link) => link.href)) : setTimeout(look, "
+                "50); }; look();"
             )
             assert any("many-machines.html" in link for link in found), start

@@ -26,14 +26,22 @@ def run(name: str, work: Path, *more: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.needs("embreex")
-@pytest.mark.parametrize(
-    "name", [name for name in STUDIES if name not in ("cameras", "real")]
-)  # these have tests of their own
+# these have tests of their own
+@pytest.mark.parametrize("name", [name for name in STUDIES if name not in ("cameras", "real")])
 def test_a_study_runs_in_miniature(name: str, tmp_path: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in (ROOT / "docs").rglob("*") if "__pycache__" not in path.parts}
+    before = {
+        path: path.stat().st_mtime_ns
+        for path in (ROOT / "docs").rglob("*")
+        if "__pycache__" not in path.parts
+    }
     printed = run(name, tmp_path)
-    assert re.search(r"\d", re.sub(r"\S*/\S*", "", printed)), f"no figures:\n{printed}"  # a path is none
-    after = {path: path.stat().st_mtime_ns for path in (ROOT / "docs").rglob("*") if "__pycache__" not in path.parts}
+    # a path is none
+    assert re.search(r"\d", re.sub(r"\S*/\S*", "", printed)), f"no figures:\n{printed}"
+    after = {
+        path: path.stat().st_mtime_ns
+        for path in (ROOT / "docs").rglob("*")
+        if "__pycache__" not in path.parts
+    }
     assert after == before  # tiny figures never reach the pages
 
 
@@ -58,7 +66,9 @@ def test_the_study_of_a_real_drive_runs_in_miniature(real: Path, tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.needs("kiss_icp")
-def test_refining_repairs_errors_that_are_added_to_the_poses_of_a_real_drive(real: Path, tmp_path: Path) -> None:
+def test_refining_repairs_errors_that_are_added_to_the_poses_of_a_real_drive(
+    real: Path, tmp_path: Path
+) -> None:
     printed = run_on_the_real_drive("poses", real, tmp_path)
     exact, repaired, wrong, refined = (
         float(share) for share in re.findall(r"^\| KISS.*? \| ([\d.]+)%", printed, re.MULTILINE)
@@ -71,7 +81,11 @@ def test_every_study_is_on_a_page_and_every_other_module_belongs_to_a_study() ->
     pages = "\n".join(path.read_text() for path in (ROOT / "docs").rglob("*.md"))
     code = "\n".join(SCRIPTS.values())
     for name in SCRIPTS:
-        used = f"docs/studies/{name}.py" in pages if name in STUDIES else re.search(rf"(import|from) {name}\b", code)
+        used = (
+            f"docs/studies/{name}.py" in pages
+            if name in STUDIES
+            else re.search(rf"(import|from) {name}\b", code)
+        )
         assert used, f"docs/studies/{name}.py: nothing uses it"
 
 

@@ -1,4 +1,6 @@
-"""Raw captures of many sensors: reading them, and recording them in a simulated town or on a CARLA server."""
+"""Raw captures of many sensors: reading them, and recording them in a simulated town or on a CARLA
+server.
+"""
 
 import lazy_loader
 

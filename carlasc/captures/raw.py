@@ -1,6 +1,8 @@
-"""The raw capture: recordings of many sensors, from which ground truth is made (see the format page, `docs/format.md#raw-capture`).
+"""The raw capture: recordings of many sensors, from which ground truth is made (see the format
+page, `docs/format.md#raw-capture`).
 
-Sensor 0 is the ego sensor. The files in the folder raw/, which `carlasc.captures.writing` writes, are:
+Sensor 0 is the ego sensor. The files in the folder raw/, which `carlasc.captures.writing` writes,
+are:
 
 velodyne{s}/{f}.npy  labels{s}/  instances{s}/  velocities{s}/  pose{s}/  times{s}.txt  bev/{f}.jpg
 cameras.json  images/{camera}/{f}.jpg, and the other folders of images
@@ -72,10 +74,13 @@ def image_path(field: str, frame: int) -> str:
 
 
 def parse_times(data: bytes | memoryview, where: str) -> dict[int, tuple[float, str]]:
-    """Return the time in seconds and the line of each frame of a times file. If a frame has several lines, the last one is valid.
+    """Return the time in seconds and the line of each frame of a times file.
+
+    If a frame has several lines, the last one is valid.
 
     Raises:
-        FormatError: a line does not have the format of CARLA. `where` is the file named in the message.
+        FormatError: a line does not have the format of CARLA. `where` is the file named in the
+            message.
     """
     found: dict[int, tuple[float, str]] = {}
     for number, line in enumerate(bytes(data).decode(errors="replace").splitlines(), 1):
@@ -101,10 +106,11 @@ class SensorRecording:
     """The recording of one sensor in one frame.
 
     Attributes:
-        scan: points in the sensor frame, with labels (0 is unlabelled) and instances (0 is no actor).
+        scan: points in the sensor frame, with labels (0 is unlabelled) and instances (0 is no
+            actor).
         world_T_sensor: (4, 4) float64 pose.
-        velocities: (K, 4) float64, one row per actor that was hit: actor id, and velocity over ground in m/s on the axes of the sensor
-            frame.
+        velocities: (K, 4) float64, one row per actor that was hit: actor id, and velocity over
+            ground in m/s on the axes of the sensor frame.
     """
 
     scan: Scan
@@ -112,7 +118,9 @@ class SensorRecording:
     velocities: NDArray[np.float64]
 
     def flow(self) -> NDArray[np.float32]:
-        """Return (N, 3) float32 velocities of the actors hit by the points, m/s, sensor frame; zero for points without an actor."""
+        """Return (N, 3) float32 velocities of the actors hit by the points, m/s, sensor frame; zero
+        for points without an actor.
+        """
         flow = np.zeros((len(self.scan), 3), np.float32)
         if self.scan.instances is None or not len(self.velocities):
             return flow
@@ -137,7 +145,8 @@ class Capture:
         """Keep the folder of a capture. Sensors and frames are listed on first use.
 
         Args:
-            source: the folder of a sequence with raw/, or raw/ itself: a path, a URL, or a tree of files.
+            source: the folder of a sequence with raw/, or raw/ itself: a path, a URL, or a tree of
+                files.
             classes: class table of the labels.
 
         Raises:
@@ -174,7 +183,8 @@ class Capture:
     def frames(self) -> NDArray[np.int64]:
         """The sorted frame numbers of sensor 0.
 
-        A frame is listed if any of its files exists. Reading it raises an error if another file, or a file of another sensor, is missing.
+        A frame is listed if any of its files exists. Reading it raises an error if another file, or
+        a file of another sensor, is missing.
 
         Raises:
             MissingDataError: the capture has no frames.
@@ -183,13 +193,21 @@ class Capture:
         found: set[int] = set()
         for kind in FOLDERS.values():
             names = self._entries(f"{kind}{ego}")
-            found |= {int(name.removesuffix(".npy")) for name in names if re.fullmatch(r"[0-9]{1,18}\.npy", name)}
+            found |= {
+                int(name.removesuffix(".npy"))
+                for name in names
+                if re.fullmatch(r"[0-9]{1,18}\.npy", name)
+            }
         if not found:
-            raise MissingDataError(self.location, expected="frames such as velodyne0/100.npy", found="none")
+            raise MissingDataError(
+                self.location, expected="frames such as velodyne0/100.npy", found="none"
+            )
         return np.array(sorted(found), np.int64)
 
     def read(self, sensor: int, frame: int) -> SensorRecording:
-        """Read the recording of a sensor in a frame. Its files are requested together. The arrays may be read-only.
+        """Read the recording of a sensor in a frame.
+
+        Its files are requested together. The arrays may be read-only.
 
         Raises:
             MissingDataError: a file does not exist.
@@ -206,28 +224,36 @@ class Capture:
             if len(arrays[name]) != len(arrays["points"]):
                 raise FormatError(
                     where[name],
-                    expected=f"{len(arrays['points'])} values, one per point of {array_path('points', sensor, frame)}",
+                    expected=f"{len(arrays['points'])} values, one per point of "
+                    f"{array_path('points', sensor, frame)}",
                     found=str(len(arrays[name])),
                 )
         scan = Scan(arrays["points"], labels=arrays["labels"], instances=arrays["instances"])
-        return SensorRecording(scan, check_rigid(arrays["pose"], where["pose"]), arrays["velocities"])
+        return SensorRecording(
+            scan, check_rigid(arrays["pose"], where["pose"]), arrays["velocities"]
+        )
 
     def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
-        """Return the (3,) velocity over ground, m/s, world frame, of each actor that a sensor hit in a frame, by actor id.
+        """Return the (3,) velocity over ground, m/s, world frame, of each actor that a sensor hit
+        in a frame, by actor id.
 
         Raises:
             MissingDataError: a file does not exist.
             FormatError: a file does not have the format.
         """
         paths = [
-            self._folder + array_path(kind, sensor, frame) for kind in ("velocities", "pose") for sensor in self.sensors
+            self._folder + array_path(kind, sensor, frame)
+            for kind in ("velocities", "pose")
+            for sensor in self.sensors
         ]
         files, found = self.tree.read_many(paths), dict[int, NDArray[np.float64]]()
         half = len(self.sensors)
         for row, (path, data) in enumerate(zip(paths[:half], files[:half], strict=True)):
             rows = parse_npy(data, FORMATS["velocities"], where := self.tree.where(path))
             check_finite(rows, where)
-            velocities = rotate_vectors(self._pose_of(paths[half + row], files[half + row]), rows[:, 1:])
+            velocities = rotate_vectors(
+                self._pose_of(paths[half + row], files[half + row]), rows[:, 1:]
+            )
             found |= dict(zip(rows[:, 0].astype(np.int64).tolist(), velocities, strict=True))
         return found
 
@@ -242,7 +268,9 @@ class Capture:
         return self._pose_of(path, self.tree.read(path))
 
     def read_poses(self, sensor: int, frames: Iterable[int]) -> NDArray[np.float64]:
-        """Return (F, 4, 4) float64 world_T_sensor of several frames, requested together; NaN for poses that cannot be read."""
+        """Return (F, 4, 4) float64 world_T_sensor of several frames, requested together; NaN for
+        poses that cannot be read.
+        """
         paths = [self._folder + array_path("pose", sensor, frame) for frame in frames]
         found = np.full((len(paths), 4, 4), np.nan)
         try:
@@ -259,7 +287,9 @@ class Capture:
         return check_rigid(parse_npy(data, FORMATS["pose"], where), where)
 
     def read_time(self, frame: int, sensor: int = 0) -> float:
-        """Return the simulation time of a frame, seconds. If a frame has several lines, the last one is valid.
+        """Return the simulation time of a frame, seconds.
+
+        If a frame has several lines, the last one is valid.
 
         Raises:
             MissingDataError: the times file does not exist, or has no line for the frame.
@@ -268,7 +298,9 @@ class Capture:
         times = self.read_times(sensor)
         if frame not in times:
             where = self.tree.where(self._folder + times_path(sensor))
-            raise MissingDataError(where, expected=f"a line for frame {frame}", found="no such line")
+            raise MissingDataError(
+                where, expected=f"a line for frame {frame}", found="no such line"
+            )
         return times[frame]
 
     def read_times(self, sensor: int = 0) -> Mapping[int, float]:
@@ -295,7 +327,8 @@ class Capture:
 
     @cached_property
     def cameras(self) -> dict[str, CameraModel]:
-        """The cameras of cameras.json by name, in the frame of the ego sensor; empty if the file does not exist.
+        """The cameras of cameras.json by name, in the frame of the ego sensor; empty if the file
+        does not exist.
 
         Raises:
             FormatError: the file is damaged.
@@ -313,13 +346,17 @@ class Capture:
             for folder in layout.IMAGE_FOLDERS
             for suffix in layout.IMAGE_SUFFIXES
         ]
-        return tuple(name for name in names if self.tree.is_file(self._folder + image_path(name, frame)))
+        return tuple(
+            name for name in names if self.tree.is_file(self._folder + image_path(name, frame))
+        )
 
     def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
         """Return the image files of a frame as bytes, by their layout names."""
         names = self.image_fields(frame)
         files = self.tree.read_many([self._folder + image_path(name, frame) for name in names])
-        return {name: np.frombuffer(data, np.uint8) for name, data in zip(names, files, strict=True)}
+        return {
+            name: np.frombuffer(data, np.uint8) for name, data in zip(names, files, strict=True)
+        }
 
     def light(self) -> Capture:
         """Return a copy without cached listings, to be sent to other processes with every frame."""
@@ -336,10 +373,12 @@ def find_captures(source: str | os.PathLike[str]) -> dict[str, Capture]:
     """Find the captures in a folder.
 
     Args:
-        source: a path or a URL: the folder of a sequence with raw/ in it, raw/ itself, or a folder up to three levels above such sequences.
+        source: a path or a URL: the folder of a sequence with raw/ in it, raw/ itself, or a folder
+            up to three levels above such sequences.
 
     Returns:
-        Captures by the path of their sequence relative to `source`, in sorted order. The path is "" if `source` is the sequence.
+        Captures by the path of their sequence relative to `source`, in sorted order. The path is ""
+        if `source` is the sequence.
 
     Raises:
         MissingDataError: the folder does not exist, or contains no capture.
@@ -347,7 +386,11 @@ def find_captures(source: str | os.PathLike[str]) -> dict[str, Capture]:
     tree = tree_of(source, mapped=False)
     _check_folder(tree)
     entries = tree.entries()
-    if entries.get(RAW) or entries.get("velodyne0") or tree.location.rstrip("/").rpartition("/")[2] == RAW:
+    if (
+        entries.get(RAW)
+        or entries.get("velodyne0")
+        or tree.location.rstrip("/").rpartition("/")[2] == RAW
+    ):
         return {"": Capture(tree)}
     paths = sorted(_find(tree, "", _SEARCH_DEPTH))
     if not paths:
@@ -371,12 +414,17 @@ def _find(tree: Tree, path: str, depth: int) -> Iterator[str]:
 
 
 def _check_folder(tree: Tree) -> None:
-    """Raise MissingDataError if the folder of a tree does not exist. A folder in an object store exists if it contains a file."""
+    """Raise MissingDataError if the folder of a tree does not exist.
+
+    A folder in an object store exists if it contains a file.
+    """
     if isinstance(tree, LocalTree):
         if not tree.root.is_dir():
             found = "a file" if tree.root.exists() else "nothing"
             raise MissingDataError(tree.location, expected="a folder", found=found)
-    elif isinstance(tree, RemoteTree) and tree.size() is not None:  # to list it, a web server would send the whole file
+    elif (
+        isinstance(tree, RemoteTree) and tree.size() is not None
+    ):  # to list it, a web server would send the whole file
         raise MissingDataError(tree.location, expected="a folder", found="a file")
     elif not tree.entries():
         raise MissingDataError(tree.location, expected="a folder", found="nothing")

@@ -1,4 +1,6 @@
-"""Settings of both the simulated town and a CARLA server: model and positions of LiDARs, traffic, bird's-eye pictures."""
+"""Settings of both the simulated town and a CARLA server: model and positions of LiDARs, traffic,
+bird's-eye pictures.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ HEIGHTS_M = (1.0, 5.0)
 
 @dataclass(frozen=True)
 class Lidar:
-    """The model of a spinning LiDAR. The defaults are those of the data set (see the format page, `docs/format.md#raw-capture`).
+    """The model of a spinning LiDAR.
+
+    The defaults are those of the data set (see the format page, `docs/format.md#raw-capture`).
 
     Attributes:
         channels: number of channels, one above the other.
@@ -75,10 +79,14 @@ class Lidar:
             raise ArgumentError("channels", expected="at least 1", found=str(self.channels))
         if self.points < self.channels:
             raise ArgumentError(
-                "points", expected=f"at least one per channel ({self.channels})", found=str(self.points)
+                "points",
+                expected=f"at least one per channel ({self.channels})",
+                found=str(self.points),
             )
         if not 0 < self.range_m < 1000:
-            raise ArgumentError("range_m", expected="more than 0 and less than 1000 m", found=str(self.range_m))
+            raise ArgumentError(
+                "range_m", expected="more than 0 and less than 1000 m", found=str(self.range_m)
+            )
         if not -90 <= self.lower_deg <= self.upper_deg <= 90:
             raise ArgumentError(
                 "upper_deg",
@@ -92,12 +100,17 @@ class Lidar:
     def directions(self) -> NDArray[np.float64]:
         """(R, 3) unit vectors of the rays in the sensor frame.
 
-        Channels are ordered from the highest to the lowest. The azimuth of the rays of a channel increases from -pi: x towards y.
+        Channels are ordered from the highest to the lowest. The azimuth of the rays of a channel
+        increases from -pi: x towards y.
         """
         elevation = np.radians(np.linspace(self.upper_deg, self.lower_deg, self.channels))[:, None]
         columns = self.points // self.channels
         azimuth = np.linspace(-np.pi, np.pi, columns, endpoint=False)[None, :]
-        rays = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth
+        rays = (
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation) + 0 * azimuth,
+        )
         return np.stack(rays, axis=-1).reshape(-1, 3)
 
 
@@ -109,8 +122,11 @@ def sensor_offsets(sensors: int, rng: np.random.Generator) -> NDArray[np.float64
         rng: source of the random numbers.
 
     Returns:
-        (sensors, 3) float64 offsets in the vehicle frame, metres. The first is the constant offset of the ego sensor; the others are
-        uniformly distributed in a box.
+        (sensors, 3) float64 offsets in the vehicle frame, metres. The first is the constant offset
+        of the ego sensor; the others are uniformly distributed in a box.
     """
-    low, high = (-MAX_OFFSET_M, -MAX_OFFSET_M, HEIGHTS_M[0]), (MAX_OFFSET_M, MAX_OFFSET_M, HEIGHTS_M[1])
+    low, high = (
+        (-MAX_OFFSET_M, -MAX_OFFSET_M, HEIGHTS_M[0]),
+        (MAX_OFFSET_M, MAX_OFFSET_M, HEIGHTS_M[1]),
+    )
     return np.vstack([EGO_SENSOR_M, rng.uniform(low, high, (sensors - 1, 3))])

@@ -30,7 +30,9 @@ from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 
 
 class CaptureWriter:
-    """Writes a capture to a folder or an object store. Every file is written whole. A writer can be pickled.
+    """Writes a capture to a folder or an object store.
+
+    Every file is written whole. A writer can be pickled.
 
     Attributes:
         out: name of the folder of the sequence.
@@ -62,9 +64,8 @@ class CaptureWriter:
         """
         where = self.target.tree.where(file)
         if not self.target.tree.is_file(file):
-            if any(
-                not name.startswith(".") for name in self.target.tree.entries()
-            ):  # files with this prefix were left by a killed run
+            # files with this prefix were left by a killed run
+            if any(not name.startswith(".") for name in self.target.tree.entries()):
                 raise ConflictError(
                     self.location,
                     expected=f"an empty folder, or a capture of `{command}`",
@@ -73,10 +74,15 @@ class CaptureWriter:
                 )
             return
         earlier = parse_json(bytes(self.target.tree.read(file)), where)
-        differing = [key for key in sorted(settings.keys() | earlier.keys()) if settings.get(key) != earlier.get(key)]
+        differing = [
+            key
+            for key in sorted(settings.keys() | earlier.keys())
+            if settings.get(key) != earlier.get(key)
+        ]
         if differing:
             expected, found = (
-                ", ".join(f"{key} {side.get(key)!r}" for key in differing) for side in (settings, earlier)
+                ", ".join(f"{key} {side.get(key)!r}" for key in differing)
+                for side in (settings, earlier)
             )
             raise ConflictError(
                 where,
@@ -92,7 +98,10 @@ class CaptureWriter:
         self.target.put(file, to_json(dict(settings)))
 
     def has(self, sensor: int, frame: int) -> bool:
-        """Whether all files of a sensor and a frame exist. An existing file is complete, unless a power failure left it empty."""
+        """Whether all files of a sensor and a frame exist.
+
+        An existing file is complete, unless a power failure left it empty.
+        """
         return all(self._has(array_path(name, sensor, frame)) for name in FOLDERS)
 
     def has_frame(self, frame: int, sensors: int, bev: bool, images: Sequence[str] = ()) -> bool:
@@ -119,7 +128,9 @@ class CaptureWriter:
         Raises:
             FormatError: a line of a times file does not have the format of CARLA.
         """
-        return frozenset.intersection(*(frozenset(self._times_of(sensor)) for sensor in range(sensors)))
+        return frozenset.intersection(
+            *(frozenset(self._times_of(sensor)) for sensor in range(sensors))
+        )
 
     def write(self, sensor: int, frame: int, recording: SensorRecording) -> None:
         """Write the recording of a sensor in a frame. Existing files are replaced.
@@ -135,24 +146,34 @@ class CaptureWriter:
         """
         scan, where = recording.scan, f"{self.location}: sensor {sensor}, frame {frame}"
         if scan.labels is None or scan.instances is None:
-            raise FormatError(where, expected="a scan with labels and instances", found="a scan without one of them")
+            raise FormatError(
+                where,
+                expected="a scan with labels and instances",
+                found="a scan without one of them",
+            )
         arrays: dict[str, NDArray[Any]] = {
             "points": scan.points,
             "labels": scan.labels,
             "instances": scan.instances,
             # In the published files, an empty list of actors has no columns.
-            "velocities": recording.velocities if len(recording.velocities) else np.empty(0, np.float64),
+            "velocities": recording.velocities
+            if len(recording.velocities)
+            else np.empty(0, np.float64),
             "pose": check_rigid(recording.world_T_sensor, where),
         }
         files: dict[str, bytes | memoryview] = {}
         for name, array in arrays.items():
             buffer = io.BytesIO()
-            np.save(buffer, np.ascontiguousarray(array, FORMATS[name].dtypes[0]), allow_pickle=False)
+            np.save(
+                buffer, np.ascontiguousarray(array, FORMATS[name].dtypes[0]), allow_pickle=False
+            )
             files[array_path(name, sensor, frame)] = buffer.getbuffer()
         self.target.put_many(files)
 
     def write_times(self, times_s: Mapping[int, Sequence[float]]) -> None:
-        """Write the simulation times of frames. The times file of each sensor is written whole, in the order of frames.
+        """Write the simulation times of frames.
+
+        The times file of each sensor is written whole, in the order of frames.
 
         Existing lines of other frames are kept. To write times frame by frame, see `TimesLog`.
 
@@ -169,18 +190,26 @@ class CaptureWriter:
             for frame, times in times_s.items():
                 elapsed_s = float(times[sensor])
                 lines[frame] = (
-                    f"{frame}, Timestamp(frame={frame},elapsed_seconds={elapsed_s},delta_seconds={FRAME_PERIOD_S},"
+                    f"{frame}, "
+                    f"Timestamp(frame={frame},elapsed_seconds={elapsed_s},delta_seconds={FRAME_PERIOD_S},"
                     f"platform_timestamp={elapsed_s})"
                 )
-            files[times_path(sensor)] = "".join(f"{lines[frame]}\n" for frame in sorted(lines)).encode()
+            files[times_path(sensor)] = "".join(
+                f"{lines[frame]}\n" for frame in sorted(lines)
+            ).encode()
         self.target.put_many(files)
 
     def _times_of(self, sensor: int) -> dict[int, str]:
-        """Return the lines of the times file of a sensor by frame; empty if the file does not exist."""
+        """Return the lines of the times file of a sensor by frame; empty if the file does not
+        exist.
+        """
         path = times_path(sensor)
         if (data := self.target.read(path)) is None:
             return {}
-        return {frame: line for frame, (_, line) in parse_times(data, self.target.tree.where(path)).items()}
+        return {
+            frame: line
+            for frame, (_, line) in parse_times(data, self.target.tree.where(path)).items()
+        }
 
     def write_bev(self, frame: int, jpeg: bytes) -> None:
         """Write the bird's-eye picture of a frame, given as JPEG bytes."""
@@ -188,20 +217,27 @@ class CaptureWriter:
 
     def write_images(self, frame: int, images: Mapping[str, NDArray[np.uint8]]) -> None:
         """Write the images of a frame, given as the bytes of their files by field."""
-        self.target.put_many({image_path(field, frame): data.data for field, data in images.items()})
+        self.target.put_many(
+            {image_path(field, frame): data.data for field, data in images.items()}
+        )
 
     def __repr__(self) -> str:
         return f"<CaptureWriter {self.location}>"
 
 
 class TimesLog:
-    """Collects the times of frames, and writes the times files regularly and at the end, also after an error or Ctrl-C.
+    """Collects the times of frames, and writes the times files regularly and at the end, also after
+    an error or Ctrl-C.
 
-    Times are not appended line by line, because object stores cannot append, and because the order of lines would differ between runs.
+    Times are not appended line by line, because object stores cannot append, and because the order
+    of lines would differ between runs.
     """
 
     def __init__(self, writer: CaptureWriter, every: int = 50) -> None:
-        """Write the times files of a capture after `every` frames. Only one process may do this at a time."""
+        """Write the times files of a capture after `every` frames.
+
+        Only one process may do this at a time.
+        """
         self.writer, self.every = writer, every
         self._waiting: dict[int, Sequence[float]] = {}
 
@@ -221,6 +257,9 @@ class TimesLog:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.flush()

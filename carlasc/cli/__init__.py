@@ -1,4 +1,6 @@
-"""The command line: one file per command, which parses, calls one function of the library, and prints its result."""
+"""The command line: one file per command, which parses, calls one function of the library, and
+prints its result.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,10 @@ _SETTINGS: dict[str, Any] = {
 
 
 class _Commands(MutableMapping[str, Any]):
-    """The commands by name. The file of a command is imported on first use, so that `carlasc COMMAND` imports only one."""
+    """The commands by name.
+
+    The file of a command is imported on first use, so that `carlasc COMMAND` imports only one.
+    """
 
     def __init__(self) -> None:
         self._loaded: dict[str, Any] = {
@@ -99,9 +104,13 @@ def _module(name: str) -> ModuleType:
 
 
 class _DeclaringCommand(Command):
-    """A command with its own options and those of the converter or exporter that its arguments name."""
+    """A command with its own options and those of the converter or exporter that its arguments
+    name.
+    """
 
-    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
+    ) -> Any:
         """Read the arguments, including the options of the converter or exporter."""
         name = self.name or ""
         declared = _module(name).declared_options(args)
@@ -128,7 +137,8 @@ app = typer.Typer(
     name="carlasc",
     cls=_Group,
     **_SETTINGS,
-    help="A toolkit for semantic scene completion: read CarlaSC, convert other data sets to its layout, make ground truth at any voxel size,"
+    help="A toolkit for semantic scene completion: read CarlaSC, convert other data sets to its "
+    "layout, make ground truth at any voxel size,"
     " and score predictions.",
 )
 
@@ -144,14 +154,18 @@ def _print_version(requested: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
     ] = False,
     durable: Annotated[
         bool | None,
         typer.Option(
             "--durable/--no-durable",
             show_default=False,
-            help="Sync each file to the disk before it is renamed to its final name, so that a power failure leaves no empty file. Default: on,"
+            help="Sync each file to the disk before it is renamed to its final name, so that a "
+            "power failure leaves no empty file. Default: on,"
             " unless the environment variable CARLASC_DURABLE is no.",
         ),
     ] = None,

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import carlasc
-from carlasc.cli.common import FAILED, FramesOption, Json, console, echo, file_option, line, place_argument, print_json
+from carlasc.cli.common import (
+    FAILED,
+    FramesOption,
+    Json,
+    console,
+    echo,
+    file_option,
+    line,
+    place_argument,
+    print_json,
+)
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import parse_window
 from carlasc.errors import count
@@ -24,42 +34,57 @@ def audit(
     grids: Annotated[
         str,
         place_argument(
-            "Grids: a data set, a sequence, the folder of a grid, or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc.",
+            "Grids: a data set, a sequence, the folder of a grid, or files of SemanticKITTI, "
+            "SSCBench, Occ3D, OpenOccupancy or CarlaOcc.",
             "GRIDS",
         ),
     ],
-    scans: Annotated[str, place_argument("The recording that the grids belong to, in CarlaSC's layout.", "SCANS")],
-    grid: Annotated[str | None, typer.Option(help="Name of the grids. Default: evaluation, or the only grid.")] = None,
+    scans: Annotated[
+        str, place_argument("The recording that the grids belong to, in CarlaSC's layout.", "SCANS")
+    ],
+    grid: Annotated[
+        str | None, typer.Option(help="Name of the grids. Default: evaluation, or the only grid.")
+    ] = None,
     made_from: Annotated[
         str | None,
         typer.Option(
             metavar="A:B",
-            help="First and last scan that each grid was made from, in frames relative to its frame. Default: not known.",
+            help="First and last scan that each grid was made from, in frames relative to its "
+            "frame. Default: not known.",
         ),
     ] = None,
     frames: FramesOption = None,
     keep: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for intermediate counts: an interrupted audit continues there, and --part needs it to join the parts."
+            help="Folder for intermediate counts: an interrupted audit continues there, and "
+            "--part needs it to join the parts."
         ),
     ] = None,
     html: Annotated[
         Path | None,
-        file_option("--html", metavar="FILE", text="Also write the audit as one page, with the worst frames."),
+        file_option(
+            "--html",
+            metavar="FILE",
+            text="Also write the audit as one page, with the worst frames.",
+        ),
     ] = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Print all checks, also those that found no fault.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Compare grids of any origin with the scans that they belong to, and print what is wrong with the grids.
+    """Compare grids of any origin with the scans that they belong to, and print what is wrong with
+    the grids.
 
-    The exit code is 0 if no fault was found, and 1 if there is a fault or a frame that cannot be read.
+    The exit code is 0 if no fault was found, and 1 if there is a fault or a frame that cannot be
+    read.
     """
     window = None if made_from is None else parse_window(made_from, "made_from")
     with work.spread("Auditing", usual=1) as run:
-        result = carlasc.audit(grids, scans, grid=grid, made_from=window, frames=frames, keep=keep, run=run)
+        result = carlasc.audit(
+            grids, scans, grid=grid, made_from=window, frames=frames, keep=keep, run=run
+        )
     if html is not None and result.verdicts:
         carlasc.inspection.write_audit_page(result, html)
     if as_json:
@@ -86,5 +111,9 @@ def _print(result: AuditResult, *, everything: bool) -> None:
             if everything or verdict.state != "sound":
                 text = f"  {verdict.state:<12} {verdict.sentence}"
                 out.print(line(text, _COLORS[verdict.state]), soft_wrap=True)
-    state = "sound, as far as the drives tell" if result.ok else f"not sound ({count(len(result.faults), 'fault')})"
+    state = (
+        "sound, as far as the drives tell"
+        if result.ok
+        else f"not sound ({count(len(result.faults), 'fault')})"
+    )
     out.print(line(f"{result.grids}: {state}", "bold"), soft_wrap=True)

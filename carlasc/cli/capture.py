@@ -15,14 +15,16 @@ from carlasc.core.choices import TrafficLevel
 from carlasc.errors import count as counted
 
 OutArgument = Annotated[
-    str, place_argument("Folder of the sequence, or its URL: the capture is written to OUT/raw.", "OUT")
+    str,
+    place_argument("Folder of the sequence, or its URL: the capture is written to OUT/raw.", "OUT"),
 ]
 
 
 CamerasOption = Annotated[
     str,
     typer.Option(
-        help="Cameras of the vehicle, separated by commas: front, front_left, front_right, left, right, back_left, back_right, back."
+        help="Cameras of the vehicle, separated by commas: front, front_left, front_right, left, "
+        "right, back_left, back_right, back."
         " Default: none.",
         metavar="NAMES",
     ),
@@ -40,21 +42,40 @@ class SensorFlags(Flags):
 
     heading: ClassVar[str] = "Traffic and sensors"
 
-    sensors: Annotated[int, typer.Option(help="Number of LiDARs. The first is the ego sensor.", min=1)] = 20
-    seed: Annotated[int, typer.Option(help="Seed of all random choices: traffic, sensor positions, noise.", min=0)] = 0
+    sensors: Annotated[
+        int, typer.Option(help="Number of LiDARs. The first is the ego sensor.", min=1)
+    ] = 20
+    seed: Annotated[
+        int,
+        typer.Option(help="Seed of all random choices: traffic, sensor positions, noise.", min=0),
+    ] = 0
     traffic: Annotated[
         TrafficLevel,
-        typer.Option(help="Amount of traffic: 25, 50 or 100 moving vehicles, and as many pedestrians."),
+        typer.Option(
+            help="Amount of traffic: 25, 50 or 100 moving vehicles, and as many pedestrians."
+        ),
     ] = "medium"
     channels: Annotated[int, typer.Option(help="Number of channels of each LiDAR.", min=1)] = 64
-    points: Annotated[int, typer.Option(help="Number of rays per scan, over all channels.", min=1)] = 130_000
-    range_m: Annotated[float, typer.Option("--range", help="Range of each LiDAR, in metres.")] = 50.0
-    bev: Annotated[bool, typer.Option("--bev/--no-bev", help="Write bird's-eye-view pictures.")] = True
+    points: Annotated[
+        int, typer.Option(help="Number of rays per scan, over all channels.", min=1)
+    ] = 130_000
+    range_m: Annotated[float, typer.Option("--range", help="Range of each LiDAR, in metres.")] = (
+        50.0
+    )
+    bev: Annotated[bool, typer.Option("--bev/--no-bev", help="Write bird's-eye-view pictures.")] = (
+        True
+    )
 
     def arguments(self) -> dict[str, Any]:
         """Return them as arguments of `carlasc.simulate` and `carlasc.record`."""
         lidar = carlasc.captures.Lidar(self.channels, self.points, self.range_m)
-        return {"sensors": self.sensors, "seed": self.seed, "traffic": self.traffic, "lidar": lidar, "bev": self.bev}
+        return {
+            "sensors": self.sensors,
+            "seed": self.seed,
+            "traffic": self.traffic,
+            "lidar": lidar,
+            "bev": self.bev,
+        }
 
 
 @dataclass(frozen=True)
@@ -65,9 +86,14 @@ class ServerFlags(Flags):
 
     host: Annotated[str, typer.Option(help="Host of the CARLA server.")] = "127.0.0.1"
     port: Annotated[int, typer.Option(help="RPC port of the server.", min=1, max=65535)] = 2000
-    traffic_port: Annotated[int, typer.Option(help="Port of the traffic manager.", min=1, max=65535)] = 8000
+    traffic_port: Annotated[
+        int, typer.Option(help="Port of the traffic manager.", min=1, max=65535)
+    ] = 8000
     timeout_s: Annotated[
-        float, typer.Option("--timeout", help="Longest time to wait for an answer of the server, in seconds.", min=1)
+        float,
+        typer.Option(
+            "--timeout", help="Longest time to wait for an answer of the server, in seconds.", min=1
+        ),
     ] = 60.0
     town: Annotated[str, typer.Option(help="CARLA map to drive in.")] = "Town01"
 
@@ -82,12 +108,16 @@ def capture(
 ) -> None:
     """Record a drive on a running CARLA server as a raw capture: the scans of all sensors.
 
-    A second run with the same options replays the drive and writes only the missing frames. At the end, also after an error or Ctrl-C,
-    the actors are destroyed and the settings of the server are restored.
+    A second run with the same options replays the drive and writes only the missing frames. At the
+    end, also after an error or Ctrl-C, the actors are destroyed and the settings of the server are
+    restored.
     """
-    signal.signal(signal.SIGTERM, _interrupt)  # clean up the server also when a batch system ends the command
+    # clean up the server also when a batch system ends the command
+    signal.signal(signal.SIGTERM, _interrupt)
     with progress_bar("capture") as progress:
-        place = carlasc.captures.ServerOptions(server.host, server.port, server.traffic_port, server.timeout_s)
+        place = carlasc.captures.ServerOptions(
+            server.host, server.port, server.traffic_port, server.timeout_s
+        )
         result = carlasc.record(
             out,
             server=place,
@@ -101,9 +131,11 @@ def capture(
         print_json(result)
         return
     echo(
-        f"{result.out}: {counted(result.written, 'frame')} of {counted(result.sensors, 'LiDAR')} written,"
+        f"{result.out}: {counted(result.written, 'frame')} of {counted(result.sensors, 'LiDAR')} "
+        f"written,"
         f" {result.count - result.written} existed already"
-        f" (CARLA {result.server_version}, {counted(result.vehicles, 'vehicle')}, {counted(result.walkers, 'pedestrian')})"
+        f" (CARLA {result.server_version}, {counted(result.vehicles, 'vehicle')}, "
+        f"{counted(result.walkers, 'pedestrian')})"
     )
     echo(f"next: carlasc regrid {result.out} --res 0.2")
 

@@ -20,68 +20,100 @@ class DetailFlags(Flags):
 
     heading: ClassVar[str] = "Details of the publication"
 
-    name: Annotated[str | None, typer.Option(help="Name of the data set. Default: the name of SOURCE.")] = None
+    name: Annotated[
+        str | None, typer.Option(help="Name of the data set. Default: the name of SOURCE.")
+    ] = None
     description: Annotated[
-        str | None, typer.Option(help="Description in a sentence or two. Default: one made from the data.")
+        str | None,
+        typer.Option(help="Description in a sentence or two. Default: one made from the data."),
     ] = None
     authors: Annotated[
-        list[str] | None, typer.Option("--author", help="Author or group that publishes it. Repeat it for several.")
+        list[str] | None,
+        typer.Option("--author", help="Author or group that publishes it. Repeat it for several."),
     ] = None
     license: Annotated[
         str | None,
         typer.Option(
-            help="Licence of the sequences whose carlasc.json names none: a name such as cc-by-4.0, or the URL of its text."
+            help="Licence of the sequences whose carlasc.json names none: a name such as "
+            "cc-by-4.0, or the URL of its text."
         ),
     ] = None
     citation: Annotated[
-        Path | None, file_option("--citation", metavar="FILE", text="A BibTeX file that says how to cite the data.")
+        Path | None,
+        file_option(
+            "--citation", metavar="FILE", text="A BibTeX file that says how to cite the data."
+        ),
     ] = None
     url: Annotated[
         str | None,
-        typer.Option(help="URL where the data are published, such as https://huggingface.co/datasets/ORG/NAME."),
+        typer.Option(
+            help="URL where the data are published, such as "
+            "https://huggingface.co/datasets/ORG/NAME."
+        ),
     ] = None
-    contact: Annotated[str | None, typer.Option(help="Contact for questions, such as an e-mail address.")] = None
+    contact: Annotated[
+        str | None, typer.Option(help="Contact for questions, such as an e-mail address.")
+    ] = None
     version: Annotated[str, typer.Option("--data-version", help="Version of the data.")] = "1.0.0"
     published: Annotated[
-        str | None, typer.Option(metavar="YYYY-MM-DD", help="Date of the publication. Default: today.")
+        str | None,
+        typer.Option(metavar="YYYY-MM-DD", help="Date of the publication. Default: today."),
     ] = None
 
     def details(self) -> carlasc.CardDetails:
         """Return the details of the card."""
         if self.citation is not None and not self.citation.is_file():
-            raise MissingDataError(self.citation, expected="a BibTeX file", found="nothing", advice="check the path")
+            raise MissingDataError(
+                self.citation, expected="a BibTeX file", found="nothing", advice="check the path"
+            )
         citation = None if self.citation is None else self.citation.read_text(errors="replace")
-        return carlasc.CardDetails(**{**vars(self), "authors": self.authors or (), "citation": citation})
+        return carlasc.CardDetails(
+            **{**vars(self), "authors": self.authors or (), "citation": citation}
+        )
 
 
 def card(
     details: DetailFlags,
     work: OneWorkerFlags,
-    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
+    source: Annotated[
+        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
+    ] = ".",
     out: Annotated[
         Path | None,
         file_option(
             "-o",
             "--out",
             metavar="FOLDER",
-            text="Folder of the card: the root folder of the publication. Default: SOURCE, if it is a folder or a Parquet store; otherwise the"
+            text="Folder of the card: the root folder of the publication. Default: SOURCE, if it "
+            "is a folder or a Parquet store; otherwise the"
             " folder that contains SOURCE.",
         ),
     ] = None,
     pictures: Annotated[
-        bool, typer.Option("--pictures/--no-pictures", help="Draw a grid and a scan (needs the extra `render`).")
+        bool,
+        typer.Option(
+            "--pictures/--no-pictures", help="Draw a grid and a scan (needs the extra `render`)."
+        ),
     ] = True,
-    every: Annotated[int, typer.Option(metavar="N", help="Count the classes of every N-th frame.")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing card.")] = False,
+    every: Annotated[
+        int, typer.Option(metavar="N", help="Count the classes of every N-th frame.")
+    ] = 1,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing card.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the card of a data set: README.md for the Hugging Face Hub, and croissant.json with the fields for responsible AI.
+    """Write the card of a data set: README.md for the Hugging Face Hub, and croissant.json with the
+    fields for responsible AI.
 
-    Converted data keep the licence of their source. The command fails if that licence forbids publishing what is made from the data.
+    Converted data keep the licence of their source. The command fails if that licence forbids
+    publishing what is made from the data.
     """
     about = details.details()
     with work.spread("Counting", usual=1) as run:
-        result = carlasc.card(source, out, about=about, pictures=pictures, every=every, overwrite=overwrite, run=run)
+        result = carlasc.card(
+            source, out, about=about, pictures=pictures, every=every, overwrite=overwrite, run=run
+        )
     if as_json:
         print_json(result.to_dict())
     else:

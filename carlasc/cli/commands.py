@@ -1,4 +1,6 @@
-"""Base classes of the commands: plain help under headings, and errors as one line with an exit code."""
+"""Base classes of the commands: plain help under headings, and errors as one line with an exit
+code.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,11 @@ from carlasc.cli.common import FAILED, INTERRUPTED, WRONG_USAGE, BatchError, ech
 from carlasc.cli.flags import declared_name
 from carlasc.errors import ArgumentError, CarlascError
 
-_INTERRUPTED = "interrupted: files written so far are complete; run the same command again to continue"
-_ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")  # an argument in an error of the library: `workers`, `overwrite=True`
+_INTERRUPTED = (
+    "interrupted: files written so far are complete; run the same command again to continue"
+)
+# an argument in an error of the library: `workers`, `overwrite=True`
+_ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
 _OPTIONS = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOptions("kiss-icp")`
 _UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
 
@@ -25,13 +30,18 @@ _UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
 class Command(TyperCommand):
     """A command whose help is plain text, and whose errors are one line on stderr and an exit code."""
 
-    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
+    ) -> Any:
         """Read the arguments."""
         with _errors_in_one_line(self):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command. Exit codes: 1 if the work failed, 2 for a wrong argument, 130 if it was interrupted."""
+        """Run the command.
+
+        Exit codes: 1 if the work failed, 2 for a wrong argument, 130 if it was interrupted.
+        """
         with _errors_in_one_line(self):
             return super().invoke(ctx)
 
@@ -43,7 +53,9 @@ class Command(TyperCommand):
 class CommandGroup(TyperGroup):
     """The commands. An unknown name prints one line on stderr."""
 
-    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
+    ) -> Any:
         """Read the options before the command. Without arguments, print the help."""
         with _errors_in_one_line(self):
             return super().make_context(info_name, args or ["--help"], parent, **extra)
@@ -66,11 +78,15 @@ class CommandGroup(TyperGroup):
 
 
 def write_options(parameters: list[Any], ctx: Any, formatter: Any) -> None:
-    """Write parameters under their headings: arguments first, then the options of the command, then those of its groups."""
+    """Write parameters under their headings: arguments first, then the options of the command, then
+    those of its groups.
+    """
     sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
     for parameter in parameters:
         is_argument = parameter.param_type_name == "argument"
-        heading = getattr(parameter, "rich_help_panel", None) or ("Arguments" if is_argument else "Options")
+        heading = getattr(parameter, "rich_help_panel", None) or (
+            "Arguments" if is_argument else "Options"
+        )
         if (record := parameter.get_help_record(ctx)) is not None:
             sections.setdefault(heading, []).append(record)
     for heading, records in sections.items():
@@ -82,7 +98,9 @@ def write_options(parameters: list[Any], ctx: Any, formatter: Any) -> None:
 @contextmanager
 def _errors_in_one_line(command: Any) -> Iterator[None]:
     """Turn errors of the library and of the arguments into one line on stderr and an exit code."""
-    options = {declared_name(one.name): _typed(one) for one in getattr(command, "params", ()) if one.name}
+    options = {
+        declared_name(one.name): _typed(one) for one in getattr(command, "params", ()) if one.name
+    }
     try:
         yield
     except _UsageError as error:
@@ -93,7 +111,10 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
         shown = copy.copy(error)
         if isinstance(error, ArgumentError):
             shown.where = options.get(error.where, error.where)
-        fail(_replace_arguments(str(shown), options), WRONG_USAGE if isinstance(error, ArgumentError) else FAILED)
+        fail(
+            _replace_arguments(str(shown), options),
+            WRONG_USAGE if isinstance(error, ArgumentError) else FAILED,
+        )
     except BatchError as error:
         for message in error.messages:
             echo(f"carlasc: {_replace_arguments(message, options)}", err=True)
@@ -101,7 +122,8 @@ def _errors_in_one_line(command: Any) -> Iterator[None]:
     except KeyboardInterrupt:
         fail(_INTERRUPTED, INTERRUPTED)
     except (SystemError, ValueError) as error:
-        # caused by Ctrl-C while compiled code returned its result, or while a zip was written, which then cannot be closed
+        # caused by Ctrl-C while compiled code returned its result, or while a zip was written,
+        # which then cannot be closed
         if not any(isinstance(one, KeyboardInterrupt) for one in _chain(error)):
             raise
         fail(_INTERRUPTED, INTERRUPTED)
@@ -126,7 +148,9 @@ def _typed(parameter: Any) -> str:
 
 
 def _replace_arguments(text: str, options: Mapping[str, str]) -> str:
-    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite` ``, if the command has such an option."""
+    """Replace `` `window=8` `` by `` `--window 8` `` and `` `overwrite=True` `` by `` `--overwrite`
+    ``, if the command has such an option.
+    """
 
     def replace(match: re.Match[str]) -> str:
         name, value = match[1], match[2]

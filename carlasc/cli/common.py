@@ -1,4 +1,6 @@
-"""What all commands share: exit codes for errors, progress, figures as JSON, and the parsing of small values."""
+"""What all commands share: exit codes for errors, progress, figures as JSON, and the parsing of
+small values.
+"""
 
 from __future__ import annotations
 
@@ -22,21 +24,25 @@ if TYPE_CHECKING:
 
     from carlasc.core.frames import FrameRange
 else:
-    FrameRange = object  # used in annotations only: importing it loads NumPy, which would slow down `--help`
+    FrameRange = (
+        object  # used in annotations only: importing it loads NumPy, which would slow down `--help`
+    )
 
 _Number = TypeVar("_Number", int, float)
 
 _LINE_S = 10.0  # time between two lines of progress without a terminal, seconds
 FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 
-_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # a URL, also with one slash only; a single letter is a drive
+# a URL, also with one slash only; a single letter is a drive
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None:
     """Return a path with `~` replaced, or a URL as it is.
 
     Raises:
-        ArgumentError: the place is empty, or is a URL with one slash (`Path` removes the other one).
+        ArgumentError: the place is empty, or is a URL with one slash (`Path` removes the other
+            one).
     """
     if place is None:
         return None
@@ -46,7 +52,9 @@ def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None
     if "://" in place:
         return place
     if _URL.match(place) and not Path(place).exists():
-        raise ArgumentError(name, expected="a path, or a URL such as s3://bucket/folder", found=place)
+        raise ArgumentError(
+            name, expected="a path, or a URL such as s3://bucket/folder", found=place
+        )
     return str(Path(place).expanduser()) if place.startswith("~") else place
 
 
@@ -73,11 +81,16 @@ def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None
 
 def place_argument(text: str, name: str = "SOURCE", default: str | None = None) -> Any:
     """Return an argument for a path or a URL. `text` is its help, `name` its name in the help."""
-    return typer.Argument(metavar=name, help=text, callback=_read_place, show_default=default or True)
+    return typer.Argument(
+        metavar=name, help=text, callback=_read_place, show_default=default or True
+    )
 
 
 def places_argument(text: str, name: str = "SOURCES") -> Any:
-    """Return an argument for one or more paths or URLs. `text` is its help, `name` its name in the help."""
+    """Return an argument for one or more paths or URLs.
+
+    `text` is its help, `name` its name in the help.
+    """
     return typer.Argument(metavar=name, help=text, callback=_read_places)
 
 
@@ -97,7 +110,9 @@ def file_option(*flags: str, text: str, **settings: Any) -> Any:
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")
+]
 
 
 def starting_with(incomplete: str, names: Iterable[str]) -> list[str]:
@@ -106,7 +121,10 @@ def starting_with(incomplete: str, names: Iterable[str]) -> list[str]:
 
 
 def echo(text: object, *, err: bool = False, nl: bool = True) -> None:
-    """Print lines on stdout or stderr. Control characters are escaped, because names come from data."""
+    """Print lines on stdout or stderr.
+
+    Control characters are escaped, because names come from data.
+    """
     typer.echo("\n".join(map(printable, str(text).split("\n"))), err=err, nl=nl)
 
 
@@ -132,7 +150,8 @@ class BatchError(Exception):
 
 
 def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str = "frames") -> None:
-    """End the command with exit code 1, and with what failed on stderr, if anything in a batch failed.
+    """End the command with exit code 1, and with what failed on stderr, if anything in a batch
+    failed.
 
     Args:
         failures: (what failed, message) of each.
@@ -162,7 +181,10 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
             echo(place)
         what, _, verb = done.rpartition(": ")
         skipped = f" ({result.skipped} existed)" if result.skipped else ""
-        echo(f"{what}{what and ': '}{count(result.made, 'frame')} {verb}{skipped} in {result.elapsed_s:.1f} s")
+        echo(
+            f"{what}{what and ': '}{count(result.made, 'frame')} {verb}{skipped} in "
+            f"{result.elapsed_s:.1f} s"
+        )
     failures = [(failure.frame, failure.message) for failure in result.failures]
     report_failures(failures, result.made + result.skipped + len(failures))
 
@@ -171,7 +193,8 @@ def print_frames(result: Any, places: Iterable[object], done: str, *, json: bool
 def progress_bar(
     description: str, unit: str = "frames", *, transient: bool = False
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show progress on stderr while the block runs: a bar on a terminal, otherwise a line every ten seconds.
+    """Show progress on stderr while the block runs: a bar on a terminal, otherwise a line every ten
+    seconds.
 
     Args:
         description: what is being done.
@@ -209,7 +232,9 @@ def progress_bar(
 
 
 def _lines(description: str, unit: str) -> Callable[[int, int], None]:
-    """Return a callback of (done, total) that prints a line on stderr, at most one every `_LINE_S` seconds."""
+    """Return a callback of (done, total) that prints a line on stderr, at most one every `_LINE_S`
+    seconds.
+    """
     start = last = time.monotonic()
 
     def show(done: int, total: int) -> None:
@@ -233,7 +258,9 @@ def print_json(value: Any) -> None:
     echo(json.dumps(value, indent=2, default=_plain))
 
 
-def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], option: str) -> tuple[_Number, ...]:
+def parse_numbers(
+    text: str, kind: type[_Number], counts: tuple[int, ...], option: str
+) -> tuple[_Number, ...]:
     """Read "a,b,c".
 
     Raises:
@@ -246,7 +273,9 @@ def parse_numbers(text: str, kind: type[_Number], counts: tuple[int, ...], optio
     if len(values) not in counts:
         wanted = " or ".join(map(str, counts))
         raise ArgumentError(
-            option, expected=f"{wanted} {'whole ' if kind is int else ''}numbers separated by commas", found=repr(text)
+            option,
+            expected=f"{wanted} {'whole ' if kind is int else ''}numbers separated by commas",
+            found=repr(text),
         )
     return values
 
@@ -259,9 +288,13 @@ def _read_frames(text: str | None) -> FrameRange | None:
 
 SourceClassesOption = Annotated[
     str | None,
-    typer.Option(help="Class table of the labels in SOURCE, if its metadata do not name it: carla, carlasc11, ..."),
+    typer.Option(
+        help="Class table of the labels in SOURCE, if its metadata do not name it: carla, "
+        "carlasc11, ..."
+    ),
 ]
-FramesOption = Annotated[  # read in a callback: typer would replace the message of a parser's ValueError
+# read in a callback: typer would replace the message of a parser's ValueError
+FramesOption = Annotated[
     FrameRange | None,
     typer.Option(
         "--frames",

@@ -32,36 +32,42 @@ class LayoutFlags(Flags):
     classes: Annotated[
         str,
         typer.Option(
-            help="Classes of the labels. carla: CarlaSC's classes. The name of the data set's own class table, such as semantickitti: its ids are"
+            help="Classes of the labels. carla: CarlaSC's classes. The name of the data set's own "
+            "class table, such as semantickitti: its ids are"
             " kept. auto: the ids of SemanticKITTI are kept, all others become carla."
         ),
     ] = "auto"
     axes: Annotated[
         Axes,
         typer.Option(
-            help="Axes of the output. left: y is mirrored, as in CarlaSC, which is left-handed. right: right-handed, as in the data set."
+            help="Axes of the output. left: y is mirrored, as in CarlaSC, which is left-handed. "
+            "right: right-handed, as in the data set."
         ),
     ] = "left"
     flow: Annotated[
         FlowSource,
         typer.Option(
-            help="Scene flow. auto: the velocity of each actor, from its tracked boxes, or from its points without boxes. none: no flow."
+            help="Scene flow. auto: the velocity of each actor, from its tracked boxes, or from "
+            "its points without boxes. none: no flow."
         ),
     ] = "auto"
-    allow_unknown: Annotated[bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")] = (
-        False
-    )
+    allow_unknown: Annotated[
+        bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")
+    ] = False
     images: Annotated[
         Images,
         typer.Option(
-            help="Images of cameras. copy: copied into the output. link: only their paths are written. none: left out. Calibrations are always"
+            help="Images of cameras. copy: copied into the output. link: only their paths are "
+            "written. none: left out. Calibrations are always"
             " written."
         ),
     ] = "none"
 
     def options(self) -> carlasc.converting.LayoutOptions:
         """Return how sequences are written."""
-        return carlasc.converting.LayoutOptions(self.classes, self.axes, self.flow, self.allow_unknown, self.images)
+        return carlasc.converting.LayoutOptions(
+            self.classes, self.axes, self.flow, self.allow_unknown, self.images
+        )
 
 
 def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
@@ -76,24 +82,38 @@ def _print_list(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _print_preview(found: tuple[carlasc.converting.RecordingPreview, ...], out: str, grids: str) -> None:
+def _print_preview(
+    found: tuple[carlasc.converting.RecordingPreview, ...], out: str, grids: str
+) -> None:
     """Print what a conversion would read and write."""
     for one in found:
         rate = "no times" if one.rate_hz is None else f"{one.rate_hz:g} Hz"
         echo(f"{one.location}: {count(one.frames, 'scan')}, {rate}, of {', '.join(one.sensors)}")
         bounds = " ".join(
-            f"{axis} {low:g}..{high:g}" for axis, low, high in zip("xyz", one.lower, one.upper, strict=True)
+            f"{axis} {low:g}..{high:g}"
+            for axis, low, high in zip("xyz", one.lower, one.upper, strict=True)
         )
         echo(f"  first scan: {one.points} points, {bounds} m; fields {', '.join(one.fields)}")
-        ground = "no ground found" if one.up is None else f"height of the sensor above the ground: {one.height_m:g} m"
+        ground = (
+            "no ground found"
+            if one.up is None
+            else f"height of the sensor above the ground: {one.height_m:g} m"
+        )
         wrong = one.up not in (None, "+z")
-        echo(f"  {ground}" + (f"; up is {one.up}, so the axes are not x forward, y left, z up" if wrong else ""))
         echo(
-            f"  poses: {'those of the recording' if one.poses == 'file' else 'estimated from the scans with KISS-ICP'}"
+            f"  {ground}"
+            + (f"; up is {one.up}, so the axes are not x forward, y left, z up" if wrong else "")
+        )
+        echo(
+            f"  poses: "
+            f"{'those of the recording' if one.poses == 'file' else 'estimated from the scans with KISS-ICP'}"
         )
         for note in one.notes:
             echo(f"  {note}")
-        echo(f"  output: {out}/{one.split}/{one.name}, with {'no grids' if grids == 'none' else f'grids from {grids}'}")
+        echo(
+            f"  output: {out}/{one.split}/{one.name}, with "
+            f"{'no grids' if grids == 'none' else f'grids from {grids}'}"
+        )
     echo("nothing was written")
 
 
@@ -107,21 +127,30 @@ def convert(
         str,
         typer.Argument(
             metavar="NAME",
-            help="Name of the data set: kitti, argoverse2, ... (see --list). NAME --help also shows the options of this data set.",
-            autocompletion=lambda incomplete: starting_with(incomplete, carlasc.converting.converter_names()),
+            help="Name of the data set: kitti, argoverse2, ... (see --list). NAME --help also "
+            "shows the options of this data set.",
+            autocompletion=lambda incomplete: starting_with(
+                incomplete, carlasc.converting.converter_names()
+            ),
         ),
     ],
-    source: Annotated[Path, file_argument("Folder of the data set, or of one of its sequences.", "SOURCE")],
+    source: Annotated[
+        Path, file_argument("Folder of the data set, or of one of its sequences.", "SOURCE")
+    ],
     out: Annotated[str, place_argument("Folder to write to, or its URL.", "OUT")],
     sequences: Annotated[
         str | None,
-        typer.Option(help="Names of sequences, or their last parts, separated by commas, such as 00,08. Default: all."),
+        typer.Option(
+            help="Names of sequences, or their last parts, separated by commas, such as 00,08. "
+            "Default: all."
+        ),
     ] = None,
     split: Annotated[SplitName, typer.Option(help="Only sequences of this split.")] = "all",
     grids: Annotated[
         Literal["scans", "voxels", "none"],
         typer.Option(
-            help="Grids to write. scans: made from scans merged over time (by default coarse ones). voxels: the grids of the data set. none: no"
+            help="Grids to write. scans: made from scans merged over time (by default coarse "
+            "ones). voxels: the grids of the data set. none: no"
             " grids."
         ),
     ] = "scans",
@@ -132,7 +161,12 @@ def convert(
     json: Json = False,
     _list: Annotated[
         bool,
-        typer.Option("--list", help="List the converters that are installed.", callback=_print_list, is_eager=True),
+        typer.Option(
+            "--list",
+            help="List the converters that are installed.",
+            callback=_print_list,
+            is_eager=True,
+        ),
     ] = False,
 ) -> None:
     """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes.
@@ -142,7 +176,12 @@ def convert(
     chosen = None if sequences is None else sequences.split(",")
     if dry_run:
         found = carlasc.converting.preview(
-            name, source, sequences=chosen, split=split, poses=poses.options(), options=options.values
+            name,
+            source,
+            sequences=chosen,
+            split=split,
+            poses=poses.options(),
+            options=options.values,
         )
         if json:
             print_json(found)
@@ -150,12 +189,15 @@ def convert(
             _print_preview(found, out, grids)
         return
     if making.is_given and grids != "scans":
-        raise ArgumentError("--grids", expected="scans, because options of the grid are given", found=grids)
+        raise ArgumentError(
+            "--grids", expected="scans, because options of the grid are given", found=grids
+        )
     bounded = making.grid.bounds is not None
     if run.part is not None and grids == "scans" and not bounded:
         raise ArgumentError(
             "--part",
-            expected="--bounds or --grids none, because the height of the grid is otherwise measured in all sequences",
+            expected="--bounds or --grids none, because the height of the grid is otherwise "
+            "measured in all sequences",
             found="neither",
         )
     made = carlasc.groundtruth.GridOptions(

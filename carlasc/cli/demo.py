@@ -22,11 +22,18 @@ def demo(
     out: Annotated[Path, file_argument("Folder to write to.")] = Path("carlasc-demo"),
     count: Annotated[int, typer.Option(help="Number of frames of each drive.", min=1)] = 6,
     sensors: Annotated[
-        int, typer.Option(help="Number of LiDARs; a fifth of them record the drive for validation.", min=1)
+        int,
+        typer.Option(
+            help="Number of LiDARs; a fifth of them record the drive for validation.", min=1
+        ),
     ] = 20,
-    seed: Annotated[int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the town: another seed makes another town.", min=0)
+    ] = 0,
 ) -> None:
-    """Simulate two drives, one to train and one to validate, make their ground truth, check it, and draw pictures and a page for a browser. This takes about a minute."""
+    """Simulate two drives, one to train and one to validate, make their ground truth, check it, and
+    draw pictures and a page for a browser. This takes about a minute.
+    """
     from carlasc.demo import demonstrate
 
     with work.spread("demo", shown=False) as run:
@@ -41,7 +48,10 @@ def demo(
     for picture in result.pictures:
         echo(f"picture  {picture}")
     first = result.sequences[0]
-    echo(f"next     carlasc regrid {first} --res 0.4    or    carlasc render {first} --frames 0:{count} -o drive.mp4")
+    echo(
+        f"next     carlasc regrid {first} --res 0.4    or    carlasc render {first} --frames "
+        f"0:{count} -o drive.mp4"
+    )
     echo(f"page     {result.page}    (open it in a browser)")
     if not result.validation.ok:
         raise typer.Exit(FAILED)
@@ -49,7 +59,10 @@ def demo(
 
 @contextmanager
 def _show_step(name: str) -> Iterator[Callable[[int, int], None]]:
-    """Print the name of a step, and its time when it is done. On a terminal, also show its progress."""
+    """Print the name of a step, and its time when it is done.
+
+    On a terminal, also show its progress.
+    """
     start, has_bar = time.perf_counter(), sys.stderr.isatty()
     if not has_bar:  # a bar would be drawn over an unfinished line
         echo(f"{name} ...", nl=False)

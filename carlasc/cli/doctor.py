@@ -17,11 +17,16 @@ if TYPE_CHECKING:
 def doctor(
     folder: Annotated[
         Path | None,
-        file_argument("Folder whose disk speed is measured. Default: the folder for temporary files.", "FOLDER"),
+        file_argument(
+            "Folder whose disk speed is measured. Default: the folder for temporary files.",
+            "FOLDER",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Print the installed packages and the properties of the machine, as text to paste into an issue. User names are left out."""
+    """Print the installed packages and the properties of the machine, as text to paste into an
+    issue. User names are left out.
+    """
     from carlasc.inspection.installation import doctor as look
 
     found = look(folder)
@@ -35,7 +40,11 @@ def doctor(
 
 def _lines(found: Installation) -> Iterator[str]:
     width = max(
-        map(len, [extra.name for extra in found.extras] + [package.name for package in found.packages]), default=0
+        map(
+            len,
+            [extra.name for extra in found.extras] + [package.name for package in found.packages],
+        ),
+        default=0,
     )
     yield f"carlasc {found.version}, in {found.folder}"
     yield f"Python {found.python}"
@@ -55,7 +64,8 @@ def _lines(found: Installation) -> Iterator[str]:
         state = (
             "writable"
             if code.writable
-            else "NOT WRITABLE: every process compiles again; set NUMBA_CACHE_DIR to a folder that is writable"
+            else "NOT WRITABLE: every process compiles again; set NUMBA_CACHE_DIR to a folder "
+            "that is writable"
         )
         yield "\ncompiled code"
         yield f"  {code.folder} ({state}): {code.files} files, {code.bytes / 1e6:.1f} MB"
@@ -78,4 +88,6 @@ def _describe_extra(extra: Extra) -> str:
     """Return the versions of its packages, or what is wrong with them."""
     if extra.problems:
         return ", ".join(extra.problems)
-    return "complete: " + ", ".join(f"{package.name} {package.version}" for package in extra.packages)
+    return "complete: " + ", ".join(
+        f"{package.name} {package.version}" for package in extra.packages
+    )

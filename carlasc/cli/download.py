@@ -16,19 +16,25 @@ def download(
     split: Annotated[
         list[str] | None,
         typer.Option(
-            help="Split: train (two zips), val, test or all. Repeat it for several. Needed for sequences only."
+            help="Split: train (two zips), val, test or all. Repeat it for several. Needed for "
+            "sequences only."
         ),
     ] = None,
     what: Annotated[
         Literal["sequences", "fine", "cylindrical"],
         typer.Option(
-            help="What to download. sequences: scans, poses and coarse grids. fine, cylindrical: only these grids, of all splits."
+            help="What to download. sequences: scans, poses and coarse grids. fine, cylindrical: "
+            "only these grids, of all splits."
         ),
     ] = "sequences",
-    extract: Annotated[bool, typer.Option("--extract", help="Extract each zip into OUT, then remove it.")] = False,
+    extract: Annotated[
+        bool, typer.Option("--extract", help="Extract each zip into OUT, then remove it.")
+    ] = False,
     keep: Annotated[bool, typer.Option("--keep", help="With --extract: keep the zips.")] = False,
     connections: Annotated[int, typer.Option(help="Number of parallel connections.", min=1)] = 4,
-    base_url: Annotated[str | None, typer.Option(help="URL of a mirror: zips are read from BASE_URL/NAME.")] = None,
+    base_url: Annotated[
+        str | None, typer.Option(help="URL of a mirror: zips are read from BASE_URL/NAME.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Download the published zips. If it is interrupted, run the same command again to continue.
@@ -52,5 +58,9 @@ def download(
         print_json(result)
         return
     for archive in result.archives:
-        place = archive.path if archive.folder is None else f"{count(archive.files, 'file')} in {archive.folder}"
+        place = (
+            archive.path
+            if archive.folder is None
+            else f"{count(archive.files, 'file')} in {archive.folder}"
+        )
         echo(f"{archive.name}: {archive.fetched / 1e9:.2f} GB downloaded: {place}")

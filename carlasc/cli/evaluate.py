@@ -38,10 +38,14 @@ class GridChoiceFlags(Flags):
     """The grids and the frames that are compared, and the classes of the predictions."""
 
     grid: Annotated[
-        str | None, typer.Option(help="Name of the grid with the predictions. Default: as for --truth-grid.")
+        str | None,
+        typer.Option(help="Name of the grid with the predictions. Default: as for --truth-grid."),
     ] = None
     truth_grid: Annotated[
-        str | None, typer.Option(help="Name of the grid with the ground truth. Default: evaluation, or the only grid.")
+        str | None,
+        typer.Option(
+            help="Name of the grid with the ground truth. Default: evaluation, or the only grid."
+        ),
     ] = None
     source_classes: SourceClassesOption = None
     frames: FramesOption = None
@@ -54,38 +58,56 @@ class ScoringFlags(Flags):
     heading: ClassVar[str] = "What is scored"
 
     voxels: Annotated[
-        Voxels, typer.Option(help="known: score only voxels that are known in the ground truth. all: score all voxels.")
+        Voxels,
+        typer.Option(
+            help="known: score only voxels that are known in the ground truth. all: score all "
+            "voxels."
+        ),
     ] = "known"
     near_m: Annotated[
-        float, typer.Option("--near", help="Score only voxels at least this far from the sensor, in metres.")
+        float,
+        typer.Option(
+            "--near", help="Score only voxels at least this far from the sensor, in metres."
+        ),
     ] = 0.0
     far_m: Annotated[
         float | None,
-        typer.Option("--far", help="Score only voxels nearer to the sensor than this, in metres. Default: no limit."),
+        typer.Option(
+            "--far",
+            help="Score only voxels nearer to the sensor than this, in metres. Default: no limit.",
+        ),
     ] = None
     fov: Annotated[
         float,
         typer.Option(
-            help="Score only voxels in a field of view of this angle, centred forward, in degrees.", min=1, max=360
+            help="Score only voxels in a field of view of this angle, centred forward, in degrees.",
+            min=1,
+            max=360,
         ),
     ] = 360.0
     by: Annotated[
         list[str] | None,
         typer.Option(
             metavar="PART",
-            help="Also score by distance, height, visibility, motion or seen (by a camera). Repeat it for several.",
+            help="Also score by distance, height, visibility, motion or seen (by a camera). "
+            "Repeat it for several.",
         ),
     ] = None
     rays: Annotated[
         bool,
         typer.Option(
-            "--rays", help="Also score the first occupied voxel on each ray: RayIoU. Needs poses and a Cartesian grid."
+            "--rays",
+            help="Also score the first occupied voxel on each ray: RayIoU. Needs poses and a "
+            "Cartesian grid.",
         ),
     ] = False
 
     actors: Annotated[
         bool,
-        typer.Option("--actors", help="Also score actors: panoptic quality (PQ), tracking (LSTQ), and velocities."),
+        typer.Option(
+            "--actors",
+            help="Also score actors: panoptic quality (PQ), tracking (LSTQ), and velocities.",
+        ),
     ] = False
 
     def options(self) -> carlasc.Scoring:
@@ -102,10 +124,14 @@ class OutputFlags(Flags):
     heading: ClassVar[str] = "Output"
 
     per_frame: Annotated[
-        Path | None, file_option("--per-frame", text="Also write the scores of each frame to this CSV file.")
+        Path | None,
+        file_option("--per-frame", text="Also write the scores of each frame to this CSV file."),
     ] = None
     plot: Annotated[
-        Path | None, file_option("--plot", text="Also draw the scores of each frame to this .png, .svg or .pdf file.")
+        Path | None,
+        file_option(
+            "--plot", text="Also draw the scores of each frame to this .png, .svg or .pdf file."
+        ),
     ] = None
     as_json: Json = False
     latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX.")] = False
@@ -120,7 +146,8 @@ def evaluate(
     source: Annotated[
         str,
         place_argument(
-            "Predictions: a data set, a sequence, the folder of a grid, a folder of .label files, or files of SemanticKITTI,"
+            "Predictions: a data set, a sequence, the folder of a grid, a folder of .label files, "
+            "or files of SemanticKITTI,"
             " SSCBench, Occ3D, OpenOccupancy or CarlaOcc."
         ),
     ],
@@ -128,36 +155,47 @@ def evaluate(
     convention: Annotated[
         str | None,
         typer.Option(
-            help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, occ3d-lidar, occ3d-lidar-sparseocc,"
-            " occ3d-camera, openoccupancy; or own, which scores the classes of the data. Default: the benchmark whose files TRUTH holds, otherwise"
+            help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, "
+            "occ3d-lidar, occ3d-lidar-sparseocc,"
+            " occ3d-camera, openoccupancy; or own, which scores the classes of the data. Default: "
+            "the benchmark whose files TRUTH holds, otherwise"
             " carlasc, or own for classes that carlasc has no map for.",
-            autocompletion=lambda incomplete: starting_with(incomplete, (*carlasc.metrics.CONVENTIONS, "own")),
+            autocompletion=lambda incomplete: starting_with(
+                incomplete, (*carlasc.metrics.CONVENTIONS, "own")
+            ),
         ),
     ] = None,
     all_conventions: Annotated[
-        bool, typer.Option("--all-conventions", help="Print one row per convention instead of the tables.")
+        bool,
+        typer.Option(
+            "--all-conventions", help="Print one row per convention instead of the tables."
+        ),
     ] = False,
     forecast: Annotated[
         Around | None,
         typer.Option(
-            help="Score forecasts: grids with names such as forecast_1s. present: they are around the sensor of the frame in which they are made."
+            help="Score forecasts: grids with names such as forecast_1s. present: they are around "
+            "the sensor of the frame in which they are made."
             " future: around the sensor of the frame that they predict."
         ),
     ] = None,
     compare: Annotated[
         str | None,
         place_option(
-            "--compare", text="Other predictions of the same sequences, to compare SOURCE with by a paired test."
+            "--compare",
+            text="Other predictions of the same sequences, to compare SOURCE with by a paired test.",
         ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the predictions in the tables. Default: the name of SOURCE.")
+        str | None,
+        typer.Option(help="Name of the predictions in the tables. Default: the name of SOURCE."),
     ] = None,
 ) -> None:
     """Score predicted grids by the rules of a benchmark: IoU per class, mIoU, and completeness.
 
-    Benchmarks differ in the voxels that are scored, in the classes, and in the classes of the mean. Scores by different conventions can
-    therefore not be compared. Intersections and unions are summed over all frames before they are divided.
+    Benchmarks differ in the voxels that are scored, in the classes, and in the classes of the mean.
+    Scores by different conventions can therefore not be compared. Intersections and unions are
+    summed over all frames before they are divided.
     """
     if output.plot is not None:
         from carlasc.inspection.charts import check_plot
@@ -172,25 +210,38 @@ def evaluate(
             "plot": output.plot,
         }
         if other_options := [option for option, value in alone.items() if value]:
-            raise ArgumentError(other_options[0], expected="none with --forecast", found="both", advice="leave one out")
+            raise ArgumentError(
+                other_options[0],
+                expected="none with --forecast",
+                found="both",
+                advice="leave one out",
+            )
         common |= {"convention": convention, "around": forecast}
         with work.spread("Scoring", usual=1) as run:
-            by_time = carlasc.metrics.evaluate_forecasts(source, truth, scoring=scoring.options(), run=run, **common)
+            by_time = carlasc.metrics.evaluate_forecasts(
+                source, truth, scoring=scoring.options(), run=run, **common
+            )
         _print_forecasts(by_time, name, output)
         return
     if all_conventions:
         with work.spread("Scoring", usual=1) as run:
-            found = carlasc.metrics.evaluate_by_all_conventions(source, truth, name=name, run=run, **common)
+            found = carlasc.metrics.evaluate_by_all_conventions(
+                source, truth, name=name, run=run, **common
+            )
         _print_conventions(found, output.as_json)
         return
     common = {**common, "convention": convention}
     with work.spread("Scoring", usual=1) as run:
-        result = carlasc.evaluate(source, truth, scoring=scoring.options(), name=name, run=run, **common)
+        result = carlasc.evaluate(
+            source, truth, scoring=scoring.options(), name=name, run=run, **common
+        )
     other = None
     if compare is not None:
         whole = replace(scoring, by=None, rays=False, actors=False).options()
         with work.spread("Scoring --compare", usual=1) as run:
-            other = carlasc.evaluate(compare, truth, scoring=whole, name=Path(compare).name, run=run, **common)
+            other = carlasc.evaluate(
+                compare, truth, scoring=whole, name=Path(compare).name, run=run, **common
+            )
     if output.per_frame is not None:
         from carlasc.storage.files import write_output
 
@@ -205,7 +256,9 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Region:
-    """The voxels between two distances, metres, and within an angle about the forward axis, degrees. It pickles into workers."""
+    """The voxels between two distances, metres, and within an angle about the forward axis,
+    degrees. It pickles into workers.
+    """
 
     near_m: float
     far_m: float | None
@@ -222,7 +275,10 @@ def _print_tables(tables: Sequence[FigureTable], remark: str, output: OutputFlag
     from carlasc.cli.tables import print_table
 
     if output.latex or output.csv:
-        echo("\n".join(table.to_latex() if output.latex else table.to_csv() for table in tables), nl=False)
+        echo(
+            "\n".join(table.to_latex() if output.latex else table.to_csv() for table in tables),
+            nl=False,
+        )
         return
     for table in tables:
         print_table(console(), table.header, table.texts(), title=f"{table.title} ({remark})")
@@ -236,28 +292,41 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
             values["comparison"] = {"with": other.name, **comparison.to_dict()}
         print_json(values)
         return
-    _print_tables(result.tables(), f"percent, {count(result.frames, 'frame')}, voxels: {result.voxels}", output)
+    _print_tables(
+        result.tables(),
+        f"percent, {count(result.frames, 'frame')}, voxels: {result.voxels}",
+        output,
+    )
     if output.latex or output.csv:
         return
     out = console()
     if (interval := result.interval()) is not None:
         out.print(
             line(
-                f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to {100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
+                f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to "
+                f"{100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
             )
         )
     if comparison is not None and other is not None:
         found = comparison.difference
         out.print(
             line(
-                f"mIoU minus that of {other.name}: {100 * found.value:+.2f}, 95 % interval {100 * found.low:+.2f} to {100 * found.high:+.2f},"
+                f"mIoU minus that of {other.name}: {100 * found.value:+.2f}, 95 % interval "
+                f"{100 * found.low:+.2f} to {100 * found.high:+.2f},"
                 f" p = {comparison.p_value:.3g} ({count(len(comparison.sequences), 'sequence')})"
             )
         )
     if result.actors is not None and not math.isnan(result.actors.velocity_m_s):
         speeds = result.actors.velocity_by_speed.items()
-        bands = ", ".join(f"from {low:g} m/s {value:.2f}" for low, value in speeds if not math.isnan(value))
-        out.print(line(f"mean velocity error of moving voxels: {result.actors.velocity_m_s:.2f} m/s ({bands})"))
+        bands = ", ".join(
+            f"from {low:g} m/s {value:.2f}" for low, value in speeds if not math.isnan(value)
+        )
+        out.print(
+            line(
+                f"mean velocity error of moving voxels: {result.actors.velocity_m_s:.2f} m/s "
+                f"({bands})"
+            )
+        )
     for note in result.notes:
         echo(f"note: {note}", err=True)
 
@@ -266,12 +335,25 @@ def _print_forecasts(by_time: Mapping[float, Evaluation], name: str, output: Out
     """Print the tables with a row for each time ahead."""
     results = list(by_time.values())
     if output.as_json:
-        print_json({"name": name, "forecasts": [{"horizon_s": t, **result.to_dict()} for t, result in by_time.items()]})
+        print_json(
+            {
+                "name": name,
+                "forecasts": [
+                    {"horizon_s": t, **result.to_dict()} for t, result in by_time.items()
+                ],
+            }
+        )
     else:
         tables = [carlasc.metrics.semantic_table(results), carlasc.metrics.geometric_table(results)]
-        tables += [replace(table, title=f"{table.title}, {one.name}") for one in results for table in one.tables()[2:]]
+        tables += [
+            replace(table, title=f"{table.title}, {one.name}")
+            for one in results
+            for table in one.tables()[2:]
+        ]
         frames = ", ".join(str(result.frames) for result in results)
-        _print_tables(tables, f"percent, {name}, frames: {frames}, voxels: {results[0].voxels}", output)
+        _print_tables(
+            tables, f"percent, {name}, frames: {frames}, voxels: {results[0].voxels}", output
+        )
     failures = [failure for result in results for failure in result.failures]
     report_failures(failures, sum(result.frames for result in results) + len(failures))
 
@@ -283,7 +365,10 @@ def _print_conventions(found: Any, as_json: bool) -> None:
 
     if as_json:
         print_json(
-            {n: {"impossible": str(r)} if isinstance(r, CarlascError) else r.to_dict() for n, r in found.items()}
+            {
+                n: {"impossible": str(r)} if isinstance(r, CarlascError) else r.to_dict()
+                for n, r in found.items()
+            }
         )
     else:
         rows, reasons = [], []
@@ -297,10 +382,17 @@ def _print_conventions(found: Any, as_json: bool) -> None:
             shown = ["-" if math.isnan(value) else f"{100 * value:.2f}" for value in figures]
             rows.append([name, str(result.matrix.total), *shown])
         header = ["Convention", "Voxels", "mIoU", "IoU", "Precision", "Recall"]
-        print_table(console(), header, rows, title="The same predictions by each convention (percent)", turn=False)
+        print_table(
+            console(),
+            header,
+            rows,
+            title="The same predictions by each convention (percent)",
+            turn=False,
+        )
         for reason in reasons:
             echo(f"no score: {reason}")
     for result in found.values():
-        if not isinstance(result, CarlascError):  # a frame that cannot be read fails by every convention
+        # a frame that cannot be read fails by every convention
+        if not isinstance(result, CarlascError):
             report_failures(result.failures, result.frames + len(result.failures))
             break

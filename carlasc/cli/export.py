@@ -9,7 +9,14 @@ from typing import Annotated
 import typer
 
 import carlasc
-from carlasc.cli.common import Json, echo, file_argument, place_argument, print_frames, starting_with
+from carlasc.cli.common import (
+    Json,
+    echo,
+    file_argument,
+    place_argument,
+    print_frames,
+    starting_with,
+)
 from carlasc.cli.flags import DeclaredOptions, RunFlags, declared_by
 
 
@@ -22,7 +29,9 @@ def _print_list(wanted: bool) -> None:
     if wanted:
         for name in carlasc.converting.exporter_names():
             exporter = carlasc.converting.load_exporter(name)
-            options = ", ".join(option.name for option in carlasc.converting.option_declarations(exporter))
+            options = ", ".join(
+                option.name for option in carlasc.converting.option_declarations(exporter)
+            )
             echo(f"{name}: {exporter.title}" + (f" (options: {options})" if options else ""))
         raise typer.Exit
 
@@ -34,8 +43,11 @@ def export(
         str,
         typer.Argument(
             metavar="NAME",
-            help="Name of the other data set: kitti, occ3d, ... (see --list). NAME --help also shows the options of this data set.",
-            autocompletion=lambda incomplete: starting_with(incomplete, carlasc.converting.exporter_names()),
+            help="Name of the other data set: kitti, occ3d, ... (see --list). NAME --help also "
+            "shows the options of this data set.",
+            autocompletion=lambda incomplete: starting_with(
+                incomplete, carlasc.converting.exporter_names()
+            ),
         ),
     ],
     source: Annotated[str, place_argument("Folder, zip, store or URL of one or more sequences.")],
@@ -43,11 +55,18 @@ def export(
     sequences: Annotated[
         str | None, typer.Option(help="Names of sequences, separated by commas. Default: all.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write existing frames again.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Write existing frames again.")
+    ] = False,
     json: Json = False,
     _list: Annotated[
         bool,
-        typer.Option("--list", help="List the exporters that are installed.", callback=_print_list, is_eager=True),
+        typer.Option(
+            "--list",
+            help="List the exporters that are installed.",
+            callback=_print_list,
+            is_eager=True,
+        ),
     ] = False,
 ) -> None:
     """Write sequences in the format of another data set, so that its tools can read them.

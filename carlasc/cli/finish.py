@@ -20,7 +20,8 @@ def finish(
 ) -> None:
     """Finish a .zarr store that was written in parts, so that it can be opened.
 
-    The last part of a run does this automatically. Use this command if a part failed, or was never run.
+    The last part of a run does this automatically. Use this command if a part failed, or was never
+    run.
     """
     result = carlasc.finish(out, incomplete=incomplete)
     if json:

@@ -1,4 +1,7 @@
-"""Groups of options that commands share. Each group is a class: its fields are options, and its methods make the library's objects."""
+"""Groups of options that commands share.
+
+Each group is a class: its fields are options, and its methods make the library's objects.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,15 @@ if TYPE_CHECKING:
     from carlasc.converting import OptionDeclaration
     from carlasc.running import Engine, Run
 
-_DECLARED = (
-    "declared_"  # prefix of parameters of declared options, so that no parameter of the command has the same name
-)
+# prefix of parameters of declared options, so that no parameter of the command has the same name
+_DECLARED = "declared_"
 
 
 @dataclass(frozen=True)
 class Flags:
-    """A group of options: each field is an option, or another group. Annotations are read when the command is used.
+    """A group of options: each field is an option, or another group.
+
+    Annotations are read when the command is used.
 
     Attributes:
         heading: heading of the options in `--help`; empty for none.
@@ -37,7 +41,10 @@ class Flags:
     def is_given(self) -> bool:
         """Whether an option of the group has another value than its default."""
         values = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
-        return any(value.is_given if isinstance(value, Flags) else value != field.default for field, value in values)
+        return any(
+            value.is_given if isinstance(value, Flags) else value != field.default
+            for field, value in values
+        )
 
 
 @dataclass(frozen=True)
@@ -47,11 +54,15 @@ class DeclaredOptions(Flags):
     values: Mapping[str, Any]
 
 
-def flatten(function: Callable[..., None], declared: Sequence[OptionDeclaration] = ()) -> Callable[..., None]:
-    """Return a function for typer, in which each option of a group is a parameter of the function itself.
+def flatten(
+    function: Callable[..., None], declared: Sequence[OptionDeclaration] = ()
+) -> Callable[..., None]:
+    """Return a function for typer, in which each option of a group is a parameter of the function
+    itself.
 
     Args:
-        function: the function of a command, whose parameters are annotated with options or groups of options.
+        function: the function of a command, whose parameters are annotated with options or groups
+            of options.
         declared: options that replace the parameter of type `DeclaredOptions`.
     """
     hints = get_type_hints(function, include_extras=True)
@@ -59,10 +70,14 @@ def flatten(function: Callable[..., None], declared: Sequence[OptionDeclaration]
     groups: dict[str, type[Flags]] = {}
     for name, parameter in inspect.signature(function).parameters.items():
         if not _is_group(hints[name]):
-            parameters.append(parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY))
+            parameters.append(
+                parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY)
+            )
             continue
         groups[name] = hints[name]
-        parameters += map(_declared, declared) if hints[name] is DeclaredOptions else _parameters(hints[name])
+        parameters += (
+            map(_declared, declared) if hints[name] is DeclaredOptions else _parameters(hints[name])
+        )
 
     def command(**given: Any) -> None:
         function(**{name: _make(group, given) for name, group in groups.items()}, **given)
@@ -73,8 +88,12 @@ def flatten(function: Callable[..., None], declared: Sequence[OptionDeclaration]
     return command
 
 
-def declared_by(kind: Literal["converter", "exporter"], arguments: Sequence[str]) -> tuple[OptionDeclaration, ...]:
-    """Return the options of the converter or exporter that the arguments of a command name, if they name one."""
+def declared_by(
+    kind: Literal["converter", "exporter"], arguments: Sequence[str]
+) -> tuple[OptionDeclaration, ...]:
+    """Return the options of the converter or exporter that the arguments of a command name, if they
+    name one.
+    """
     named = [argument for argument in arguments if not argument.startswith("-")]
     if not named:  # the library need not be loaded
         return ()
@@ -112,7 +131,9 @@ def _parameters(group: type[Flags]) -> Iterator[inspect.Parameter]:
         info.rich_help_panel = group.heading or None
         default = inspect.Parameter.empty if field.default is MISSING else field.default
         annotation = Annotated[kind, info]
-        yield inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        yield inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+        )
 
 
 def _make(group: type[Flags], given: dict[str, Any]) -> Flags:
@@ -129,7 +150,10 @@ def _make(group: type[Flags], given: dict[str, Any]) -> Flags:
 
 
 def _declared(option: OptionDeclaration) -> inspect.Parameter:
-    """Return the parameter of a declared option. Without a value it is None, and the library takes the default."""
+    """Return the parameter of a declared option.
+
+    Without a value it is None, and the library takes the default.
+    """
     dashed = option.name.replace("_", "-")
     is_switch = option.type is bool
     shown = option.default is not None and option.default is not False
@@ -142,11 +166,17 @@ def _declared(option: OptionDeclaration) -> inspect.Parameter:
     kind: Any = Literal[option.choices] if option.choices else option.type
     annotation = Annotated[kind | None, info]
     name = f"{_DECLARED}{option.name}"
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
+    )
 
 
 def _shown(default: object) -> str:
-    return {True: "yes", False: "no"}.get(default, str(default)) if isinstance(default, bool) else str(default)
+    return (
+        {True: "yes", False: "no"}.get(default, str(default))
+        if isinstance(default, bool)
+        else str(default)
+    )
 
 
 @dataclass(frozen=True)
@@ -155,14 +185,15 @@ class WorkFlags(Flags):
 
     heading: ClassVar[str] = "Parallel work"
 
-    workers: Annotated[int | None, typer.Option(help="Number of parallel processes. Default: one per core.", min=1)] = (
-        None
-    )
+    workers: Annotated[
+        int | None, typer.Option(help="Number of parallel processes. Default: one per core.", min=1)
+    ] = None
     cluster: Annotated[
         str | None,
         typer.Option(
             metavar="WHERE",
-            help="Run on a Dask cluster: local or local:N (N processes on this machine), tcp://HOST:PORT (a running scheduler), slurm"
+            help="Run on a Dask cluster: local or local:N (N processes on this machine), "
+            "tcp://HOST:PORT (a running scheduler), slurm"
             " (starts --workers jobs), or the dotted path of a cluster class. Default: no cluster.",
         ),
     ] = None
@@ -204,7 +235,9 @@ class WorkFlags(Flags):
 class OneWorkerFlags(WorkFlags):
     """How work is spread; by default, one process does it."""
 
-    workers: Annotated[int | None, typer.Option(help="Number of parallel processes. Default: one.", min=1)] = None
+    workers: Annotated[
+        int | None, typer.Option(help="Number of parallel processes. Default: one.", min=1)
+    ] = None
 
 
 @dataclass(frozen=True)
@@ -215,7 +248,8 @@ class RunFlags(WorkFlags):
         str | None,
         typer.Option(
             metavar="I/N",
-            help="Do only part I of N, such as 2/4. Run the other parts as commands of their own, on any machine that can write to the output.",
+            help="Do only part I of N, such as 2/4. Run the other parts as commands of their own, "
+            "on any machine that can write to the output.",
         ),
     ] = None
 

@@ -19,38 +19,54 @@ _FEW = 8  # fewer voxels along an axis are unusual
 _MOVED_M = 1e-3  # bounds that differ by less are equal up to rounding
 _VOXEL_BYTES, _LARGE_BYTES = 8, 2e9  # size of a label and a count; a larger frame is unusual
 MOTION_HELP = (
-    "How moving points are found. boxes, instances, flow: by the field of that name. evidence: a point moves if rays of other scans passed"
-    " through its position. none: only classes that always move. auto: the best field that exists, and evidence for what it misses"
+    "How moving points are found. boxes, instances, flow: by the field of that name. evidence: a "
+    "point moves if rays of other scans passed"
+    " through its position. none: only classes that always move. auto: the best field that "
+    "exists, and evidence for what it misses"
 )
 
 
 @dataclass(frozen=True)
 class GridFlags(Flags):
-    """The geometry of a grid. Most people need these options: they are the first ones, without a heading."""
+    """The geometry of a grid.
+
+    Most people need these options: they are the first ones, without a heading.
+    """
 
     res: Annotated[
         str | None,
         typer.Option(
-            help="Voxel size in metres: one value, or one per axis, x,y,z (cylindrical: radius,azimuth,z with the azimuth in degrees). Use only"
+            help="Voxel size in metres: one value, or one per axis, x,y,z (cylindrical: "
+            "radius,azimuth,z with the azimuth in degrees). Use only"
             " one of --res, --size and --preset."
         ),
     ] = None
-    size: Annotated[str | None, typer.Option(help="Number of voxels per axis: X,Y,Z. The bounds stay exact.")] = None
+    size: Annotated[
+        str | None, typer.Option(help="Number of voxels per axis: X,Y,Z. The bounds stay exact.")
+    ] = None
     preset: Annotated[Preset | None, typer.Option(help="A grid of the published data set.")] = None
-    coordinates: Annotated[Coordinates | None, typer.Option(help="Coordinates of the grid. Default: cartesian.")] = None
+    coordinates: Annotated[
+        Coordinates | None, typer.Option(help="Coordinates of the grid. Default: cartesian.")
+    ] = None
     bounds: Annotated[
         str | None,
         typer.Option(
-            help="Lower and upper bound of each axis, x0,x1,y0,y1,z0,z1, in metres (cylindrical: radius, azimuth in degrees, z). Default: those of"
+            help="Lower and upper bound of each axis, x0,x1,y0,y1,z0,z1, in metres (cylindrical: "
+            "radius, azimuth in degrees, z). Default: those of"
             " the published data set."
         ),
     ] = None
     yes: Annotated[
-        bool, typer.Option("--yes", help="Make the grid even if its size or its bounds are probably a mistake.")
+        bool,
+        typer.Option(
+            "--yes", help="Make the grid even if its size or its bounds are probably a mistake."
+        ),
     ] = False
 
     def spec_or_published(self) -> carlasc.GridSpec:
-        """Return the grid that the options describe, or the published one of the coordinates if they name none."""
+        """Return the grid that the options describe, or the published one of the coordinates if
+        they name none.
+        """
         if self.res is None and self.size is None and self.preset is None and self.bounds is None:
             return carlasc.GridSpec.published(self.coordinates or "cartesian")
         return self.spec()
@@ -61,15 +77,17 @@ class GridFlags(Flags):
         Azimuths are in degrees in options, and in radians in the library.
 
         Raises:
-            ArgumentError: not exactly one of --res, --size and --preset, values that are not valid for a grid, or values that are
-                probably a mistake, without --yes.
+            ArgumentError: not exactly one of --res, --size and --preset, values that are not valid
+                for a grid, or values that are probably a mistake, without --yes.
         """
         spec, asked = self._spec()
         unusual = [*unusual_of(spec, asked)]
         found = "; ".join(text for text, _ in unusual)
         if any(mistake for _, mistake in unusual) and not self.yes:
             expected = f"{_FEW} voxels or more along x and y, the bounds asked for, {_LARGE_BYTES / 1e9:g} GB per frame at most"
-            raise ArgumentError("grid", expected=expected, found=found, advice="give --yes to make it all the same")
+            raise ArgumentError(
+                "grid", expected=expected, found=found, advice="give --yes to make it all the same"
+            )
         if unusual:
             echo(f"note: the grid has {found}", err=True)
         return spec
@@ -81,13 +99,21 @@ class GridFlags(Flags):
         if len(given) != 1:
             found = " and ".join(given) or "none of them"
             raise ArgumentError(
-                "grid", expected="one of --res, --size and --preset", found=found, advice="try --res 0.2"
+                "grid",
+                expected="one of --res, --size and --preset",
+                found=found,
+                advice="try --res 0.2",
             )
         if self.preset == "cylindrical" and self.coordinates == "cartesian":
-            raise ArgumentError("coordinates", expected="cylindrical with --preset cylindrical", found="cartesian")
+            raise ArgumentError(
+                "coordinates", expected="cylindrical with --preset cylindrical", found="cartesian"
+            )
         if self.preset is not None and self.bounds is not None:
             raise ArgumentError(
-                "bounds", expected="none, because --preset has bounds", found=repr(self.bounds), advice="use --size"
+                "bounds",
+                expected="none, because --preset has bounds",
+                found=repr(self.bounds),
+                advice="use --size",
             )
         cylindrical = "cylindrical" in (self.preset, self.coordinates)
         spec = carlasc.GridSpec.published("cylindrical" if cylindrical else "cartesian")
@@ -116,7 +142,9 @@ def unusual_of(spec: carlasc.GridSpec, asked: carlasc.GridSpec) -> Iterator[tupl
         spec: the grid.
         asked: the grid with the bounds, and the numbers of voxels, that were asked for.
     """
-    axes = ("x", "y", "z") if spec.coordinates == "cartesian" else ("the radius", "the azimuth", "z")
+    axes = (
+        ("x", "y", "z") if spec.coordinates == "cartesian" else ("the radius", "the azimuth", "z")
+    )
     for number, axis in enumerate(axes):
         if spec.size[number] < _FEW and (axis != "z" or spec.size != asked.size):
             yield f"{count(spec.size[number], 'voxel')} along {axis}", axis != "z"
@@ -138,33 +166,48 @@ class VoteFlags(Flags):
         VoteRule | None,
         typer.Option(
             "--voting",
-            help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the published files (default for captures)."
-            " sample: one vote per sample, as in the paper. ray: a voxel is occupied if enough of the rays that enter it end in it (default for"
+            help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the "
+            "published files (default for captures)."
+            " sample: one vote per sample, as in the paper. ray: a voxel is occupied if enough of "
+            "the rays that enter it end in it (default for"
             " scans).",
         ),
     ] = None
-    free_step_m: Annotated[float, typer.Option(help="Distance between free-space samples on a ray, in metres.")] = 1.5
-    keep: Annotated[bool, typer.Option("--keep-votes", help="Also write the votes of each class per voxel.")] = False
+    free_step_m: Annotated[
+        float, typer.Option(help="Distance between free-space samples on a ray, in metres.")
+    ] = 1.5
+    keep: Annotated[
+        bool, typer.Option("--keep-votes", help="Also write the votes of each class per voxel.")
+    ] = False
     keep_evidence: Annotated[
         bool,
         typer.Option(
             "--keep-evidence",
-            help="Also write how certain each voxel is: probabilities, flags and number of scans (only for grids from scans).",
+            help="Also write how certain each voxel is: probabilities, flags and number of scans "
+            "(only for grids from scans).",
         ),
     ] = False
     keep_actors: Annotated[
         bool,
-        typer.Option("--keep-actors", help="Also write the actor that each voxel belongs to, and its velocity."),
+        typer.Option(
+            "--keep-actors",
+            help="Also write the actor that each voxel belongs to, and its velocity.",
+        ),
     ] = False
     min_confidence: Annotated[
         float,
         typer.Option(
-            help="Set a voxel to unknown if it is neither free nor occupied with at least this probability, 0 to below 1 (only for grids from"
+            help="Set a voxel to unknown if it is neither free nor occupied with at least this "
+            "probability, 0 to below 1 (only for grids from"
             " scans)."
         ),
     ] = 0.0
     keep_seen: Annotated[
-        bool, typer.Option("--keep-seen", help="Also write which cameras see each voxel (only for data with cameras).")
+        bool,
+        typer.Option(
+            "--keep-seen",
+            help="Also write which cameras see each voxel (only for data with cameras).",
+        ),
     ] = False
 
     def voting(self) -> carlasc.Voting:
@@ -189,21 +232,24 @@ class PoseFlags(Flags):
     poses: Annotated[
         carlasc.motion.PoseSource,
         typer.Option(
-            help="Where poses come from. file: the poses of the data. kiss-icp: estimated from the scans. auto: the file if it exists, otherwise"
+            help="Where poses come from. file: the poses of the data. kiss-icp: estimated from "
+            "the scans. auto: the file if it exists, otherwise"
             " estimated."
         ),
     ] = "auto"
     refine: Annotated[
         carlasc.motion.RefineMode,
         typer.Option(
-            help="Refine poses, so that neighbouring scans agree. auto: only where scans then agree clearly better. always: all poses. never: none."
+            help="Refine poses, so that neighbouring scans agree. auto: only where scans then "
+            "agree clearly better. always: all poses. never: none."
         ),
     ] = "auto"
     force: Annotated[
         bool,
         typer.Option(
             "--force",
-            help="Accept poses even if they jump between frames, if scans do not overlap under them, or if their calibration is missing.",
+            help="Accept poses even if they jump between frames, if scans do not overlap under "
+            "them, or if their calibration is missing.",
         ),
     ] = False
 
@@ -222,17 +268,22 @@ class WindowFlags(Flags):
         str | None,
         typer.Option(
             metavar="A:B",
-            help="First and last scan to merge, in frames relative to the current frame. Default: -30:30.",
+            help="First and last scan to merge, in frames relative to the current frame. Default: "
+            "-30:30.",
         ),
     ] = None
     dynamic: Annotated[
         Dynamic | None,
         typer.Option(
-            help="What happens to moving points. align: each actor is completed from all scans (default). current: only points of the frame"
-            " itself are used. drop: they are left out. tube: they stay where they were seen, which leaves ghost trails, as in SemanticKITTI."
+            help="What happens to moving points. align: each actor is completed from all scans "
+            "(default). current: only points of the frame"
+            " itself are used. drop: they are left out. tube: they stay where they were seen, "
+            "which leaves ghost trails, as in SemanticKITTI."
         ),
     ] = None
-    motion: Annotated[carlasc.motion.MotionSource | None, typer.Option(help=f"{MOTION_HELP} (default).")] = None
+    motion: Annotated[
+        carlasc.motion.MotionSource | None, typer.Option(help=f"{MOTION_HELP} (default).")
+    ] = None
 
     def from_scans(self, poses: carlasc.motion.PoseOptions) -> carlasc.FromScans:
         """Return how scans are merged, with the defaults of `FromScans` for what is not given."""
@@ -250,15 +301,20 @@ class ScanFlags(WindowFlags):
     """How scans are merged."""
 
     window_m: Annotated[
-        float | None, typer.Option(help="Merge only scans within this driven distance, in metres. Default: no limit.")
+        float | None,
+        typer.Option(
+            help="Merge only scans within this driven distance, in metres. Default: no limit."
+        ),
     ] = None
     stride: Annotated[
-        int | None, typer.Option(help="Merge every N-th scan of the window. Default: 1.", metavar="N")
+        int | None,
+        typer.Option(help="Merge every N-th scan of the window. Default: 1.", metavar="N"),
     ] = None
     complete: Annotated[
         Complete | None,
         typer.Option(
-            help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay unknown. mirror: one side is copied from the"
+            help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay "
+            "unknown. mirror: one side is copied from the"
             " other. body: like mirror, and the rest is copied from similar vehicles (default)."
         ),
     ] = None
@@ -266,21 +322,29 @@ class ScanFlags(WindowFlags):
         bool,
         typer.Option(
             "--no-own-path",
-            help="Do not count the space that the recording vehicle drove through as free. By default it counts as free, which removes ghost trails"
+            help="Do not count the space that the recording vehicle drove through as free. By "
+            "default it counts as free, which removes ghost trails"
             " there.",
         ),
     ] = False
     rays: Annotated[
         Rays | None,
         typer.Option(
-            help="Which rays of other scans are followed. all: every ray (default). enough: near the sensor, where rays are dense, only some of them."
+            help="Which rays of other scans are followed. all: every ray (default). enough: near "
+            "the sensor, where rays are dense, only some of them."
         ),
     ] = None
     min_range_m: Annotated[
-        float | None, typer.Option(help="Leave out nearer points, in metres. Default: the range in carlasc.json.")
+        float | None,
+        typer.Option(
+            help="Leave out nearer points, in metres. Default: the range in carlasc.json."
+        ),
     ] = None
     max_range_m: Annotated[
-        float | None, typer.Option(help="Leave out farther points, in metres. Default: the range in carlasc.json.")
+        float | None,
+        typer.Option(
+            help="Leave out farther points, in metres. Default: the range in carlasc.json."
+        ),
     ] = None
 
     def _given(self) -> dict[str, Any]:
@@ -298,7 +362,9 @@ def parse_window(text: str, option: str = "window") -> tuple[int, int]:
         return int(first), int(last)
     except ValueError:
         raise ArgumentError(
-            option, expected="A:B, in frames relative to the current frame, such as -30:30", found=repr(text)
+            option,
+            expected="A:B, in frames relative to the current frame, such as -30:30",
+            found=repr(text),
         ) from None
 
 

@@ -14,11 +14,16 @@ if TYPE_CHECKING:
 
 def info(
     source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, a capture, or a URL.")
+        str,
+        place_argument(
+            "A data set, a split, a sequence, a zip, a packed store, a capture, or a URL."
+        ),
     ] = ".",
     as_json: Json = False,
 ) -> None:
-    """List the contents of a data set: splits, sequences, frames, fields, grids and how they were made. No frame is read."""
+    """List the contents of a data set: splits, sequences, frames, fields, grids and how they were
+    made. No frame is read.
+    """
     overview = carlasc.info(source)
     if as_json:
         print_json(overview.to_dict())
@@ -31,27 +36,53 @@ def _print(overview: Overview) -> None:
 
     out = console()
     names = {name: number for name, number in overview.splits.items() if name != "none"}
-    splits = f" ({', '.join(f'{name} {number}' for name, number in names.items())})" if names else ""
+    splits = (
+        f" ({', '.join(f'{name} {number}' for name, number in names.items())})" if names else ""
+    )
     out.print(line(overview.location, "bold") + line(f": {overview.level} ({overview.store})"))
     if overview.sequences:
         size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
         out.print(line(f"{count(len(overview.sequences), 'sequence')}{splits}{size}"))
-        header = ("Sequence", "Frames", "Numbers", "Gaps", "Fields", "Grids", "Axes", "Classes", "Size")
+        header = (
+            "Sequence",
+            "Frames",
+            "Numbers",
+            "Gaps",
+            "Fields",
+            "Grids",
+            "Axes",
+            "Classes",
+            "Size",
+        )
         print_table(out, header, [_row(sequence) for sequence in overview.sequences], turn=False)
     for sequence in overview.sequences:
         if sequence.problem:
             out.print(line(f"{sequence.path or sequence.name}: {sequence.problem}"))
     if kinds := _kinds_of_grids(overview):
-        header = ("Grid", "Coordinates", "Voxels", "Voxel size", "Bounds", "Fields", "Sequences", "Frames", "Made")
+        header = (
+            "Grid",
+            "Coordinates",
+            "Voxels",
+            "Voxel size",
+            "Bounds",
+            "Fields",
+            "Sequences",
+            "Frames",
+            "Made",
+        )
         print_table(out, header, [_grid_row(grids) for grids in kinds])
     for capture in overview.captures:
-        span = f"{capture.first}..{capture.last}" + (f" with {count(capture.gaps, 'gap')}" if capture.gaps else "")
+        span = f"{capture.first}..{capture.last}" + (
+            f" with {count(capture.gaps, 'gap')}" if capture.gaps else ""
+        )
         text = f"raw capture {capture.path or '.'}: {count(capture.sensors, 'sensor')}, {count(capture.frames, 'frame')} ({span})"
         out.print(line(text))
 
 
 def _row(sequence: SequenceOverview) -> list[str]:
-    fields = [name if n == sequence.frames else f"{name} ({n})" for name, n in sequence.fields.items()]
+    fields = [
+        name if n == sequence.frames else f"{name} ({n})" for name, n in sequence.fields.items()
+    ]
     fields += [name.removesuffix(".txt") for name in sequence.documents if name.endswith(".txt")]
     return [
         sequence.path or sequence.name,
@@ -94,7 +125,9 @@ def _grid_row(grids: list[GridOverview]) -> list[str]:
 def _made(grid: GridOverview) -> str:
     if grid.made is None:
         return "published"
-    return ", ".join(f"{key} {value}" for key, value in grid.made.items() if isinstance(value, str | int | float))
+    return ", ".join(
+        f"{key} {value}" for key, value in grid.made.items() if isinstance(value, str | int | float)
+    )
 
 
 def _size(count: int) -> str:

@@ -16,12 +16,20 @@ from carlasc.errors import count
 def refine(
     poses: PoseFlags,
     run: RunFlags,
-    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")],
-    out: Annotated[str, place_option("-o", "--out", text="Folder of the data set with refined poses.")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")] = False,
+    source: Annotated[
+        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
+    ],
+    out: Annotated[
+        str, place_option("-o", "--out", text="Folder of the data set with refined poses.")
+    ],
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")
+    ] = False,
     json: Json = False,
 ) -> None:
-    """Write a copy of SOURCE with refined poses, so that neighbouring scans agree. SOURCE is not changed.
+    """Write a copy of SOURCE with refined poses, so that neighbouring scans agree.
+
+    SOURCE is not changed.
 
     Unchanged files are hard links. If it is interrupted, run the same command again to finish it.
     """
@@ -36,4 +44,7 @@ def refine(
     if result.left_out:
         echo(f"note: {', '.join(result.left_out)} left out, because of other poses")
     files = f"{count(result.linked, 'file')} linked, {result.files} written"
-    echo(f"{result.out}: poses of {len(result.refined)} of {count(len(result.sequences), 'sequence')} refined; {files}")
+    echo(
+        f"{result.out}: poses of {len(result.refined)} of "
+        f"{count(len(result.sequences), 'sequence')} refined; {files}"
+    )

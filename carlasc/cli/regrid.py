@@ -30,7 +30,8 @@ def regrid(
     source: Annotated[
         str,
         place_argument(
-            "A sequence with a raw capture or with scans, or a data set of such sequences: a folder or a URL.",
+            "A sequence with a raw capture or with scans, or a data set of such sequences: a "
+            "folder or a URL.",
             default="current folder",
         ),
     ] = ".",
@@ -39,31 +40,41 @@ def regrid(
         place_option(
             "-o",
             "--out",
-            text="Folder or URL to write to. Sequences keep their paths below SOURCE. Default: SOURCE.",
+            text="Folder or URL to write to. Sequences keep their paths below SOURCE. Default: "
+            "SOURCE.",
         ),
     ] = None,
     observe: Annotated[
         Observed | None,
         typer.Option(
-            help="What grids are made from: a raw capture, scans of one sensor merged over time, or a finer grid. Default: the capture if it exists,"
+            help="What grids are made from: a raw capture, scans of one sensor merged over time, "
+            "or a finer grid. Default: the capture if it exists,"
             " otherwise the scans.",
             show_default=False,
         ),
     ] = None,
     from_grid: Annotated[
-        str | None, typer.Option(help="With --observe grid: name of the finer grid. Default: the finest grid.")
+        str | None,
+        typer.Option(help="With --observe grid: name of the finer grid. Default: the finest grid."),
     ] = None,
     frames: FramesOption = None,
-    name: Annotated[str | None, typer.Option(help="Name of the grid's folder. Default: a name with its size.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the grid's folder. Default: a name with its size.")
+    ] = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Make ground truth at any resolution: from a raw capture, from the scans of one sensor merged over time, or from a finer grid.
+    """Make ground truth at any resolution: from a raw capture, from the scans of one sensor merged
+    over time, or from a finer grid.
 
-    Existing frames are skipped, so the same command continues an interrupted run. In the folder of a sequence, `carlasc regrid --res 0.2` is
-    enough.
+    Existing frames are skipped, so the same command continues an interrupted run. In the folder of
+    a sequence, `carlasc regrid --res 0.2` is enough.
     """
-    voting, chosen, spec = making.votes.voting(), _observe(observe, making, poses, from_grid), making.grid.spec()
+    voting, chosen, spec = (
+        making.votes.voting(),
+        _observe(observe, making, poses, from_grid),
+        making.grid.spec(),
+    )
     with run.spread("regrid") as spread:
         result = carlasc.regrid(
             source,
@@ -82,14 +93,21 @@ def regrid(
 def _observe(
     kind: Observed | None, making: GroundTruthFlags, poses: PoseFlags, grid: str | None
 ) -> carlasc.groundtruth.Observe | None:
-    """Return the `observe` argument. Without --observe, given options for scans or for a finer grid decide."""
+    """Return the `observe` argument.
+
+    Without --observe, given options for scans or for a finer grid decide.
+    """
     for_scans = making.scans.is_given or poses.is_given
     if kind is None and (for_scans or grid is not None):
         kind = "scans" if for_scans else "grid"
     if for_scans and kind != "scans":
-        raise ArgumentError("observe", expected="scans, because options for scans are given", found=str(kind))
+        raise ArgumentError(
+            "observe", expected="scans, because options for scans are given", found=str(kind)
+        )
     if grid is not None and kind != "grid":
-        raise ArgumentError("observe", expected="grid, because --from-grid is given", found=str(kind))
+        raise ArgumentError(
+            "observe", expected="grid, because --from-grid is given", found=str(kind)
+        )
     match kind:
         case "capture":
             return carlasc.FromCapture()

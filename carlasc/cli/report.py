@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import carlasc
-from carlasc.cli.common import Json, console, echo, file_option, line, place_argument, print_json, report_failures
+from carlasc.cli.common import (
+    Json,
+    console,
+    echo,
+    file_option,
+    line,
+    place_argument,
+    print_json,
+    report_failures,
+)
 from carlasc.cli.flags import WorkFlags
 
 if TYPE_CHECKING:
@@ -20,35 +29,53 @@ _SHOWN = 12
 
 def report(
     work: WorkFlags,
-    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
-    grid: Annotated[str | None, typer.Option(help="Only the grid of this name. Default: all grids.")] = None,
+    source: Annotated[
+        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
+    ] = ".",
+    grid: Annotated[
+        str | None, typer.Option(help="Only the grid of this name. Default: all grids.")
+    ] = None,
     html: Annotated[
         Path | None,
-        file_option("--html", metavar="FILE", text="Also write the reports as one page for a browser."),
+        file_option(
+            "--html", metavar="FILE", text="Also write the reports as one page for a browser."
+        ),
     ] = None,
     remake: Annotated[
-        bool, typer.Option("--remake", help="Make all reports from the files, also where reports exist.")
+        bool,
+        typer.Option("--remake", help="Make all reports from the files, also where reports exist."),
     ] = False,
     holdout: Annotated[
-        bool, typer.Option("--holdout", help="Also measure held-out rays (see `carlasc validate --holdout`).")
+        bool,
+        typer.Option(
+            "--holdout", help="Also measure held-out rays (see `carlasc validate --holdout`)."
+        ),
     ] = False,
     save: Annotated[
         bool,
         typer.Option(
-            "--save", help="Write the reports into the folders of the grids (only of grids that carlasc made)."
+            "--save",
+            help="Write the reports into the folders of the grids (only of grids that carlasc "
+            "made).",
         ),
     ] = False,
-    everything: Annotated[bool, typer.Option("--all", help="Print all actors, not only the first twelve.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Print all actors, not only the first twelve.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Print the report of each grid: contents, settings, tracks of actors, and how much the grid changes with fewer scans.
+    """Print the report of each grid: contents, settings, tracks of actors, and how much the grid
+    changes with fewer scans.
 
-    `carlasc regrid` writes a report with each grid. For other grids, the report is made from their files.
+    `carlasc regrid` writes a report with each grid. For other grids, the report is made from their
+    files.
     """
     from carlasc.inspection.report_page import write_report_page
 
     with work.spread("report", "steps") as run:
-        result = carlasc.report(source, grid=grid, remake=remake, holdout=holdout, save=save, run=run)
+        result = carlasc.report(
+            source, grid=grid, remake=remake, holdout=holdout, save=save, run=run
+        )
     if html is not None:
         write_report_page(result, html)
     if as_json:
@@ -79,7 +106,9 @@ def _print_actors(actors: tuple[ActorTrack, ...], *, everything: bool) -> None:
     from carlasc.cli.tables import print_table
 
     shown = actors if everything else actors[:_SHOWN]
-    header = "Actor|Instance|Frames|Observations|Points|m/s|Size m|Residual m|Static m|Sure".split("|")
+    header = "Actor|Instance|Frames|Observations|Points|m/s|Size m|Residual m|Static m|Sure".split(
+        "|"
+    )
     rows = [
         [
             actor.label,

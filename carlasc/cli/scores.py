@@ -12,14 +12,21 @@ from carlasc.cli.common import Overwrite, console, echo
 
 
 def scores(
-    files: Annotated[list[Path], typer.Argument(help="JSON files that `carlasc evaluate --json` printed.")],
+    files: Annotated[
+        list[Path], typer.Argument(help="JSON files that `carlasc evaluate --json` printed.")
+    ],
     format: Annotated[
         Literal["text", "markdown", "latex", "html"] | None,
         typer.Option(help="Format of the table. Default: by the ending of OUT, otherwise text."),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write. Default: print the table.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File to write. Default: print the table.")
+    ] = None,
     mixed: Annotated[
-        bool, typer.Option("--mixed", help="Allow results by different conventions, which cannot be compared.")
+        bool,
+        typer.Option(
+            "--mixed", help="Allow results by different conventions, which cannot be compared."
+        ),
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
@@ -44,7 +51,9 @@ def scores(
         return
     if out.exists() and not overwrite:
         raise ConflictError(
-            out, problem="the file exists", advice="choose another name, or replace it with `overwrite=True`"
+            out,
+            problem="the file exists",
+            advice="choose another name, or replace it with `overwrite=True`",
         )
     from carlasc.storage.files import write_output
 

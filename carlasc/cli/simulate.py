@@ -19,17 +19,21 @@ def simulate(
     *,
     out: OutArgument,
     count: Annotated[int, typer.Option(help="Number of frames, 0.1 s apart.", min=1)] = 20,
-    first_frame: Annotated[int, typer.Option(help="Number of the first frame. The drive starts at 0.", min=0)] = 0,
+    first_frame: Annotated[
+        int, typer.Option(help="Number of the first frame. The drive starts at 0.", min=0)
+    ] = 0,
     cameras: CamerasOption = "",
     grid: GridFlags,
     json: Json = False,
     sensors: SensorFlags,
     run: RunFlags,
 ) -> None:
-    """Simulate a drive through a town, and write a raw capture (the scans of all sensors), or scans and ground truth.
+    """Simulate a drive through a town, and write a raw capture (the scans of all sensors), or scans
+    and ground truth.
 
-    If OUT is a .zarr store, or a grid is given (--res, --size, --preset), the scans of the ego sensor and the ground truth of all sensors are
-    written instead of a raw capture. A second run with the same options writes only the missing frames.
+    If OUT is a .zarr store, or a grid is given (--res, --size, --preset), the scans of the ego
+    sensor and the ground truth of all sensors are written instead of a raw capture. A second run
+    with the same options writes only the missing frames.
     """
     drive = {"count": count, "first_frame": first_frame, **sensors.arguments()}
     drive["cameras"] = camera_names(cameras)
@@ -51,10 +55,14 @@ def _print_capture(result: carlasc.captures.SimulationResult) -> None:
         "class",
         "points",
         "share",
-        title=f"{result.out}: {count_of(result.count, 'frame')} of {count_of(result.sensors, 'sensor')}",
+        title=f"{result.out}: {count_of(result.count, 'frame')} of "
+        f"{count_of(result.sensors, 'sensor')}",
     )
     total = sum(result.classes.values())
     for name, points_of_class in sorted(result.classes.items(), key=lambda item: -item[1]):
         table.add_row(name, f"{points_of_class:,}", f"{points_of_class / total:.2%}")
     console().print(table)
-    console().print(f"{count_of(result.written, 'frame')} written, {result.count - result.written} existed already")
+    console().print(
+        f"{count_of(result.written, 'frame')} written, {result.count - result.written} existed "
+        f"already"
+    )

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 import carlasc
-from carlasc.cli.common import Json, console, echo, file_option, line, place_argument, print_json, report_failures
+from carlasc.cli.common import (
+    Json,
+    console,
+    echo,
+    file_option,
+    line,
+    place_argument,
+    print_json,
+    report_failures,
+)
 from carlasc.cli.flags import OneWorkerFlags
 from carlasc.errors import count
 
@@ -21,30 +30,46 @@ _KINDS: tuple[Kind, ...] = ("points", "voxels")
 
 def stats(
     work: OneWorkerFlags,
-    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
+    source: Annotated[
+        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
+    ] = ".",
     by: Annotated[
         Literal["total", "split", "sequence"],
-        typer.Option(help="Print shares of the whole (total), and also of each split or of each sequence."),
+        typer.Option(
+            help="Print shares of the whole (total), and also of each split or of each sequence."
+        ),
     ] = "split",
     grid: Annotated[
-        str, typer.Option(help="Grid whose voxels are counted. A sequence that has only one grid uses that one.")
+        str,
+        typer.Option(
+            help="Grid whose voxels are counted. A sequence that has only one grid uses that one."
+        ),
     ] = "evaluation",
     remap: Annotated[
-        str, typer.Option(help="Classes of the second table: auto, none (no table), carlasc11, semantickitti19, ...")
+        str,
+        typer.Option(
+            help="Classes of the second table: auto, none (no table), carlasc11, semantickitti19, "
+            "..."
+        ),
     ] = "auto",
     every: Annotated[int, typer.Option(metavar="N", help="Count only every N-th frame.")] = 1,
     plot: Annotated[
-        Path | None, file_option("--plot", text="Also draw the histograms to this .png, .svg or .pdf file.")
+        Path | None,
+        file_option("--plot", text="Also draw the histograms to this .png, .svg or .pdf file."),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Count the classes of points and of known voxels, and compute class weights: as tables, a plot or JSON."""
+    """Count the classes of points and of known voxels, and compute class weights: as tables, a plot
+    or JSON.
+    """
     from carlasc.inspection.charts import check_plot, draw_histograms
 
     if plot is not None:  # before counting, which may take hours
         check_plot(plot)
     with work.spread("Counting", usual=1) as run:
-        result = carlasc.stats(source, grid=grid, remap=None if remap == "none" else remap, every=every, run=run)
+        result = carlasc.stats(
+            source, grid=grid, remap=None if remap == "none" else remap, every=every, run=run
+        )
     if plot is not None:
         draw_histograms(result, plot)
     if as_json:
@@ -79,23 +104,36 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
     else:
         out.print(line("no voxels counted: choose a grid with --grid (`carlasc info` lists them)"))
     if total.actor_voxels:
-        out.print(line(f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} of them move"))
+        out.print(
+            line(
+                f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} of them "
+                f"move"
+            )
+        )
 
 
 def _class_table(
     result: Statistics, classes: ClassTable, splits: dict[str, Histogram], *, remapped: bool
 ) -> tuple[list[str], list[list[str]]]:
-    """Return a header and a row per class: its counts, its shares in the whole and in each split, its weight."""
+    """Return a header and a row per class: its counts, its shares in the whole and in each split,
+    its weight.
+    """
     shares = [f"{split} {kind} %" for split in splits for kind in _KINDS]
     header = ["Class", *(text for kind in _KINDS for text in (kind, f"{kind} %")), *shares]
     totals = [_counts(result, result.total, kind, remapped) for kind in _KINDS]
-    parts = [_counts(result, histogram, kind, remapped) for histogram in splits.values() for kind in _KINDS]
+    parts = [
+        _counts(result, histogram, kind, remapped)
+        for histogram in splits.values()
+        for kind in _KINDS
+    ]
     weights = result.weights() if remapped or result.remap is None else {}
     header += ["weight"] if weights else []
     rows = []
     for name in classes.names.values():
         if any(counts[name] for counts in totals):
-            cells = [cell for counts in totals for cell in (f"{counts[name]:,}", _percent(counts, name))]
+            cells = [
+                cell for counts in totals for cell in (f"{counts[name]:,}", _percent(counts, name))
+            ]
             weight = [f"{weights[name]:.4f}"] if weights else []
             rows.append([name, *cells, *(_percent(counts, name) for counts in parts), *weight])
     return header, rows

@@ -1,4 +1,6 @@
-"""Tables for terminals of any width: a wide table is transposed or printed in parts, so that no word is broken."""
+"""Tables for terminals of any width: a wide table is transposed or printed in parts, so that no
+word is broken.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,18 @@ Column = tuple[str, ...]  # the header and the cells
 
 
 def print_table(
-    console: Console, header: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", turn: bool = True
+    console: Console,
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    title: str = "",
+    turn: bool = True,
 ) -> None:
     """Print a table whose first column holds the names of the rows.
 
-    A table with more than ten columns beside the first, or one that is wider than the terminal, is transposed. If it is still too wide, it is
-    printed in several parts, each of which starts with the first column.
+    A table with more than ten columns beside the first, or one that is wider than the terminal, is
+    transposed. If it is still too wide, it is printed in several parts, each of which starts with
+    the first column.
 
     Args:
         console: where to print; its width is that of the terminal.
@@ -38,16 +46,29 @@ def print_table(
     title, header = printable(title), [printable(name) for name in header]
     rows = [[printable(cell) for cell in row] for row in rows]  # names come from data
     columns: list[Column] = list(zip(header, *rows, strict=True))
-    if turn and rows and (len(columns) - 1 > _MOST_COLUMNS or _least_width(columns) > console.width):
-        names = [header[0], *(row[0].replace("/", "/\n") for row in rows)]  # paths are too long for a column
-        columns = [(name, *cells[1:]) for name, cells in zip(names, [tuple(header), *map(tuple, rows)], strict=True)]
+    if (
+        turn
+        and rows
+        and (len(columns) - 1 > _MOST_COLUMNS or _least_width(columns) > console.width)
+    ):
+        # paths are too long for a column
+        names = [
+            header[0],
+            *(row[0].replace("/", "/\n") for row in rows),
+        ]
+        columns = [
+            (name, *cells[1:])
+            for name, cells in zip(names, [tuple(header), *map(tuple, rows)], strict=True)
+        ]
     if title:  # rich would wrap it at the width of the table
         console.print(Text(title, style="italic"))
     for chosen in _split(columns, console.width):
         table = Table()
         for column, width in zip(chosen, _widths(chosen, console.width), strict=True):
             right = column is not chosen[0] and all(_NUMBER.fullmatch(cell) for cell in column[1:])
-            table.add_column(Text(column[0]), width=width, overflow="fold", justify="right" if right else "left")
+            table.add_column(
+                Text(column[0]), width=width, overflow="fold", justify="right" if right else "left"
+            )
         for cells in zip(*(column[1:] for column in chosen), strict=True):
             table.add_row(*map(Text, cells))
         console.print(table)
@@ -80,10 +101,14 @@ def _most(texts: Column) -> int:
 
 
 def _widths(columns: list[Column], width: int) -> list[int]:
-    """Return the width of each column: the least that it needs, and for columns with longer texts a part of the rest."""
+    """Return the width of each column: the least that it needs, and for columns with longer texts a
+    part of the rest.
+    """
     widths = [_least(column) for column in columns]
     spare = width - _least_width(columns)
-    while spare > 0 and (short := [i for i, column in enumerate(columns) if widths[i] < _most(column)]):
+    while spare > 0 and (
+        short := [i for i, column in enumerate(columns) if widths[i] < _most(column)]
+    ):
         for index in short[:spare]:
             widths[index] += 1
         spare -= len(short)

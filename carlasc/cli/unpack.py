@@ -17,7 +17,11 @@ def unpack(
     source: Annotated[str, place_argument("Packed store, zip or URL.")],
     out: Annotated[str, place_argument("Folder to write.", "OUT")],
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write into an existing folder, and replace files of the same names.")
+        bool,
+        typer.Option(
+            "--overwrite",
+            help="Write into an existing folder, and replace files of the same names.",
+        ),
     ] = False,
     json: Json = False,
 ) -> None:
@@ -31,4 +35,7 @@ def unpack(
         print_json(result)
     else:
         kept = f" ({result.kept} were written by an earlier run)" if result.kept else ""
-        echo(f"{result.out}: {count(len(result.sequences), 'sequence')}, {count(result.files, 'file')} written{kept}")
+        echo(
+            f"{result.out}: {count(len(result.sequences), 'sequence')}, "
+            f"{count(result.files, 'file')} written{kept}"
+        )

@@ -40,7 +40,8 @@ class HoldoutFlags(Flags):
         bool,
         typer.Option(
             "--holdout",
-            help="Also leave scans out, make grids from the other scans, and compare the rays of the left-out scans with these grids (by default"
+            help="Also leave scans out, make grids from the other scans, and compare the rays of "
+            "the left-out scans with these grids (by default"
             " in one process per core).",
         ),
     ] = False
@@ -58,16 +59,20 @@ class HoldoutGridFlags(GridFlags):
 
 def validate(
     *,
-    source: Annotated[str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")] = ".",
+    source: Annotated[
+        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
+    ] = ".",
     every: Annotated[
         int | None,
         typer.Option(
-            metavar="N", help="Read the contents of every N-th frame. Default: about forty frames per sequence."
+            metavar="N",
+            help="Read the contents of every N-th frame. Default: about forty frames per sequence.",
         ),
     ] = None,
     full: Annotated[bool, typer.Option("--full", help="Read the contents of all frames.")] = False,
     everything: Annotated[
-        bool, typer.Option("--all", help="Print all findings, not only the first three of each kind.")
+        bool,
+        typer.Option("--all", help="Print all findings, not only the first three of each kind."),
     ] = False,
     as_json: Json = False,
     holdout: HoldoutFlags,
@@ -75,16 +80,24 @@ def validate(
     scans: WindowFlags,
     work: OneWorkerFlags,
 ) -> None:
-    """Check a data set: files, poses, times, and whether scans agree with poses and grids. The exit code is 1 if there is an error.
+    """Check a data set: files, poses, times, and whether scans agree with poses and grids.
 
-    It finds files of the wrong size, labels without votes, unknown classes, poses that are not rigid or jump, and gaps. By comparing scans
-    with poses and grids, it recognizes a mirrored y axis, poses of a camera, transposed rotations, and a grid shifted by one voxel.
+    The exit code is 1 if there is an error.
+
+    It finds files of the wrong size, labels without votes, unknown classes, poses that are not
+    rigid or jump, and gaps. By comparing scans with poses and grids, it recognizes a mirrored y
+    axis, poses of a camera, transposed rotations, and a grid shifted by one voxel.
     """
     if full and every is not None:
-        raise ArgumentError("every", expected="only one of --every and --full", found="both", advice="leave one out")
+        raise ArgumentError(
+            "every", expected="only one of --every and --full", found="both", advice="leave one out"
+        )
     if not holdout.holdout and (holdout.is_given or grid.is_given or scans.is_given):
         raise ArgumentError(
-            "holdout", expected="--holdout, because its options are given", found="none", advice="give `holdout`"
+            "holdout",
+            expected="--holdout, because its options are given",
+            found="none",
+            advice="give `holdout`",
         )
     spec, observe = grid.spec_or_published(), scans.from_scans(carlasc.motion.PoseOptions("file"))
     rays = None
@@ -93,7 +106,9 @@ def validate(
     if holdout.holdout:
         left_out = holdout.holdout_every or carlasc.inspection.EVERY
         with work.spread("Leaving scans out") as run:
-            rays = carlasc.inspection.holdout(source, spec, observe=observe, every=left_out, run=run)
+            rays = carlasc.inspection.holdout(
+                source, spec, observe=observe, every=left_out, run=run
+            )
     if as_json:
         print_json(result.to_dict() | ({} if rays is None else {"holdout": rays.to_dict()}))
     else:
@@ -102,7 +117,9 @@ def validate(
             print_held_out(rays)
     if rays is not None:
         measured = sum(scores.frames for scores in rays.sequences.values()) + len(rays.failures)
-        report_failures([(failure.frame, failure.message) for failure in rays.failures], measured, "scans")
+        report_failures(
+            [(failure.frame, failure.message) for failure in rays.failures], measured, "scans"
+        )
     if not result.ok:
         raise typer.Exit(FAILED)
 
@@ -121,16 +138,22 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
             out.print(line(f"  ... and {len(findings) - len(shown)} more (--all prints them)"))
     for report in result.sequences:
         figures = [
-            f"{share:.1%} of points in voxels of their class ({grid})" for grid, share in report.voxel_share.items()
+            f"{share:.1%} of points in voxels of their class ({grid})"
+            for grid, share in report.voxel_share.items()
         ]
         if report.pose_share is not None:
-            figures.append(f"{report.pose_share:.1%} of a scan's structure overlaps that of an earlier scan")
+            figures.append(
+                f"{report.pose_share:.1%} of a scan's structure overlaps that of an earlier scan"
+            )
         if report.disagreement_m is not None and report.refined_m is not None:
             figures.append(
-                f"scans agree within {100 * report.disagreement_m:.1f} cm ({100 * report.refined_m:.1f} cm with refined poses)"
+                f"scans agree within {100 * report.disagreement_m:.1f} cm "
+                f"({100 * report.refined_m:.1f} cm with refined poses)"
             )
         name = report.path or result.location
-        out.print(line(f"{name}: {count(report.frames, 'frame')}, {report.sampled} read"), soft_wrap=True)
+        out.print(
+            line(f"{name}: {count(report.frames, 'frame')}, {report.sampled} read"), soft_wrap=True
+        )
         for figure in figures:
             out.print(line(f"  {figure}"), soft_wrap=True)
         if report.mounting:
@@ -139,23 +162,31 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
         for camera, agreement in report.images.items():
             out.print(line(f"  images of {camera} on the scans: {agreement}"), soft_wrap=True)
     counts = ", ".join(count(result.count(severity), severity) for severity in SEVERITIES)
-    out.print(line(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold"), soft_wrap=True)
+    out.print(
+        line(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold"),
+        soft_wrap=True,
+    )
 
 
 def print_held_out(result: HoldoutResult) -> None:
-    """Print the scores of the held-out rays: of all sequences together, or of each if their classes differ."""
+    """Print the scores of the held-out rays: of all sequences together, or of each if their classes
+    differ.
+    """
     total = result.total
     parts = result.sequences if total is None else {result.location: total}
     for name, scores in parts.items():
         _print_scores(
-            f"{name or result.location}: held-out rays, {result.spec}, {count(scores.frames, 'scan')} left out", scores
+            f"{name or result.location}: held-out rays, {result.spec}, "
+            f"{count(scores.frames, 'scan')} left out",
+            scores,
         )
     for name, scores in result.given_poses.items():
         shares = scores.all
         figures = {"free": shares.free, "unknown": shares.unknown, "occupied": shares.occupied}
         text = ", ".join(f"{100 * (share or 0):.2f} % {where}" for where, share in figures.items())
         console().print(
-            line(f"{name or result.location}: under the given poses: returns in {text} voxels"), soft_wrap=True
+            line(f"{name or result.location}: under the given poses: returns in {text} voxels"),
+            soft_wrap=True,
         )
 
 
@@ -163,17 +194,40 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
     from carlasc.cli.tables import print_table
 
     out = console()
-    header = ["Rays", "Returns", "Free %", "Unknown %", "Occupied %", "Passed %", "Passed objects %", "Missed %"]
+    header = [
+        "Rays",
+        "Returns",
+        "Free %",
+        "Unknown %",
+        "Occupied %",
+        "Passed %",
+        "Passed objects %",
+        "Missed %",
+    ]
     header += ["Error m", "90 % m"]
     parts = {"all": scores.all, **scores.by_distance(), **scores.by_class()}
-    print_table(out, header, [_row(name, shares) for name, shares in parts.items()], title=title, turn=False)
+    print_table(
+        out, header, [_row(name, shares) for name, shares in parts.items()], title=title, turn=False
+    )
     if scores.swept_share is not None:
         text = f"{scores.swept_share:.2%} of the {scores.swept_voxels} voxels that the vehicle itself drove through are occupied"
         out.print(line(text))
 
 
 def _row(name: str, shares: RayShares) -> list[str]:
-    percent = [shares.free, shares.unknown, shares.occupied, shares.passed, shares.passed_object, shares.missed]
+    percent = [
+        shares.free,
+        shares.unknown,
+        shares.occupied,
+        shares.passed,
+        shares.passed_object,
+        shares.missed,
+    ]
     metres = [shares.error_median_m, shares.error_90_m]
     cells = ["" if value is None else f"{100 * value:.2f}" for value in percent]
-    return [name, str(shares.returns), *cells, *("" if value is None else f"{value:.2f}" for value in metres)]
+    return [
+        name,
+        str(shares.returns),
+        *cells,
+        *("" if value is None else f"{value:.2f}" for value in metres),
+    ]

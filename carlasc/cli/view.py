@@ -32,19 +32,29 @@ class SceneFlags(Flags):
     frames: FramesOption = None
     every: Annotated[int, typer.Option(help="Show only every N-th frame.", min=1)] = 1
     sequence: Annotated[
-        str | None, typer.Option(help="Name of the sequence, if SOURCE has several. Default: the first.")
+        str | None,
+        typer.Option(help="Name of the sequence, if SOURCE has several. Default: the first."),
     ] = None
-    grid: Annotated[str | None, typer.Option(help="Name of the grid. Default: evaluation, or the first grid.")] = None
+    grid: Annotated[
+        str | None, typer.Option(help="Name of the grid. Default: evaluation, or the first grid.")
+    ] = None
     truth: Annotated[
         str | None,
-        place_option("--truth", text="Ground truth of SOURCE, which is then shown as a prediction with its errors."),
+        place_option(
+            "--truth",
+            text="Ground truth of SOURCE, which is then shown as a prediction with its errors.",
+        ),
     ] = None
     truth_grid: Annotated[
-        str | None, typer.Option(help="Name of the grid with the ground truth. Default: as for --grid.")
+        str | None,
+        typer.Option(help="Name of the grid with the ground truth. Default: as for --grid."),
     ] = None
     classes: Annotated[
         str | None,
-        typer.Option(help="Class table to show, such as carlasc11 (the paper's eleven). Default: that of the data."),
+        typer.Option(
+            help="Class table to show, such as carlasc11 (the paper's eleven). Default: that of "
+            "the data."
+        ),
     ] = None
     source_classes: SourceClassesOption = None
 
@@ -63,7 +73,8 @@ def view(
     source: Annotated[
         str,
         place_argument(
-            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the file of one frame."
+            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or "
+            "the file of one frame."
         ),
     ],
     out: Annotated[
@@ -72,50 +83,68 @@ def view(
             "-o",
             "--out",
             "--to",
-            text="File to write instead of opening a window: an .html page for any browser, an .rrd recording for Rerun, or an .mcap recording for"
+            text="File to write instead of opening a window: an .html page for any browser, an "
+            ".rrd recording for Rerun, or an .mcap recording for"
             " Foxglove. A name without an ending is the folder of a page for a web server.",
         ),
     ] = None,
     palette: Annotated[
         Literal["class", "colorblind"],
-        typer.Option(help="class: colours of the class table. colorblind: colours for colour-blind readers."),
+        typer.Option(
+            help="class: colours of the class table. colorblind: colours for colour-blind readers."
+        ),
     ] = "class",
     thin_m: Annotated[
-        float, typer.Option("--thin", help="Keep one point of a page per cell of this side length, in metres.")
+        float,
+        typer.Option(
+            "--thin", help="Keep one point of a page per cell of this side length, in metres."
+        ),
     ] = 0.2,
     full_points: Annotated[
         bool,
         typer.Option(
             "--full-points",
-            help="Keep all points in a recording, and print its expected size first. Default: 30,000 points per frame.",
+            help="Keep all points in a recording, and print its expected size first. Default: "
+            "30,000 points per frame.",
         ),
     ] = False,
     beside: Annotated[
         str | None,
         place_option(
-            "--beside", text="Another run of the sequence, shown in the page on the other side of a movable divider."
+            "--beside",
+            text="Another run of the sequence, shown in the page on the other side of a movable "
+            "divider.",
         ),
     ] = None,
     beside_grid: Annotated[
         str | None,
         typer.Option(
-            "--beside-grid", help="Name of the grid of the other run. Without --beside: another grid of SOURCE."
+            "--beside-grid",
+            help="Name of the grid of the other run. Without --beside: another grid of SOURCE.",
         ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing file.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Show a sequence in a window (Open3D), or write it as a page for any browser or as a recording for Rerun or Foxglove (--out).
+    """Show a sequence in a window (Open3D), or write it as a page for any browser or as a recording
+    for Rerun or Foxglove (--out).
 
-    In all of them, you can rotate and zoom, step through the frames, and show or hide the grid, points, scene flow and classes.
-    Without --frames, a file shows the first 60 frames; a window and the folder of a page show all frames.
+    In all of them, you can rotate and zoom, step through the frames, and show or hide the grid,
+    points, scene flow and classes. Without --frames, a file shows the first 60 frames; a window and
+    the folder of a page show all frames.
     """
     shown = scene.scene(source, palette)
     if out is None:
         if as_json:
-            raise ArgumentError("--json", problem="a window prints no result", advice="write a page with `out`")
+            raise ArgumentError(
+                "--json", problem="a window prints no result", advice="write a page with `out`"
+            )
         if beside is not None or beside_grid is not None:
-            raise ArgumentError("--beside", problem="a window shows only one run", advice="write a page with `out`")
+            raise ArgumentError(
+                "--beside", problem="a window shows only one run", advice="write a page with `out`"
+            )
         carlasc.view(shown, report=echo)
         return
     with progress_bar("Writing the file") as progress:

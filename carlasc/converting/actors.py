@@ -1,7 +1,8 @@
-"""The motion of the numbered actors of a recording: their points are collected while scans are read, then their paths are estimated.
+"""The motion of the numbered actors of a recording: their points are collected while scans are
+read, then their paths are estimated.
 
-A path is estimated when its actor was not seen for a while, and only its velocities are kept. Except for the result, memory therefore does not
-grow with the length of the recording.
+A path is estimated when its actor was not seen for a while, and only its velocities are kept.
+Except for the result, memory therefore does not grow with the length of the recording.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ def find_actors(
     instances: NDArray[np.uint32],
     classes: ClassTable,
 ) -> tuple[ActorObservation, ...]:
-    """Return the numbered actors of a scan that may move: those of moving classes, or of movable classes if the table has no moving ones.
+    """Return the numbered actors of a scan that may move: those of moving classes, or of movable
+    classes if the table has no moving ones.
 
     Args:
         points: (N, 4) x, y, z in metres and remission.
@@ -58,13 +60,17 @@ def find_actors(
         instances: (N,) number of each point's actor, 0 for none.
         classes: table of the ids.
     """
-    wanted = np.flatnonzero((instances > 0) & np.isin(labels, sorted(classes.moving or classes.movable)))
+    wanted = np.flatnonzero(
+        (instances > 0) & np.isin(labels, sorted(classes.moving or classes.movable))
+    )
     wanted = wanted[(np.abs(points[wanted, :3]) < _FARTHEST_M).all(axis=1)]
     order = wanted[np.argsort(instances[wanted], kind="stable")]
     groups = np.split(order, np.flatnonzero(np.diff(instances[order])) + 1) if len(order) else []
     return tuple(
         ActorObservation(
-            int(instances[own[0]]), int(np.bincount(labels[own]).argmax()), thin(points[own, :3], _MAX_POINTS)
+            int(instances[own[0]]),
+            int(np.bincount(labels[own]).argmax()),
+            thin(points[own, :3], _MAX_POINTS),
         )
         for own in groups
     )
@@ -100,7 +106,9 @@ class _VelocityEstimate:
     def __call__(self, chain: _ObservationChain) -> list[Velocity]:
         """Return the velocity in each frame of a chain, in the sensor frame of that frame."""
         poses, seconds = np.stack(chain.poses), np.array(chain.seconds)
-        observations = [transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)]
+        observations = [
+            transform_points(pose, points) for pose, points in zip(poses, chain.points, strict=True)
+        ]
         rigid = chain.label not in self.classes.deformable
         positions, velocities, headings = estimate_path(observations, seconds, rigid=rigid)
         if not self.classes.moving and is_static(observations, positions, headings, seconds):
@@ -125,7 +133,13 @@ class ActorMotion:
         self._ended: list[_ObservationChain] = []
         self._velocities: dict[int, dict[int, Velocity]] = {}
 
-    def add(self, frame: int, seconds: float, first_T_sensor: Transform, actors: Iterable[ActorObservation]) -> None:
+    def add(
+        self,
+        frame: int,
+        seconds: float,
+        first_T_sensor: Transform,
+        actors: Iterable[ActorObservation],
+    ) -> None:
         """Add the actors of the next frame.
 
         Args:
@@ -136,7 +150,11 @@ class ActorMotion:
         """
         for observation in actors:
             chain = self._chains.get(observation.actor)
-            if chain is None or frame - chain.frames[-1] > _MAX_GAP or len(chain.frames) >= _MAX_OBSERVATIONS:
+            if (
+                chain is None
+                or frame - chain.frames[-1] > _MAX_GAP
+                or len(chain.frames) >= _MAX_OBSERVATIONS
+            ):
                 self._ended += [] if chain is None else [chain]
                 chain = self._chains[observation.actor] = _ObservationChain(observation.actor)
             chain.label_counts[observation.label] = chain.label_counts.get(observation.label, 0) + 1
@@ -144,7 +162,9 @@ class ActorMotion:
             chain.seconds.append(seconds)
             chain.poses.append(first_T_sensor)
             chain.points.append(observation.points)
-        for actor in [actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > _MAX_GAP]:
+        for actor in [
+            actor for actor, chain in self._chains.items() if frame - chain.frames[-1] > _MAX_GAP
+        ]:
             self._ended.append(self._chains.pop(actor))
         if len(self._ended) >= _BATCH:
             self._run()
@@ -157,7 +177,8 @@ class ActorMotion:
         return self._velocities
 
     def _run(self) -> None:
-        chains = sorted(self._ended, key=_ObservationChain.size, reverse=True)  # longest first: no worker ends late
+        # longest first: no worker ends late
+        chains = sorted(self._ended, key=_ObservationChain.size, reverse=True)
         self._ended = []
         with closing(run_all(self._estimate, chains, self._run_options)) as estimates:
             for chain, velocities in zip(chains, estimates, strict=True):

@@ -1,4 +1,6 @@
-"""The clouds of a frame as one scan: in the frame of the layout, at one instant, with the origin of each ray."""
+"""The clouds of a frame as one scan: in the frame of the layout, at one instant, with the origin of
+each ray.
+"""
 
 from __future__ import annotations
 
@@ -75,22 +77,29 @@ def read_scan(handle: FrameHandle, rig: Rig, motion: VehicleMotion | None) -> As
         motion: the motion of the vehicle around the frame; None if it is not known.
 
     Raises:
-        CarlascError: the frame cannot be read. Other exceptions of a converter become a FormatError.
+        CarlascError: the frame cannot be read. Other exceptions of a converter become a
+            FormatError.
     """
     try:
         clouds = handle.read()
     except (CarlascError, OSError, MemoryError):
         raise
     except Exception as error:
-        problem, advice = f"the converter failed: {describe(error)}", "check the file, or report the error"
+        problem, advice = (
+            f"the converter failed: {describe(error)}",
+            "check the file, or report the error",
+        )
         raise FormatError(handle.location, problem=problem, advice=advice) from error
     return assemble(clouds, rig, motion, handle.location)
 
 
-def assemble(clouds: Sequence[Cloud], rig: Rig, motion: VehicleMotion | None, where: str) -> Assembled:
+def assemble(
+    clouds: Sequence[Cloud], rig: Rig, motion: VehicleMotion | None, where: str
+) -> Assembled:
     """Put the clouds of a frame together, in their order. Every point is kept.
 
-    Points are corrected for the motion of the vehicle, to the time of the frame, if their times and the motion are known.
+    Points are corrected for the motion of the vehicle, to the time of the frame, if their times and
+    the motion are known.
 
     Args:
         clouds: at least one.
@@ -99,7 +108,8 @@ def assemble(clouds: Sequence[Cloud], rig: Rig, motion: VehicleMotion | None, wh
         where: the frame, for errors.
 
     Raises:
-        FormatError: a cloud names a sensor that does not exist, or its fields do not fit its points.
+        FormatError: a cloud names a sensor that does not exist, or its fields do not fit its
+            points.
     """
     if not clouds:
         raise FormatError(where, expected="points of at least one sensor", found="none")
@@ -109,12 +119,17 @@ def assemble(clouds: Sequence[Cloud], rig: Rig, motion: VehicleMotion | None, wh
     points = np.concatenate([points for points, _ in placed]) if len(placed) > 1 else placed[0][0]
     fields: dict[str, NDArray[Any]] = {}
     if len(rig.sensors) > 1:
-        fields["sensor"] = np.concatenate([np.full(len(cloud.points), cloud.sensor, np.uint8) for cloud in clouds])
+        fields["sensor"] = np.concatenate(
+            [np.full(len(cloud.points), cloud.sensor, np.uint8) for cloud in clouds]
+        )
     seconds = _joined([cloud.seconds for cloud in clouds], clouds, np.float32)
     if seconds is not None:
         fields["seconds"] = seconds
-    # Either all frames of a recording have origins or none, also frames in which the vehicle is at rest.
-    if any(origins.any() for _, origins in placed) or any(_follows_motion(cloud, rig, motion) for cloud in clouds):
+    # Either all frames of a recording have origins or none, also frames in which the vehicle is at
+    # rest.
+    if any(origins.any() for _, origins in placed) or any(
+        _follows_motion(cloud, rig, motion) for cloud in clouds
+    ):
         fields["origins"] = np.concatenate([origins for _, origins in placed])
     for name in clouds[0].others:
         fields[name] = np.concatenate([_other(cloud, name, rig, where) for cloud in clouds])
@@ -129,11 +144,22 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
         found = f"{cloud.points.shape} {cloud.points.dtype}"
         raise FormatError(f"{where}: points", expected="shape (N, 4) float32", found=found)
     if not 0 <= cloud.sensor < len(rig.sensors):
-        raise FormatError(where, expected=f"a sensor 0..{len(rig.sensors) - 1}", found=str(cloud.sensor))
-    fields = {"labels": cloud.labels, "instances": cloud.instances, "seconds": cloud.seconds, "origins": cloud.origins}
+        raise FormatError(
+            where, expected=f"a sensor 0..{len(rig.sensors) - 1}", found=str(cloud.sensor)
+        )
+    fields = {
+        "labels": cloud.labels,
+        "instances": cloud.instances,
+        "seconds": cloud.seconds,
+        "origins": cloud.origins,
+    }
     for name, values in (fields | dict(cloud.others)).items():
         if values is not None and len(values) != count:
-            raise FormatError(f"{where}: {name}", expected=f"one for each of {count} points", found=str(len(values)))
+            raise FormatError(
+                f"{where}: {name}",
+                expected=f"one for each of {count} points",
+                found=str(len(values)),
+            )
     if cloud.seconds is not None and not np.isfinite(cloud.seconds).all():
         found = f"NaN or infinity at point {int(np.argmin(np.isfinite(cloud.seconds)))}"
         raise FormatError(f"{where}: times of points", expected="finite numbers", found=found)
@@ -142,10 +168,16 @@ def _check(cloud: Cloud, rig: Rig, where: str) -> None:
 def _follows_motion(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> bool:
     """Return whether the position of the sensor is known for each point of a cloud."""
     sensor = rig.sensors[cloud.sensor]
-    return cloud.seconds is not None and motion is not None and (sensor.calibrated or not sensor.deskewed)
+    return (
+        cloud.seconds is not None
+        and motion is not None
+        and (sensor.calibrated or not sensor.deskewed)
+    )
 
 
-def _place(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _place(
+    cloud: Cloud, rig: Rig, motion: VehicleMotion | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the (N, 4) points and the (N, 3) origins of their rays, in the frame of the scan."""
     sensor = rig.sensors[cloud.sensor]
     scan_T_vehicle = invert(rig.vehicle_T_scan)
@@ -167,33 +199,41 @@ def _place(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> tuple[NDArra
     if cloud.origins is not None:
         origins = transform_points(scan_T_points, cloud.origins).astype(np.float32)
     else:
-        origins = _thinned((scan_T_then[:, :3, :3] @ sensor.origin + scan_T_then[:, :3, 3]), sensor, scan_T_points)[
-            tick_of
-        ]
+        origins = _thinned(
+            (scan_T_then[:, :3, :3] @ sensor.origin + scan_T_then[:, :3, 3]), sensor, scan_T_points
+        )[tick_of]
     return points, origins
 
 
 def _origin(sensor: Sensor, scan_T_points: Transform) -> NDArray[np.float32]:
-    """Return the position of a sensor in the frame of the scan; exactly the origin if it differs by rounding only."""
+    """Return the position of a sensor in the frame of the scan; exactly the origin if it differs by
+    rounding only.
+    """
     origin = transform_points(scan_T_points, sensor.origin)
     origin[np.abs(origin) < 1e-9] = 0
     return origin.astype(np.float32)
 
 
-def _thinned(path: NDArray[np.float64], sensor: Sensor, scan_T_points: Transform) -> NDArray[np.float32]:
+def _thinned(
+    path: NDArray[np.float64], sensor: Sensor, scan_T_points: Transform
+) -> NDArray[np.float32]:
     """Return (T, 3) positions of a sensor over a sweep; neighbours within `_APART_M` are equal."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     if length[-1] < _APART_M:
         return np.tile(_origin(sensor, scan_T_points), (len(path), 1))
     parts = np.ceil(length[-1] / _APART_M)
-    _, part = np.unique(np.minimum(np.floor(length / length[-1] * parts), parts - 1), return_inverse=True)
+    _, part = np.unique(
+        np.minimum(np.floor(length / length[-1] * parts), parts - 1), return_inverse=True
+    )
     counts = np.bincount(part)
     middle = np.stack([np.bincount(part, path[:, axis]) / counts for axis in range(3)], axis=1)
     return middle[part].astype(np.float32)
 
 
 def _moved(scan_T_points: Transform, points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return (N, 4) points in the frame of the scan; the same numbers where the frames are the same."""
+    """Return (N, 4) points in the frame of the scan; the same numbers where the frames are the
+    same.
+    """
     if np.array_equal(scan_T_points, np.eye(4)):
         return points
     moved = points.copy()
@@ -201,8 +241,12 @@ def _moved(scan_T_points: Transform, points: NDArray[np.float32]) -> NDArray[np.
     return moved
 
 
-def _joined(parts: Sequence[NDArray[Any] | None], clouds: Sequence[Cloud], dtype: type) -> NDArray[Any] | None:
-    """Return the values of all clouds; 0 for those of clouds that have none; None if no cloud has any."""
+def _joined(
+    parts: Sequence[NDArray[Any] | None], clouds: Sequence[Cloud], dtype: type
+) -> NDArray[Any] | None:
+    """Return the values of all clouds; 0 for those of clouds that have none; None if no cloud has
+    any.
+    """
     if all(part is None for part in parts):
         return None
     if len(parts) == 1:
@@ -217,7 +261,9 @@ def _joined(parts: Sequence[NDArray[Any] | None], clouds: Sequence[Cloud], dtype
 def _other(cloud: Cloud, name: str, rig: Rig, where: str) -> NDArray[Any]:
     if name not in cloud.others:
         sensor = rig.sensors[cloud.sensor].name
-        raise FormatError(where, expected=f"the field {name} from all sensors", found=f"none from {sensor}")
+        raise FormatError(
+            where, expected=f"the field {name} from all sensors", found=f"none from {sensor}"
+        )
     values = cloud.others[name]
     if layout.field_named(name).kind != "vector":
         return values

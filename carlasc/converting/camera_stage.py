@@ -36,19 +36,27 @@ def write_cameras(plan: RecordingPlan, target: AxesAndClasses, images: Images) -
     if plan.writer.read_document(layout.CAMERAS) != content:
         plan.writer.write_document(layout.CAMERAS, content)
     if images == "link" and not any(camera.images for camera in cameras):
-        return ["no camera has images in separate files to link to: --images copy writes the images"]
+        return [
+            "no camera has images in separate files to link to: --images copy writes the images"
+        ]
     return _copy_images(plan, cameras) if images == "copy" else []
 
 
-def _in_layout(camera: CameraModel, plan: RecordingPlan, target: AxesAndClasses, images: Images) -> CameraModel:
+def _in_layout(
+    camera: CameraModel, plan: RecordingPlan, target: AxesAndClasses, images: Images
+) -> CameraModel:
     scan_T_camera = invert(plan.rig.vehicle_T_scan) @ camera.sensor_T_camera
     place = _MIRROR @ scan_T_camera if target.mirrored else scan_T_camera
     times = None if camera.times is None else camera.times - plan.times[0]
-    return camera.replaced(sensor_T_camera=place, times=times, images=camera.images if images == "link" else None)
+    return camera.replaced(
+        sensor_T_camera=place, times=times, images=camera.images if images == "link" else None
+    )
 
 
 def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[str]:
-    """Copy the images of all frames, those that are stored together at once; return the number of missing images."""
+    """Copy the images of all frames, those that are stored together at once; return the number of
+    missing images.
+    """
     missing, blocks = 0, dict[int, list[int]]()
     for handle in plan.recording.frames:
         blocks.setdefault(handle.number // plan.writer.block, []).append(handle.number)
@@ -56,12 +64,21 @@ def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[st
         found: dict[int, dict[str, np.ndarray]] = {}
         for number in numbers:
             for camera in cameras:
-                if any(plan.writer.has(f"images.{camera.name}.{suffix}", number) for suffix in layout.IMAGE_SUFFIXES):
+                if any(
+                    plan.writer.has(f"images.{camera.name}.{suffix}", number)
+                    for suffix in layout.IMAGE_SUFFIXES
+                ):
                     continue
                 if (image := plan.recording.image(camera, number)) is None:
                     missing += 1
                     continue
-                found.setdefault(number, {})[f"images.{camera.name}.{image[0]}"] = np.frombuffer(image[1], np.uint8)
+                found.setdefault(number, {})[f"images.{camera.name}.{image[0]}"] = np.frombuffer(
+                    image[1], np.uint8
+                )
         if found:
             plan.writer.write_frames(found)
-    return [f"{missing} images of cameras do not exist, or are neither .jpg nor .png"] if missing else []
+    return (
+        [f"{missing} images of cameras do not exist, or are neither .jpg nor .png"]
+        if missing
+        else []
+    )

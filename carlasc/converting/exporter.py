@@ -1,12 +1,14 @@
 """The protocol of exporters: an exporter writes sequences in the format of another data set.
 
-Another distribution adds one by a class that inherits `FrameExporter` or `SequenceExporter`, and an entry point:
+Another distribution adds one by a class that inherits `FrameExporter` or `SequenceExporter`, and an
+entry point:
 
     [project.entry-points."carlasc.exporters"]
     name = "package.module:Class"
 
-The options of an exporter are the arguments of its constructor. It holds only values, so that it can be pickled into a worker.
-`carlasc.export` chooses the frames, calls workers, writes each file completely or not at all, and continues earlier runs.
+The options of an exporter are the arguments of its constructor. It holds only values, so that it
+can be pickled into a worker. `carlasc.export` chooses the frames, calls workers, writes each file
+completely or not at all, and continues earlier runs.
 """
 
 from __future__ import annotations
@@ -52,12 +54,18 @@ class Exporter(ABC):
 
     @property
     def product(self) -> str:
-        """What is written. Two products of an exporter have no files in common, so both may be written to one folder."""
+        """What is written.
+
+        Two products of an exporter have no files in common, so both may be written to one folder.
+        """
         return "data"
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """The values that the content of the files depends on, for JSON. A run does not continue one with other settings."""
+        """The values that the content of the files depends on, for JSON.
+
+        A run does not continue one with other settings.
+        """
         return vars(self)
 
     def check_output(self, source: str, root: Path) -> tuple[int, list[str]] | None:
@@ -77,7 +85,9 @@ class Exporter(ABC):
 
     @abstractmethod
     def folders(self, names: Sequence[str]) -> dict[str, str]:
-        """Return the folder of each sequence of a source, by the sequence's name, relative to the root of the other data set."""
+        """Return the folder of each sequence of a source, by the sequence's name, relative to the
+        root of the other data set.
+        """
 
     def check(self, sequence: storage.Sequence) -> list[str]:
         """Check that a sequence has what the export needs, before anything is written.
@@ -95,11 +105,15 @@ class Exporter(ABC):
         return sequence.scan_frames().tolist()
 
     def documents(self, sequence: storage.Sequence) -> Files:
-        """Return the files of a sequence that belong to no single frame, by their path in its folder."""
+        """Return the files of a sequence that belong to no single frame, by their path in its
+        folder.
+        """
         return {}
 
     def index(self, root: Path, exported: Sequence[Exported]) -> Files:
-        """Return the files that belong to no single sequence, by their path in `root`. They are written last.
+        """Return the files that belong to no single sequence, by their path in `root`.
+
+        They are written last.
 
         Args:
             root: folder of the other data set. It may hold sequences of earlier exports.
@@ -129,7 +143,8 @@ class SequenceFile(AbstractContextManager["SequenceFile"]):
 
     @abstractmethod
     def add(self, frame: int, content: Mapping[str, NDArray[Any]]) -> None:
-        """Write a frame, whose arrays have the shapes that `make_frame` gives them, (N, ...) for N points. Frames come in increasing order.
+        """Write a frame, whose arrays have the shapes that `make_frame` gives them, (N, ...) for N
+        points. Frames come in increasing order.
 
         Raises:
             CarlascError: the frame cannot be expressed in the format. Nothing of it is written.
@@ -137,7 +152,10 @@ class SequenceFile(AbstractContextManager["SequenceFile"]):
 
 
 class SequenceExporter(Exporter):
-    """Writes one file per sequence, with all of its frames. Frames are made in parallel, and written by one process."""
+    """Writes one file per sequence, with all of its frames.
+
+    Frames are made in parallel, and written by one process.
+    """
 
     @abstractmethod
     def file(self, sequence: storage.Sequence) -> str:
@@ -153,7 +171,10 @@ class SequenceExporter(Exporter):
 
     @abstractmethod
     def open(self, path: Path, sequence: storage.Sequence) -> SequenceFile:
-        """Open a new file to write to. It is renamed to its final name after all frames were added."""
+        """Open a new file to write to.
+
+        It is renamed to its final name after all frames were added.
+        """
 
     @abstractmethod
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Mapping[str, NDArray[Any]]:

@@ -14,7 +14,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from carlasc import storage
-from carlasc.converting.exporter import Exported, Exporter, FrameExporter, SequenceExporter, SequenceFile
+from carlasc.converting.exporter import (
+    Exported,
+    Exporter,
+    FrameExporter,
+    SequenceExporter,
+    SequenceFile,
+)
 from carlasc.converting.registry import load_exporter, read_options
 from carlasc.converting.results import ExportResult, Failure, check_outside
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
@@ -46,10 +52,11 @@ def export(
     options: Mapping[str, Any] | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ExportResult:
-    """Write sequences of the layout in the format of another data set, so that its tools can read them.
+    """Write sequences of the layout in the format of another data set, so that its tools can read
+    them.
 
-    A second run skips existing frames; if a format has one file per sequence, it skips complete sequences. A frame that cannot be written
-    is reported in the result, and the others are written.
+    A second run skips existing frames; if a format has one file per sequence, it skips complete
+    sequences. A frame that cannot be written is reported in the result, and the others are written.
 
     Args:
         name: the other data set: one of `exporter_names()`.
@@ -57,10 +64,11 @@ def export(
         out: folder to write to.
         sequences: names of the sequences to export; None exports all.
         overwrite: write existing frames again.
-        options: options of the exporter, by name, such as `{"grid": "evaluation"}`; text is parsed as the type of the option (see
-            `option_declarations`).
-        run: how the work is spread. A part exports a share of the frames, or of the sequences if each is one file. The last part to finish
-            writes the files that belong to no single sequence.
+        options: options of the exporter, by name, such as `{"grid": "evaluation"}`; text is parsed
+            as the type of the option (see `option_declarations`).
+        run: how the work is spread. A part exports a share of the frames, or of the sequences if
+            each is one file. The last part to finish writes the files that belong to no single
+            sequence.
 
     Returns:
         What was written, what was skipped, and what failed.
@@ -68,7 +76,8 @@ def export(
     Raises:
         ArgumentError: the exporter or its option does not exist.
         MissingDataError: a sequence does not exist, or lacks data that the export needs.
-        ConflictError: `out` lies inside `source`, or holds an export of other sequences or with other options.
+        ConflictError: `out` lies inside `source`, or holds an export of other sequences or with
+            other options.
         StorageError: the output cannot be written. The files written so far are complete.
     """
     start = time.perf_counter()
@@ -77,11 +86,14 @@ def export(
     root = Path(out)
     place = source.location if isinstance(source, storage.Source) else os.fspath(source)
     if (checked := exporter.check_output(place, root)) is not None:
-        return ExportResult(root, {}, 0, checked[0], (), tuple(checked[1]), time.perf_counter() - start)
+        return ExportResult(
+            root, {}, 0, checked[0], (), tuple(checked[1]), time.perf_counter() - start
+        )
     opened = storage.as_source(source)
     check_outside(root, opened.location)
     every = _by_name(opened)
-    folders = exporter.folders(list(every))  # of all sequences: names of folders do not depend on the choice
+    # of all sequences: names of folders do not depend on the choice
+    folders = exporter.folders(list(every))
     chosen, notes = [], []
     for sequence in _choose(every, sequences, opened.location):
         notes += exporter.check(sequence)
@@ -100,7 +112,9 @@ def export(
         writing = _SequenceExport(exporter, root, overwrite, pooled, steps)
         for exported in ours:
             writing.add(exported)
-    if run.part.count == 1 or all(_is_whole(exporter, exported, root / exported.folder) for exported in chosen):
+    if run.part.count == 1 or all(
+        _is_whole(exporter, exported, root / exported.folder) for exported in chosen
+    ):
         index = exporter.index(root, writing.exported if run.part.count == 1 else chosen)
         write_many({root / file: data for file, data in index.items()})
     written = sum(len(exported.frames) for exported in writing.exported)
@@ -116,15 +130,20 @@ def export(
 
 
 def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
-    """Return the sequences of a source by name. If a sequence has both coordinates, the Cartesian one is taken.
+    """Return the sequences of a source by name.
+
+    If a sequence has both coordinates, the Cartesian one is taken.
 
     Raises:
-        FormatError: two sequences have the same name, so that they would be written to the same place.
+        FormatError: two sequences have the same name, so that they would be written to the same
+            place.
     """
     found: dict[str, storage.Sequence] = {}
     for sequence in source.sequences().values():
         other = found.get(sequence.name)
-        if other is not None and (other.split != sequence.split or other.coordinates == sequence.coordinates):
+        if other is not None and (
+            other.split != sequence.split or other.coordinates == sequence.coordinates
+        ):
             raise FormatError(
                 source.location,
                 expected="sequences of different names",
@@ -141,23 +160,32 @@ def _choose(
 ) -> list[storage.Sequence]:
     if wanted is not None and (unknown := [name for name in wanted if name not in found]):
         raise MissingDataError(
-            location, expected=f"the sequences {', '.join(unknown)}", found=f"only {', '.join(found)}"
+            location,
+            expected=f"the sequences {', '.join(unknown)}",
+            found=f"only {', '.join(found)}",
         )
     return [sequence for name, sequence in found.items() if wanted is None or name in wanted]
 
 
 def _place(exporter: Exporter, exported: Exported) -> str:
-    """Return the place of one sequence only: its folder, or its file if several sequences share a folder."""
+    """Return the place of one sequence only: its folder, or its file if several sequences share a
+    folder.
+    """
     if isinstance(exporter, SequenceExporter):
         return PurePosixPath(exported.folder, exporter.file(exported.sequence)).as_posix()
     return exported.folder
 
 
 def _deal(exporter: Exporter, chosen: Sequence[Exported], part: Part) -> list[Exported]:
-    """Return the sequences of a part, each with its frames of that part. A sequence that is one file is in one part."""
+    """Return the sequences of a part, each with its frames of that part.
+
+    A sequence that is one file is in one part.
+    """
     if isinstance(exporter, SequenceExporter):
         return list(part.take(chosen))
-    dealt = set(part.take([(n, frame) for n, exported in enumerate(chosen) for frame in exported.frames]))
+    dealt = set(
+        part.take([(n, frame) for n, exported in enumerate(chosen) for frame in exported.frames])
+    )
     ours = [
         replace(exported, frames=tuple(frame for frame in exported.frames if (n, frame) in dealt))
         for n, exported in enumerate(chosen)
@@ -218,14 +246,25 @@ class _SequenceExport:
         """Export the frames of a sequence."""
         sequence, folder = exported.sequence, self.root / exported.folder
         remove_stale(folder)
-        write_many({folder / document: data for document, data in self.exporter.documents(sequence).items()})
+        write_many(
+            {
+                folder / document: data
+                for document, data in self.exporter.documents(sequence).items()
+            }
+        )
         write = self._write_frames if isinstance(self.exporter, FrameExporter) else self._write_file
         failures = write(exported, folder)
-        self.failures += [Failure(sequence.location, frame, message) for frame, message in failures.items()]
-        self.exported.append(replace(exported, frames=tuple(f for f in exported.frames if f not in failures)))
+        self.failures += [
+            Failure(sequence.location, frame, message) for frame, message in failures.items()
+        ]
+        self.exported.append(
+            replace(exported, frames=tuple(f for f in exported.frames if f not in failures))
+        )
 
     def _write_frames(self, exported: Exported, folder: Path) -> dict[int, str]:
-        """Write the missing frames of a sequence, each in its own files; return the messages of those that failed."""
+        """Write the missing frames of a sequence, each in its own files; return the messages of
+        those that failed.
+        """
         exporter, sequence = self.exporter, exported.sequence
         assert isinstance(exporter, FrameExporter)
         jobs = [
@@ -243,7 +282,8 @@ class _SequenceExport:
         return failures
 
     def _write_file(self, exported: Exported, folder: Path) -> dict[int, str]:
-        """Write the file of a sequence, unless it exists with all frames; return the messages of those that failed.
+        """Write the file of a sequence, unless it exists with all frames; return the messages of
+        those that failed.
 
         A file that lacks frames is written again.
         """
@@ -259,7 +299,10 @@ class _SequenceExport:
         try:
             make_folder(path.parent)
             part.unlink(missing_ok=True)  # of a run that was killed
-            with closing(self._made(_make_frame, jobs)) as results, exporter.open(part, sequence) as file:
+            with (
+                closing(self._made(_make_frame, jobs)) as results,
+                exporter.open(part, sequence) as file,
+            ):
                 for frame, made in zip(exported.frames, results, strict=True):
                     problem = made if isinstance(made, str) else _add(file, frame, made)
                     if problem is not None:
@@ -269,7 +312,9 @@ class _SequenceExport:
                 sync_tree(part)
                 rename(part, path)
         except OSError as error:
-            raise StorageError(path, problem=f"cannot be written: {error.strerror or error}") from error
+            raise StorageError(
+                path, problem=f"cannot be written: {error.strerror or error}"
+            ) from error
         finally:
             part.unlink(missing_ok=True)
         return failures
@@ -278,8 +323,12 @@ class _SequenceExport:
         self.skipped += frames
         self.steps(frames)
 
-    def _made(self, function: Callable[[ExportJob], Any], jobs: list[ExportJob]) -> Generator[Any, None, None]:
-        """Return the results of jobs: the arrays of a frame, or a message if the frame or its worker failed."""
+    def _made(
+        self, function: Callable[[ExportJob], Any], jobs: list[ExportJob]
+    ) -> Generator[Any, None, None]:
+        """Return the results of jobs: the arrays of a frame, or a message if the frame or its
+        worker failed.
+        """
         return run_all(function, jobs, self.run, lost=lambda job, message: message)
 
 
@@ -324,10 +373,13 @@ class ExportRecord:
 
     def __init__(self, root: Path, name: str, product: str) -> None:
         self._path, self._name, self._product = root / RECORD, name, product
-        self._all = parse_json(self._path.read_bytes(), str(self._path)) if has_content(self._path) else {}
+        self._all = (
+            parse_json(self._path.read_bytes(), str(self._path)) if has_content(self._path) else {}
+        )
 
     def check(self, sequences: Mapping[str, storage.Sequence], settings: Mapping[str, Any]) -> None:
-        """Check that the places of sequences in the folder are new, or hold the same sequences, exported with the same settings.
+        """Check that the places of sequences in the folder are new, or hold the same sequences,
+        exported with the same settings.
 
         Raises:
             ConflictError: a place holds something else.
@@ -356,7 +408,10 @@ class ExportRecord:
     def write(self, sequences: Mapping[str, storage.Sequence], settings: Mapping[str, Any]) -> None:
         """Add sequences to the record, by their places."""
         part = self._all.setdefault(self._name, {}).setdefault(self._product, {})
-        part |= {place: {"sequence": s.path, "settings": _plain(settings)} for place, s in sequences.items()}
+        part |= {
+            place: {"sequence": s.path, "settings": _plain(settings)}
+            for place, s in sequences.items()
+        }
         write_atomic(self._path, to_json(self._all))
 
 

@@ -1,4 +1,6 @@
-"""Options for the sequences of a conversion, and the ids and axes of a data set that follow from them."""
+"""Options for the sequences of a conversion, and the ids and axes of a data set that follow from
+them.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,15 @@ class LayoutOptions:
     """How a conversion writes sequences.
 
     Attributes:
-        classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table ("semantickitti") keeps its ids; "auto"
-            keeps those of SemanticKITTI, because its tools need them, and maps those of other data sets.
+        classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table
+            ("semantickitti") keeps its ids; "auto" keeps those of SemanticKITTI, because its tools
+            need them, and maps those of other data sets.
         axes: "left" mirrors y into CarlaSC's left-handed axes; "right" keeps the right-handed ones.
-        flow: "auto" gives points the velocity of their actor: from tracked boxes if the data set has them, otherwise estimated from
-            the points of numbered actors; "none" writes no flow.
+        flow: "auto" gives points the velocity of their actor: from tracked boxes if the data set
+            has them, otherwise estimated from the points of numbered actors; "none" writes no flow.
         allow_unknown: treat class ids that the table does not have as unlabelled.
-        images: images of cameras: "copy" copies them into the output, "link" writes their paths, "none" leaves them out. The calibration
-            of the cameras is always written.
+        images: images of cameras: "copy" copies them into the output, "link" writes their paths,
+            "none" leaves them out. The calibration of the cameras is always written.
 
     Raises:
         ArgumentError: an unknown value of `axes`, `flow` or `images`.
@@ -53,7 +56,8 @@ class LayoutOptions:
         """Return the axes and the classes in which the data of a converter are written.
 
         Raises:
-            ArgumentError: `classes` is neither "auto", "carla" nor the name of the converter's class table.
+            ArgumentError: `classes` is neither "auto", "carla" nor the name of the converter's
+                class table.
         """
         own = converter.classes.name
         check_choice("classes", self.classes, ("auto", "carla", own))
@@ -66,7 +70,9 @@ class LayoutOptions:
                 expected=f"{converter.classes.name}, because no map to CarlaSC's classes exists",
                 found="carla",
             )
-        return AxesAndClasses(converter.classes, converter.to_carla, self.axes == "left", self.allow_unknown)
+        return AxesAndClasses(
+            converter.classes, converter.to_carla, self.axes == "left", self.allow_unknown
+        )
 
 
 @dataclass(frozen=True)
@@ -94,10 +100,13 @@ class AxesAndClasses:
         """Return the ids that are written for the ids that were read.
 
         Raises:
-            FormatError: an id is unknown; the message names it and its frequency. `where` names the labels.
+            FormatError: an id is unknown; the message names it and its frequency. `where` names the
+                labels.
         """
         ids = self.source.names if self.remap is None else self.remap.mapping
-        lookup = _lookup_table(tuple(ids), tuple(ids if self.remap is None else self.remap.mapping.values()))
+        lookup = _lookup_table(
+            tuple(ids), tuple(ids if self.remap is None else self.remap.mapping.values())
+        )
         mapped = lookup[labels if labels.dtype.itemsize <= 2 else np.minimum(labels, _IDS - 1)]
         if mapped.size and int(mapped.max()) == _UNKNOWN:
             unknown = mapped == _UNKNOWN

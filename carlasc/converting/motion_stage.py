@@ -1,4 +1,5 @@
-"""The second stage of a conversion, in workers: fields that need the motion of actors are added to the scans of the first stage.
+"""The second stage of a conversion, in workers: fields that need the motion of actors are added to
+the scans of the first stage.
 
 Scans are read from the output, not from the data set again, if the store can read them.
 """
@@ -24,8 +25,18 @@ from carlasc.core.scans import Scan
 from carlasc.motion import Segment, Track, ground_points, segment_by_boxes
 
 _FAR_M = 100.0  # objects farther away than this are not filled in
-_CELLS_M = (0.25, 0.5, 1.0)  # cells around labelled points: the smallest cell with labelled points decides
-_GROUND_CELLS_M = (0.5, 1.0, 2.0)  # in the plane: on the ground, the rings of two scans may be metres apart
+# cells around labelled points: the smallest cell with labelled points decides
+_CELLS_M = (
+    0.25,
+    0.5,
+    1.0,
+)
+# in the plane: on the ground, the rings of two scans may be metres apart
+_GROUND_CELLS_M = (
+    0.5,
+    1.0,
+    2.0,
+)
 _HALF = 1 << 14  # cells to each side of the origin
 
 
@@ -36,10 +47,13 @@ class MotionJob(FrameJob):
     Attributes:
         first_T_scan: (4, 4) its pose.
         velocities: velocity of each moving actor, where actors are numbered.
-        tracks: the tracks of boxes at the frame, with classes of the target; None where the data set has no boxes.
-        boxes: the annotated boxes of the frame, right-handed, in the frame of the scan; None where it was not annotated.
+        tracks: the tracks of boxes at the frame, with classes of the target; None where the data
+            set has no boxes.
+        boxes: the annotated boxes of the frame, right-handed, in the frame of the scan; None where
+            it was not annotated.
         nearby: the labelled frames before and after it, if it has no labels and others have.
-        labelled: whether its points have labels in the data set. Those that an interrupted run made from boxes are made again.
+        labelled: whether its points have labels in the data set. Those that an interrupted run made
+            from boxes are made again.
     """
 
     first_T_scan: Transform = field(kw_only=True)
@@ -62,17 +76,23 @@ class MotionBlock(StageBlock[MotionJob]):
 
 
 def _read_back(job: MotionJob, block: MotionBlock, *names: str) -> Fields:
-    """Return the existing fields of a frame as they were written; labels only if they are from the data set."""
+    """Return the existing fields of a frame as they were written; labels only if they are from the
+    data set.
+    """
     number, writer = job.handle.number, block.writer
     wanted = [name for name in names if job.labelled or name != "labels"]
     written = {name: writer.read(name, number) for name in wanted if writer.has(name, number)}
     if writer.has("points", number) and all(array is not None for array in written.values()):
         return {name: array for name, array in written.items() if array is not None}
-    return make_fields(read_scan(job.handle, block.rig, job.motion), block.target, job.handle.location)
+    return make_fields(
+        read_scan(job.handle, block.rig, job.motion), block.target, job.handle.location
+    )
 
 
 def _by_instances(job: MotionJob, block: MotionBlock) -> Fields:
-    """Return the flow of a scan whose points have numbers: the velocity of each point's actor, zero for all other points."""
+    """Return the flow of a scan whose points have numbers: the velocity of each point's actor, zero
+    for all other points.
+    """
     written = _read_back(job, block, "instances") if block.flow else {}
     if "instances" not in written:
         return {}
@@ -85,14 +105,19 @@ def _by_instances(job: MotionJob, block: MotionBlock) -> Fields:
 
 
 def _by_boxes(job: MotionJob, block: MotionBlock) -> Fields:
-    """Return labels, instances, boxes and flow of a scan whose objects have boxes. Labels and instances of the data set are kept."""
+    """Return labels, instances, boxes and flow of a scan whose objects have boxes.
+
+    Labels and instances of the data set are kept.
+    """
     assert job.tracks is not None
     written = _read_back(job, block, "points", "labels", "instances")
     classes, mirrored = block.target.classes, block.target.mirrored
     points = mirror_points(written["points"]) if mirrored else written["points"]
     labels = written.get("labels")
     scan = Scan(np.ascontiguousarray(points[:, :3]), labels)
-    segments = segment_by_boxes(job.handle.number, scan, job.first_T_scan, job.tracks, ground=classes.ground)
+    segments = segment_by_boxes(
+        job.handle.number, scan, job.first_T_scan, job.tracks, ground=classes.ground
+    )
     fields: dict[str, NDArray[Any]] = {}
     if labels is None:
         fields["labels"] = _labels_of(scan.points, segments, classes, _labelled_nearby(job, block))
@@ -118,7 +143,9 @@ def _labels_of(
     classes: ClassTable,
     labelled: list[tuple[NDArray[np.float64], NDArray[np.unsignedinteger]]],
 ) -> NDArray[np.uint32]:
-    """Return the class of each point: the class of its box, of labelled points nearby, ground, or geometry without a class."""
+    """Return the class of each point: the class of its box, of labelled points nearby, ground, or
+    geometry without a class.
+    """
     labels = np.full(len(points), classes.geometry_id, np.uint32)
     ground = ground_points(points)
     if classes.ground_id is not None:
@@ -133,32 +160,44 @@ def _labels_of(
 def _labelled_nearby(
     job: MotionJob, block: MotionBlock
 ) -> list[tuple[NDArray[np.float64], NDArray[np.unsignedinteger]]]:
-    """Return points, in the frame of the scan of a job, and class ids of the labelled frames around it."""
+    """Return points, in the frame of the scan of a job, and class ids of the labelled frames around
+    it.
+    """
     found = []
     for other in job.nearby:
         written = _read_back(other, block, "points", "labels")
         if "labels" in written:
-            points = mirror_points(written["points"]) if block.target.mirrored else written["points"]
+            points = (
+                mirror_points(written["points"]) if block.target.mirrored else written["points"]
+            )
             scan_T_other = invert(job.first_T_scan) @ other.first_T_scan
             found.append((transform_points(scan_T_other, points[:, :3]), written["labels"]))
     return found
 
 
 def _boxes_of(job: MotionJob, tracks: Sequence[Track]) -> Boxes:
-    """Return the annotated boxes of a frame, and boxes of tracks that extend to it without an annotation."""
+    """Return the annotated boxes of a frame, and boxes of tracks that extend to it without an
+    annotation.
+    """
     number = job.handle.number
     there = set() if job.boxes is None else set(job.boxes.tracks.tolist())
     scan_T_first = invert(job.first_T_scan)
     filled: dict[int, tuple[Track, Transform]] = {}
     for track in tracks:
         pose = track.pose(number)
-        if pose is not None and track.instance not in there and np.linalg.norm((scan_T_first @ pose)[:3, 3]) < _FAR_M:
+        if (
+            pose is not None
+            and track.instance not in there
+            and np.linalg.norm((scan_T_first @ pose)[:3, 3]) < _FAR_M
+        ):
             filled.setdefault(track.instance, (track, scan_T_first @ pose))
     more = Boxes.from_poses(
         np.array(list(filled), np.uint32),
         np.array([track.label for track, _ in filled.values()], np.uint32),
         np.array([pose for _, pose in filled.values()]).reshape(-1, 4, 4),
-        np.array([track.extent.upper - track.extent.lower for track, _ in filled.values()]).reshape(-1, 3),
+        np.array([track.extent.upper - track.extent.lower for track, _ in filled.values()]).reshape(
+            -1, 3
+        ),
         np.zeros(len(filled), np.bool_),
     )
     return more if job.boxes is None else job.boxes.joined(more)
@@ -172,8 +211,8 @@ def labels_nearby(
 ) -> NDArray[np.uint32]:
     """Return the most frequent class of the labelled points near each point.
 
-    Points on the ground get classes of the ground, others get other classes. Classes of actors are not copied, because actors may have
-    moved in the meantime.
+    Points on the ground get classes of the ground, others get other classes. Classes of actors are
+    not copied, because actors may have moved in the meantime.
 
     Args:
         points: (N, 3) metres, in a frame whose z points up.
@@ -198,14 +237,21 @@ def labels_nearby(
         for size in sizes:
             open_ = np.flatnonzero(own & (found == 0))
             if len(open_) and source.any():
-                found[open_] = _by_cells(points[open_, :axes], places[source, :axes], labels[source], size)
+                found[open_] = _by_cells(
+                    points[open_, :axes], places[source, :axes], labels[source], size
+                )
     return found
 
 
 def _by_cells(
-    points: NDArray[np.floating], places: NDArray[np.floating], labels: NDArray[np.int64], size: float
+    points: NDArray[np.floating],
+    places: NDArray[np.floating],
+    labels: NDArray[np.int64],
+    size: float,
 ) -> NDArray[np.uint32]:
-    """Return the most frequent label in the cell of each point, the lowest of several; 0 where the cell is empty."""
+    """Return the most frequent label in the cell of each point, the lowest of several; 0 where the
+    cell is empty.
+    """
     keys, winners = most_frequent(_cells(places, size), labels)
     wanted = _cells(points, size)
     rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
@@ -213,6 +259,9 @@ def _by_cells(
 
 
 def _cells(places: NDArray[np.floating], size: float) -> NDArray[np.int64]:
-    """Return one number per cell, below 2 ** 45. Cells beyond 4 km or more count as the last one."""
+    """Return one number per cell, below 2 ** 45.
+
+    Cells beyond 4 km or more count as the last one.
+    """
     index = np.clip(np.floor(places / size), -_HALF, _HALF - 1).astype(np.int64) + _HALF
     return index @ ((2 * _HALF) ** np.arange(index.shape[1]))

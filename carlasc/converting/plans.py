@@ -51,13 +51,14 @@ class RecordingPlan:
         trajectory: poses of the vehicle by the same clock; None until they are estimated.
         poses: (F, 4, 4) first_T_scan by frame number, right-handed; None until they are estimated.
         pose_source: where poses come from.
-        boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in the frame of the scan; None if the
-            data set has no boxes.
+        boxes: the annotated boxes by frame number, with class ids of the data set, right-handed, in
+            the frame of the scan; None if the data set has no boxes.
         flow: whether flow is written.
         voxels: geometry of the recording's own voxel grids, right-handed, if they are written.
         notes: notes for the user on poses and times, one line each.
         missing: numbers of the frames whose scan is not written yet.
-        unfinished: numbers of the frames without a scan, or without the fields from the motion of actors.
+        unfinished: numbers of the frames without a scan, or without the fields from the motion of
+            actors.
     """
 
     recording: Recording
@@ -76,7 +77,9 @@ class RecordingPlan:
     def take_estimate(self, first_T_scan: NDArray[np.float64]) -> None:
         """Take estimated poses, (F, 4, 4) by frame number."""
         self.poses = first_T_scan
-        self.trajectory = at_frames(first_T_scan @ invert(self.recording.vehicle_T_scan), self.times)
+        self.trajectory = at_frames(
+            first_T_scan @ invert(self.recording.vehicle_T_scan), self.times
+        )
 
     @property
     def rig(self) -> Rig:
@@ -90,9 +93,11 @@ class RecordingPlan:
         return flow if self.boxes is None else ("labels", "instances", "boxes", *flow)
 
     def motion(self, handle: FrameHandle) -> VehicleMotion | None:
-        """Return the motion of the vehicle around a frame; None if it is not known when the frame is read.
+        """Return the motion of the vehicle around a frame; None if it is not known when the frame
+        is read.
 
-        Poses that are estimated from the scans are not known then, even if an earlier run estimated them.
+        Poses that are estimated from the scans are not known then, even if an earlier run estimated
+        them.
         """
         estimated = self.pose_source == KISS_ICP and not self.rig.needs_motion
         if estimated or self.trajectory is None or self.trajectory.seconds is None:
@@ -102,7 +107,9 @@ class RecordingPlan:
         near = slice(max(int(first) - 1, 0), int(last) + 1)
         if len(self.trajectory.world_T_vehicle[near]) < 2:
             near = slice(max(int(first) - 2, 0), int(last) + 2)
-        return VehicleMotion(Trajectory(self.trajectory.world_T_vehicle[near], self.trajectory.seconds[near]), now)
+        return VehicleMotion(
+            Trajectory(self.trajectory.world_T_vehicle[near], self.trajectory.seconds[near]), now
+        )
 
 
 def choose_recordings(
@@ -117,7 +124,8 @@ def choose_recordings(
         split: the split in lower case, or "all".
 
     Raises:
-        MissingDataError: a name does not exist, or no recording is left; the message lists those that exist.
+        MissingDataError: a name does not exist, or no recording is left; the message lists those
+            that exist.
         ConflictError: two recordings have the same name.
     """
     by_name: dict[str, Recording] = {}
@@ -132,9 +140,13 @@ def choose_recordings(
         by_name[recording.name] = recording
     short = {name.rpartition("_")[2]: name for name in by_name}
     short = short if len(short) == len(by_name) else {name: name for name in by_name}
-    if wanted is not None and (unknown := [name for name in wanted if name not in short and name not in by_name]):
+    if wanted is not None and (
+        unknown := [name for name in wanted if name not in short and name not in by_name]
+    ):
         raise MissingDataError(
-            source, expected=f"the sequences {', '.join(unknown)}", found=f"only {', '.join(short) or 'none'}"
+            source,
+            expected=f"the sequences {', '.join(unknown)}",
+            found=f"only {', '.join(short) or 'none'}",
         )
     asked = None if wanted is None else {short.get(name, name) for name in wanted}
     chosen = [
@@ -144,10 +156,17 @@ def choose_recordings(
     ]
     chosen = [recording for recording in chosen if recording.frames or recording.problems()]
     if not chosen:
-        found = ", ".join(f"{name} ({by_name[n].split}, {len(by_name[n].frames)} scans)" for name, n in short.items())
-        raise MissingDataError(source, expected=f"sequences with scans in the split {split}", found=found or "none")
+        found = ", ".join(
+            f"{name} ({by_name[n].split}, {len(by_name[n].frames)} scans)"
+            for name, n in short.items()
+        )
+        raise MissingDataError(
+            source, expected=f"sequences with scans in the split {split}", found=found or "none"
+        )
     if empty := [recording for recording in chosen if not recording.frames]:
-        raise MissingDataError(empty[0].location, expected="scans", found="none", advice="copy them")
+        raise MissingDataError(
+            empty[0].location, expected="scans", found="none", advice="copy them"
+        )
     return chosen
 
 
@@ -166,7 +185,8 @@ def plan_recording(
     flow: bool,
     voxels: bool,
 ) -> RecordingPlan:
-    """Read and check the poses, times and boxes of a recording, and find missing frames in the output. Nothing is written.
+    """Read and check the poses, times and boxes of a recording, and find missing frames in the
+    output. Nothing is written.
 
     Args:
         recording: the recording.
@@ -228,7 +248,9 @@ def _finished(plan: RecordingPlan, number: int) -> bool:
 
 
 def _read_boxes(recording: Recording) -> dict[int, Boxes] | None:
-    """Return the boxes of the frames of a recording in the frame of the scan; None if the data set has none."""
+    """Return the boxes of the frames of a recording in the frame of the scan; None if the data set
+    has none.
+    """
     boxes = recording.boxes()
     if boxes is None:
         return None
@@ -273,11 +295,15 @@ def _announce(plan: RecordingPlan) -> None:
     for handle in {frames[i].number: frames[i] for i in (0, len(frames) // 2, -1)}.values():
         with suppress(CarlascError):  # the error is reported when the frame is read again
             points.append(sum(len(cloud.points) for cloud in handle.read()))
-    plan.writer.expect({"points": [handle.number for handle in frames]}, {"points": max(points)} if points else None)
+    plan.writer.expect(
+        {"points": [handle.number for handle in frames]},
+        {"points": max(points)} if points else None,
+    )
 
 
 def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> None:
-    """Write carlasc.json, times and the params.json of the voxel grid, and reuse poses that an earlier run estimated.
+    """Write carlasc.json, times and the params.json of the voxel grid, and reuse poses that an
+    earlier run estimated.
 
     A second estimate might differ in its last digits.
 
@@ -290,7 +316,11 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
         ConflictError: the output has other poses, times or metadata.
     """
     writer = plan.writer
-    extra: dict[str, object] = {**metadata.extra, "poses": plan.pose_source, "sensors": _sensors(plan, target)}
+    extra: dict[str, object] = {
+        **metadata.extra,
+        "poses": plan.pose_source,
+        "sensors": _sensors(plan, target),
+    }
     if plan.boxes is not None and not plan.recording.has_labels:
         extra["labels"] = "boxes"
     if not plan.recording.rays:
@@ -309,7 +339,9 @@ def begin(plan: RecordingPlan, target: AxesAndClasses, metadata: Metadata) -> No
     documents = {layout.METADATA: agree_metadata(writer, replace(metadata, extra=extra))}
     documents[layout.TIMES] = agree_times(writer, plan.times - plan.times[0])
     if plan.voxels is not None:
-        documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(_voxel_params(plan.voxels, target))
+        documents[layout.params_file(layout.grid_folder(plan.voxels))] = to_json(
+            _voxel_params(plan.voxels, target)
+        )
     _write(plan, documents)
     estimated = writer.read_document(layout.POSES) if plan.poses is None else None
     if estimated is not None:
@@ -350,18 +382,25 @@ def _write(plan: RecordingPlan, documents: dict[str, bytes | None]) -> None:
 
 
 def _sensors(plan: RecordingPlan, target: AxesAndClasses) -> list[dict[str, object]]:
-    """Return the record of each sensor in carlasc.json: its name, 12 numbers of its pose in the frame of scans, and its height if known."""
+    """Return the record of each sensor in carlasc.json: its name, 12 numbers of its pose in the
+    frame of scans, and its height if known.
+    """
     records = []
     for sensor in plan.recording.sensors:
         pose = invert(plan.recording.vehicle_T_scan) @ sensor.vehicle_T_sensor
         pose = mirror_poses(pose) if target.mirrored else pose
-        record: dict[str, object] = {"name": sensor.name, "scan_T_sensor": pose[:3].reshape(-1).tolist()}
+        record: dict[str, object] = {
+            "name": sensor.name,
+            "scan_T_sensor": pose[:3].reshape(-1).tolist(),
+        }
         records.append(record | ({} if sensor.height_m is None else {"height_m": sensor.height_m}))
     return records
 
 
 def _voxel_params(spec: GridSpec, target: AxesAndClasses) -> dict[str, object]:
-    """Return the params.json of the data set's own voxel grid, whose right-handed geometry is `spec`."""
+    """Return the params.json of the data set's own voxel grid, whose right-handed geometry is
+    `spec`.
+    """
     record = {"version": version("carlasc"), "source": "voxels"}
     spec = mirror_spec(spec) if target.mirrored else spec
     return spec.to_params(target.classes.num_channels) | {"carlasc": record}

@@ -20,7 +20,14 @@ from carlasc.groundtruth.heights import find_ground
 from carlasc.motion.options import PoseOptions
 
 _LEAST_M = 0.3  # ground must be at least this far below the sensor
-_UP = {"+z": (0, 1, 2), "-z": (0, 1, 2), "+y": (2, 0, 1), "-y": (2, 0, 1), "+x": (1, 2, 0), "-x": (1, 2, 0)}
+_UP = {
+    "+z": (0, 1, 2),
+    "-z": (0, 1, 2),
+    "+y": (2, 0, 1),
+    "-y": (2, 0, 1),
+    "+x": (1, 2, 0),
+    "-x": (1, 2, 0),
+}
 
 
 @dataclass(frozen=True)
@@ -39,7 +46,8 @@ class RecordingPreview:
         lower: least x, y, z of these points, metres, right-handed, in the frame of the scan.
         upper: greatest x, y, z.
         up: the direction away from the ground, "+z" for correct axes; None if no ground was found.
-        height_m: height of the first sensor above the ground, estimated from the first scan; None if no ground was found.
+        height_m: height of the first sensor above the ground, estimated from the first scan; None
+            if no ground was found.
         poses: "file", or "kiss-icp" if they would be estimated from the scans.
         notes: notes for the user, one line each.
     """
@@ -92,12 +100,20 @@ def preview(
 def _preview(recording: Recording, poses: PoseOptions) -> RecordingPreview:
     times = recording.times()
     trajectory = read_trajectory(recording, frame_times(recording, times), poses)
-    scan = read_scan(recording.frames[0], Rig(tuple(recording.sensors), recording.vehicle_T_scan), None)
-    steps = np.zeros(0) if times is None else np.diff(times[[handle.number for handle in recording.frames]])
+    scan = read_scan(
+        recording.frames[0], Rig(tuple(recording.sensors), recording.vehicle_T_scan), None
+    )
+    steps = (
+        np.zeros(0)
+        if times is None
+        else np.diff(times[[handle.number for handle in recording.frames]])
+    )
     given = {"labels": scan.labels, "instances": scan.instances}
     points = scan.points[:, :3]
     up, height_m = _ground(points)
-    lower, upper = (tuple(round(float(value), 2) for value in edge(points, axis=0)) for edge in (np.min, np.max))
+    lower, upper = (
+        tuple(round(float(value), 2) for value in edge(points, axis=0)) for edge in (np.min, np.max)
+    )
     return RecordingPreview(
         recording.name,
         recording.split,
@@ -117,7 +133,9 @@ def _preview(recording: Recording, poses: PoseOptions) -> RecordingPreview:
 
 
 def _ground(points: NDArray[np.float32]) -> tuple[str | None, float | None]:
-    """Return the direction away from the ground, and the height of the sensor above it, of (N, 3) points."""
+    """Return the direction away from the ground, and the height of the sensor above it, of (N, 3)
+    points.
+    """
     for up, order in _UP.items():
         turned = points[:, order] * np.array([1, 1, -1 if up.startswith("-") else 1], np.float32)
         ground = find_ground([turned])

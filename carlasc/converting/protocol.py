@@ -1,13 +1,15 @@
-"""The protocol of converters: a converter finds the recordings of another data set and reads their frames. It uses no store.
+"""The protocol of converters: a converter finds the recordings of another data set and reads their
+frames. It uses no store.
 
 Another distribution adds a converter by a class that inherits `Converter` and an entry point:
 
     [project.entry-points."carlasc.converters"]
     name = "package.module:Class"
 
-A converter returns the data of the other data set in right-handed axes (x forward, y to the left, z up), with its own class ids. Missing
-data are None or empty. `carlasc.convert` does the rest, in the same way for all converters: mirroring, remapping, poses from scans,
-deskewing, labels and flow from boxes, and grids.
+A converter returns the data of the other data set in right-handed axes (x forward, y to the left, z
+up), with its own class ids. Missing data are None or empty. `carlasc.convert` does the rest, in the
+same way for all converters: mirroring, remapping, poses from scans, deskewing, labels and flow from
+boxes, and grids.
 """
 
 from __future__ import annotations
@@ -40,11 +42,13 @@ class Sensor:
     Attributes:
         name: its name in the data set.
         vehicle_T_sensor: (4, 4) float64 pose of the sensor in the frame of the vehicle.
-        points_in: "sensor" if its points are given in its own frame, "vehicle" if in that of the vehicle.
-        deskewed: whether points are already corrected for the motion of the vehicle, to the time of the frame. If not, clouds with
-            `seconds` are corrected.
+        points_in: "sensor" if its points are given in its own frame, "vehicle" if in that of the
+            vehicle.
+        deskewed: whether points are already corrected for the motion of the vehicle, to the time of
+            the frame. If not, clouds with `seconds` are corrected.
         height_m: height of the sensor above the ground; None if it is not known.
-        calibrated: whether `vehicle_T_sensor` is known. If not, it is an assumption: the identity, or what `Recording.notes` says.
+        calibrated: whether `vehicle_T_sensor` is known. If not, it is an assumption: the identity,
+            or what `Recording.notes` says.
     """
 
     name: str = "lidar"
@@ -73,14 +77,17 @@ class Cloud:
     """The points that one sensor took for a frame.
 
     Attributes:
-        points: (N, 4) float32: x, y, z in metres, right-handed, in the frame that the sensor says, and remission. (N, 3) points get a
-            remission of 0.
+        points: (N, 4) float32: x, y, z in metres, right-handed, in the frame that the sensor says,
+            and remission. (N, 3) points get a remission of 0.
         labels: (N,) class ids of the data set, 0 unlabelled; None if the points have no labels.
-        instances: (N,) uint32 number of each point's actor, 0 for none. An actor has the same number in all frames of the
-            recording, whether it moves or not, and in its boxes. None if the points have no instances.
+        instances: (N,) uint32 number of each point's actor, 0 for none. An actor has the same
+            number in all frames of the recording, whether it moves or not, and in its boxes. None
+            if the points have no instances.
         seconds: (N,) time of each point after the time of the frame; None if it is unknown.
-        origins: (N, 3) float32 origin of the ray of each point, metres, in the frame of the points; None: at the sensor.
-        others: other fields of the layout with a row per point, by name; vectors right-handed, in the frame of the points.
+        origins: (N, 3) float32 origin of the ray of each point, metres, in the frame of the points;
+            None: at the sensor.
+        others: other fields of the layout with a row per point, by name; vectors right-handed, in
+            the frame of the points.
         sensor: index of the sensor in `Recording.sensors`.
     """
 
@@ -105,7 +112,8 @@ class VoxelContent:
     Attributes:
         labels: (X, Y, Z) class ids of the data set.
         known: (X, Y, Z) bool, voxels that take part in an evaluation.
-        files: the original files by name. They are kept beside the grid, so that an export can write them again.
+        files: the original files by name. They are kept beside the grid, so that an export can
+            write them again.
     """
 
     labels: NDArray[np.unsignedinteger]
@@ -119,11 +127,13 @@ class Trajectory:
 
     Attributes:
         world_T_vehicle: (K, 4, 4) float64, right-handed.
-        seconds: (K,) time of each pose, increasing, by the clock of `Recording.times`; None if pose i is that of frame i.
+        seconds: (K,) time of each pose, increasing, by the clock of `Recording.times`; None if pose
+            i is that of frame i.
         where: the file of the poses, for errors.
 
     Raises:
-        FormatError: shapes do not match, a pose is not rigid, times do not increase, or a time is not finite.
+        FormatError: shapes do not match, a pose is not rigid, times do not increase, or a time is
+            not finite.
     """
 
     world_T_vehicle: NDArray[np.float64]
@@ -140,15 +150,18 @@ class Trajectory:
             )
         if self.seconds is not None and not (np.diff(self.seconds) > 0).all():
             row = int(np.argmin(np.diff(self.seconds))) + 1
-            raise FormatError(self.where, expected="times that increase", found=f"none at pose {row}")
+            raise FormatError(
+                self.where, expected="times that increase", found=f"none at pose {row}"
+            )
         if self.seconds is not None:
             check_seconds(self.seconds, self.where)
 
     def at(self, seconds: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return (..., 4, 4) world_T_vehicle at some times (...,), by the clock of `seconds`, which must be known.
+        """Return (..., 4, 4) world_T_vehicle at some times (...,), by the clock of `seconds`, which
+        must be known.
 
-        Between two poses, positions are interpolated linearly and rotations by slerp. Before the first and after the last pose, the
-        nearest motion goes on.
+        Between two poses, positions are interpolated linearly and rotations by slerp. Before the
+        first and after the last pose, the nearest motion goes on.
         """
         assert self.seconds is not None
         return slerp(self.world_T_vehicle, self.seconds, seconds)
@@ -184,8 +197,8 @@ class FrameHandle(ABC):
 class Recording(ABC):
     """One sequence of another data set.
 
-    The frame of its vehicle has x forward, y to the left and z up. A scan in the layout has the same axes, with its origin at the first
-    sensor.
+    The frame of its vehicle has x forward, y to the left and z up. A scan in the layout has the
+    same axes, with its origin at the first sensor.
 
     Attributes:
         name: name of the sequence in the layout, such as "KITTI_00".
@@ -195,9 +208,10 @@ class Recording(ABC):
         sensors: its LiDARs; the first is the origin of scans.
         has_labels: whether points of some frames have labels.
         has_instances: whether points of some frames have instances.
-        voxels: geometry of its own voxel grids, right-handed, in the frame of scans; None if it has none.
-        rays: whether the position of the sensor is known for each point, so that the space between the two is free. Without rays, no
-            grids are made from the scans.
+        voxels: geometry of its own voxel grids, right-handed, in the frame of scans; None if it has
+            none.
+        rays: whether the position of the sensor is known for each point, so that the space between
+            the two is free. Without rays, no grids are made from the scans.
     """
 
     name: str
@@ -223,14 +237,18 @@ class Recording(ABC):
         return None
 
     def times(self) -> NDArray[np.float64] | None:
-        """Return (F,) seconds by frame number; None if the recording has no times. Missing frames may have any time."""
+        """Return (F,) seconds by frame number; None if the recording has no times.
+
+        Missing frames may have any time.
+        """
         return None
 
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the tracked boxes of each annotated frame, by number, in the frame of the vehicle; None if the data set has none.
+        """Return the tracked boxes of each annotated frame, by number, in the frame of the vehicle;
+        None if the data set has none.
 
-        Labels are class ids of the data set. A frame without an entry was not annotated. A frame with an entry but no boxes was
-        annotated and contains no object.
+        Labels are class ids of the data set. A frame without an entry was not annotated. A frame
+        with an entry but no boxes was annotated and contains no object.
 
         Raises:
             FormatError: a file does not have the format.
@@ -238,10 +256,11 @@ class Recording(ABC):
         return None
 
     def cameras(self) -> Sequence[CameraModel]:
-        """Return the cameras; empty if the recording has none, or if their calibration does not exist.
+        """Return the cameras; empty if the recording has none, or if their calibration does not
+        exist.
 
-        Their `sensor_T_camera` maps to the frame of the vehicle. `times` are by the clock of `times()`, a row per frame number, and `images`
-        are paths.
+        Their `sensor_T_camera` maps to the frame of the vehicle. `times` are by the clock of
+        `times()`, a row per frame number, and `images` are paths.
 
         Raises:
             FormatError: a file does not have the format.
@@ -249,24 +268,33 @@ class Recording(ABC):
         return ()
 
     def image(self, camera: CameraModel, frame: int) -> tuple[str, bytes] | None:
-        """Return an image of a camera: the ending of its file, "jpg" or "png", and its bytes; None if it does not exist.
+        """Return an image of a camera: the ending of its file, "jpg" or "png", and its bytes; None
+        if it does not exist.
 
         By default, it is the file that `images` of the camera names.
         """
         path = Path(camera.images[frame] if camera.images else "")
-        return (path.suffix[1:], path.read_bytes()) if path.suffix in (".jpg", ".png") and path.is_file() else None
+        return (
+            (path.suffix[1:], path.read_bytes())
+            if path.suffix in (".jpg", ".png") and path.is_file()
+            else None
+        )
 
     def problems(self) -> list[tuple[int, str]]:
         """Return (frame number, message in one line) of each frame that is missing."""
         return []
 
     def notes(self) -> list[str]:
-        """Return notes for the user, one line each, such as what is missing and what was assumed instead."""
+        """Return notes for the user, one line each, such as what is missing and what was assumed
+        instead.
+        """
         return []
 
     @cached_property
     def vehicle_T_scan(self) -> Transform:
-        """(4, 4), from the frame of the scans in the layout to that of the vehicle: the axes are the same."""
+        """(4, 4), from the frame of the scans in the layout to that of the vehicle: the axes are
+        the same.
+        """
         transform = np.eye(4)
         transform[:3, 3] = self.sensors[0].vehicle_T_sensor[:3, 3]
         return transform
@@ -276,7 +304,8 @@ class Converter(ABC):
     """Finds the recordings of one kind of data set.
 
     Options are keyword parameters of the constructor, each with its type, its default and its help:
-    `sweeps: Annotated[bool, "Read all scans, not only key frames."] = True`. `carlasc convert NAME --help` shows them.
+    `sweeps: Annotated[bool, "Read all scans, not only key frames."] = True`. `carlasc convert NAME
+    --help` shows them.
 
     All attributes except `title` may be set in the constructor, if they depend on options.
 
@@ -284,12 +313,15 @@ class Converter(ABC):
         source: folder of the data set, or of one of its sequences.
         title: what it reads, in a few words.
         classes: the data set's class table.
-        to_carla: maps its ids to CarlaSC's; None if no map exists, or if they are CarlaSC's already. Sequences then keep their ids.
+        to_carla: maps its ids to CarlaSC's; None if no map exists, or if they are CarlaSC's
+            already. Sequences then keep their ids.
         keeps_classes: whether sequences keep the data set's ids by default.
         sensor: the sensor that took the scans.
-        min_range_m: nearer points are left out of grids, because they belong to the recording vehicle.
+        min_range_m: nearer points are left out of grids, because they belong to the recording
+            vehicle.
         max_range_m: farther points are left out of grids, because they are too sparse.
-        license: licence of the data and of what is made from them, such as "CC BY-NC-SA 4.0"; None if it is not known.
+        license: licence of the data and of what is made from them, such as "CC BY-NC-SA 4.0"; None
+            if it is not known.
         citation: the publication to cite, in one line; None if it is not known.
         simulated: whether the data were recorded in a simulator.
     """

@@ -1,8 +1,11 @@
-"""The installed converters and exporters, which distributions declare in two entry-point groups, and their options.
+"""The installed converters and exporters, which distributions declare in two entry-point groups,
+and their options.
 
-An option of a converter or an exporter is a keyword parameter of its constructor, with its type, its default and its help text:
+An option of a converter or an exporter is a keyword parameter of its constructor, with its type,
+its default and its help text:
 
-    def __init__(self, source: Path, *, sweeps: Annotated[bool, "Read all scans, not only key frames."] = True) -> None:
+    def __init__(self, source: Path, *, sweeps: Annotated[bool, "Read all scans, not only key
+    frames."] = True) -> None:
 """
 
 from __future__ import annotations
@@ -19,7 +22,13 @@ from carlasc.converting.exporter import Exporter
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.tables import CARLA, remaps_between
-from carlasc.errors import ArgumentError, CarlascError, DependencyError, MissingDataError, check_choice
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    DependencyError,
+    MissingDataError,
+    check_choice,
+)
 from carlasc.storage.opening import as_source
 
 GROUP = "carlasc.converters"
@@ -60,7 +69,8 @@ def load_exporter(name: str) -> type[Exporter]:
 
 
 def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
-    """Return the remaps that map ids of a table to CarlaSC's, in order: from carlasc, or from an installed converter.
+    """Return the remaps that map ids of a table to CarlaSC's, in order: from carlasc, or from an
+    installed converter.
 
     Returns:
         The remaps; empty for CarlaSC's own table. None if no map exists.
@@ -79,7 +89,9 @@ def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
     return None
 
 
-def open_converter(name: str | type[Converter], source: Path, options: Mapping[str, Any] | None = None) -> Converter:
+def open_converter(
+    name: str | type[Converter], source: Path, options: Mapping[str, Any] | None = None
+) -> Converter:
     """Return a converter of a data set.
 
     Args:
@@ -88,7 +100,8 @@ def open_converter(name: str | type[Converter], source: Path, options: Mapping[s
         options: options of the converter, by name; text is parsed as the type of the option.
 
     Raises:
-        ArgumentError: the converter or its option does not exist, or the option cannot have that value.
+        ArgumentError: the converter or its option does not exist, or the option cannot have that
+            value.
         DependencyError: it cannot be loaded.
     """
     kind = load_converter(name) if isinstance(name, str) else name
@@ -99,19 +112,22 @@ def find_recordings(converter: Converter) -> list[Recording]:
     """Return the recordings of a converter.
 
     Raises:
-        MissingDataError: no recording exists; the message names other converters that find some there.
+        MissingDataError: no recording exists; the message names other converters that find some
+            there.
         FormatError: a file does not have the format.
     """
     try:
         return converter.sequences()
     except MissingDataError as error:
-        others = [name for name in converter_names() if _finds(name, type(converter), converter.source)]
+        others = [
+            name for name in converter_names() if _finds(name, type(converter), converter.source)
+        ]
         if others:
-            error.advice = (
-                f"use {' or '.join(f'`carlasc convert {name}`' for name in others)}, which can read this folder"
-            )
+            error.advice = f"use {' or '.join(f'`carlasc convert {name}`' for name in others)}, which can read this folder"
         elif _is_in_layout(converter.source):
-            error.advice = "make grids with `carlasc regrid`, because this folder has CarlaSC's layout already"
+            error.advice = (
+                "make grids with `carlasc regrid`, because this folder has CarlaSC's layout already"
+            )
         raise
 
 
@@ -126,7 +142,9 @@ def _finds(name: str, other_than: type[Converter], source: Path) -> bool:
     """Return whether an installed converter finds recordings in a place."""
     try:
         kind = load_converter(name)
-        return kind is not other_than and any(recording.frames for recording in kind(source).sequences())
+        return kind is not other_than and any(
+            recording.frames for recording in kind(source).sequences()
+        )
     except Exception:  # noqa: BLE001 (code of another distribution, which is not needed here, may fail in any way)
         return False
 
@@ -172,26 +190,36 @@ class OptionDeclaration:
 
 
 def option_declarations(kind: type[Converter] | type[Exporter]) -> tuple[OptionDeclaration, ...]:
-    """Return the options that a converter or an exporter declares: the parameters of its constructor, except the source.
+    """Return the options that a converter or an exporter declares: the parameters of its
+    constructor, except the source.
 
     Raises:
-        DependencyError: annotations cannot be read, a parameter has no default, or its type is not str, int, float, bool or a Literal of
-            texts.
+        DependencyError: annotations cannot be read, a parameter has no default, or its type is not
+            str, int, float, bool or a Literal of texts.
     """
     try:
         hints = get_type_hints(kind.__init__, include_extras=True)
     except Exception as error:  # annotations of another distribution may name anything
-        raise DependencyError(f"{kind.__name__}: options", problem=f"annotations cannot be read: {error}") from error
+        raise DependencyError(
+            f"{kind.__name__}: options", problem=f"annotations cannot be read: {error}"
+        ) from error
     parameters = [
         parameter
-        for parameter in list(inspect.signature(kind).parameters.values())[issubclass(kind, Converter) :]
+        for parameter in list(inspect.signature(kind).parameters.values())[
+            issubclass(kind, Converter) :
+        ]
         if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
     ]
-    return tuple(_declared(kind, parameter, hints.get(parameter.name, str)) for parameter in parameters)
+    return tuple(
+        _declared(kind, parameter, hints.get(parameter.name, str)) for parameter in parameters
+    )
 
 
-def read_options(kind: type[Converter] | type[Exporter], options: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return options as the constructor of a converter or an exporter takes them; text is read as the type that is declared.
+def read_options(
+    kind: type[Converter] | type[Exporter], options: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Return options as the constructor of a converter or an exporter takes them; text is read as
+    the type that is declared.
 
     Args:
         kind: the converter or the exporter.
@@ -201,7 +229,10 @@ def read_options(kind: type[Converter] | type[Exporter], options: Mapping[str, A
         ArgumentError: an option does not exist, or cannot have that value.
         DependencyError: a declaration is not valid.
     """
-    options, known = options or {}, {declared.name: declared for declared in option_declarations(kind)}
+    options, known = (
+        options or {},
+        {declared.name: declared for declared in option_declarations(kind)},
+    )
     if unknown := sorted(set(options) - set(known)):
         expected = f"one of {', '.join(known)}" if known else "no options for this data set"
         raise ArgumentError("options", expected=expected, found=", ".join(unknown))
@@ -209,21 +240,31 @@ def read_options(kind: type[Converter] | type[Exporter], options: Mapping[str, A
 
 
 def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDeclaration:
-    """Return the option that a parameter declares, whose annotation is `hint`: `Annotated[type, help]` or a type, which may be optional."""
+    """Return the option that a parameter declares, whose annotation is `hint`: `Annotated[type,
+    help]` or a type, which may be optional.
+    """
     text = ""
     if get_origin(hint) is Annotated:
         hint, *extras = get_args(hint)
         text = next((extra for extra in extras if isinstance(extra, str)), "")
     types = [
-        part for part in (get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)) if part is not NoneType
+        part
+        for part in (get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,))
+        if part is not NoneType
     ]
     choices = get_args(types[0]) if get_origin(types[0]) is Literal else ()
     found = None if len(types) > 1 else str if choices else types[0]
-    if found not in (str, int, float, bool) or not all(isinstance(choice, str) for choice in choices):
+    if found not in (str, int, float, bool) or not all(
+        isinstance(choice, str) for choice in choices
+    ):
         expected = "an option of the type str, int, float, bool or a Literal of texts"
-        raise DependencyError(f"{kind.__name__}: {parameter.name}", expected=expected, found=str(hint))
+        raise DependencyError(
+            f"{kind.__name__}: {parameter.name}", expected=expected, found=str(hint)
+        )
     if parameter.default is parameter.empty:
-        raise DependencyError(f"{kind.__name__}: {parameter.name}", expected="a default", found="none")
+        raise DependencyError(
+            f"{kind.__name__}: {parameter.name}", expected="a default", found="none"
+        )
     return OptionDeclaration(parameter.name, found, parameter.default, text, choices)
 
 
@@ -232,7 +273,9 @@ def _load(group: str, base: type, name: str) -> Any:
     entries = _entries(group)
     if name not in entries:
         raise ArgumentError(
-            "name", expected=f"one of {', '.join(sorted(entries)) or 'no names: none is installed'}", found=repr(name)
+            "name",
+            expected=f"one of {', '.join(sorted(entries)) or 'no names: none is installed'}",
+            found=repr(name),
         )
     where = f"{base.__name__.lower()} {name} ({entries[name].value})"
     try:

@@ -1,4 +1,6 @@
-"""Grids in the geometry of other data sets: resampling, and the coordinate frames of other data sets."""
+"""Grids in the geometry of other data sets: resampling, and the coordinate frames of other data
+sets.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +17,19 @@ from carlasc.storage.metadata import Axes
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 _SNAP = 1e-6  # in voxels: a centre that is on a face, up to rounding, belongs to the voxel above it
-_SAME = 1e-4  # relative difference of voxel sizes that are equal up to the float32 bounds of the layout
+_SAME = (
+    1e-4  # relative difference of voxel sizes that are equal up to the float32 bounds of the layout
+)
 
 
 @dataclass(frozen=True)
 class TargetFrame:
-    """The frame of another data set's grids, as seen from a scan of the layout in right-handed axes (x forward, y to the left).
+    """The frame of another data set's grids, as seen from a scan of the layout in right-handed axes
+    (x forward, y to the left).
 
     Attributes:
-        height_m: height of the scan's origin, which is the sensor, above the origin of the other frame.
+        height_m: height of the scan's origin, which is the sensor, above the origin of the other
+            frame.
         forward: axis that points forward: "x", with y to the left, or "y", with x to the right.
     """
 
@@ -31,7 +37,10 @@ class TargetFrame:
     forward: Literal["x", "y"] = "x"
 
     def turn(self, grid: NDArray[_Scalar], axes: Axes) -> NDArray[_Scalar]:
-        """Return an array of a grid of the layout, (X, Y, Z), with the axes of the frame. It is a view."""
+        """Return an array of a grid of the layout, (X, Y, Z), with the axes of the frame.
+
+        It is a view.
+        """
         right = grid if axes == "right" else mirror_grid(grid)
         return right if self.forward == "x" else right[:, ::-1].transpose(1, 0, 2)
 
@@ -45,7 +54,9 @@ class TargetFrame:
         return GridSpec("cartesian", (ny, nx, nz), (-y1, x0, z0), (-y0, x1, z1))
 
     def spec_from(self, spec: GridSpec, axes: Axes) -> GridSpec:
-        """Return the grid of the layout that has a geometry in this frame: the inverse of `spec_in`."""
+        """Return the grid of the layout that has a geometry in this frame: the inverse of
+        `spec_in`.
+        """
         (x0, y0, z0), (x1, y1, z1), (nx, ny, nz) = spec.lower, spec.upper, spec.size
         z0, z1 = z0 - self.height_m, z1 - self.height_m
         if self.forward == "x":
@@ -57,25 +68,33 @@ class TargetFrame:
 
 def is_same(one: GridSpec, other: GridSpec) -> bool:
     """Return whether two Cartesian grids have the same voxels, up to the rounding of bounds."""
-    near = [np.allclose(getattr(one, bound), getattr(other, bound), rtol=0, atol=_SAME) for bound in ("lower", "upper")]
+    near = [
+        np.allclose(getattr(one, bound), getattr(other, bound), rtol=0, atol=_SAME)
+        for bound in ("lower", "upper")
+    ]
     return one.size == other.size and all(near)
 
 
 def resample_to(
-    labels: NDArray[np.unsignedinteger], known: NDArray[np.bool_], source: GridSpec, target: GridSpec
+    labels: NDArray[np.unsignedinteger],
+    known: NDArray[np.bool_],
+    source: GridSpec,
+    target: GridSpec,
 ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
     """Express a Cartesian grid in the voxels of another one, in the same frame.
 
-    Along an axis on which the target is not finer, a voxel of the source belongs to the voxel of the target that contains its centre.
-    Along an axis on which it is finer, a voxel of the target takes the voxel of the source that contains its own centre. Of the voxels of
-    the source that belong to a voxel of the target:
+    Along an axis on which the target is not finer, a voxel of the source belongs to the voxel of
+    the target that contains its centre. Along an axis on which it is finer, a voxel of the target
+    takes the voxel of the source that contains its own centre. Of the voxels of the source that
+    belong to a voxel of the target:
 
-    - if any is occupied, the voxel takes the most frequent class of the occupied ones (the lowest id of equally frequent ones);
+    - if any is occupied, the voxel takes the most frequent class of the occupied ones (the lowest
+      id of equally frequent ones);
     - otherwise, if any is known, the voxel is free;
     - otherwise it is unknown.
 
-    In `carlasc.groundtruth.resample`, which makes ground truth from finer ground truth, free voxels can outvote occupied ones. Here they
-    cannot, so that thin objects stay.
+    In `carlasc.groundtruth.resample`, which makes ground truth from finer ground truth, free voxels
+    can outvote occupied ones. Here they cannot, so that thin objects stay.
 
     Args:
         labels: (X, Y, Z) class ids of the source; 0 is free. Those of unknown voxels do not matter.
@@ -98,18 +117,26 @@ def resample_to(
     voxels, winners = most_frequent(np.ravel_multi_index(tuple(places), target.size), found)
     resampled[voxels] = winners.astype(labels.dtype)
     seen = known
-    for axis in sorted(range(3), key=lambda axis: target.size[axis] / source.size[axis]):  # largest reduction first
+    # largest reduction first
+    for axis in sorted(range(3), key=lambda axis: target.size[axis] / source.size[axis]):
         seen = _any_by_target(seen, pairs[axis], target.size[axis], axis)
     return resampled.reshape(target.size), seen
 
 
-def _pair_axis(source: GridSpec, target: GridSpec, axis: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return which cells of the source go to which cells of the target along an axis: two arrays, which do not decrease."""
+def _pair_axis(
+    source: GridSpec, target: GridSpec, axis: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which cells of the source go to which cells of the target along an axis: two arrays,
+    which do not decrease.
+    """
     finer = target.voxel_size[axis] < source.voxel_size[axis] * (1 - _SAME)
-    one, other = (target, source) if finer else (source, target)  # each cell of one has one cell of the other
+    # each cell of one has one cell of the other
+    one, other = (target, source) if finer else (source, target)
     cells = np.arange(one.size[axis])
     centers = one.lower[axis] + (cells + 0.5) * one.voxel_size[axis]
-    places = np.floor((centers - other.lower[axis]) / other.voxel_size[axis] + _SNAP).astype(np.int64)
+    places = np.floor((centers - other.lower[axis]) / other.voxel_size[axis] + _SNAP).astype(
+        np.int64
+    )
     inside = (places >= 0) & (places < other.size[axis])
     return (places[inside], cells[inside]) if finer else (cells[inside], places[inside])
 
@@ -125,7 +152,8 @@ def _targets_of(
         size: number of cells of the source along the axis.
 
     Returns:
-        (M,) rows of `cells`, each as often as it goes to a cell of the target, and (M,) these cells.
+        (M,) rows of `cells`, each as often as it goes to a cell of the target, and (M,) these
+        cells.
     """
     count = np.bincount(pair[0], minlength=size)
     start = np.cumsum(count) - count
@@ -136,22 +164,29 @@ def _targets_of(
 
 
 def _any_by_target(
-    values: NDArray[np.bool_], pair: tuple[NDArray[np.int64], NDArray[np.int64]], size: int, axis: int
+    values: NDArray[np.bool_],
+    pair: tuple[NDArray[np.int64], NDArray[np.int64]],
+    size: int,
+    axis: int,
 ) -> NDArray[np.bool_]:
-    """Return `values` with the cells of the target along an axis: each is true if any of its cells of the source is true."""
+    """Return `values` with the cells of the target along an axis: each is true if any of its cells
+    of the source is true.
+    """
     values = np.moveaxis(values, axis, 0)
     result = np.zeros((size, *values.shape[1:]), np.bool_)
     cells, places = pair
     first = np.flatnonzero(np.diff(places, prepend=-1))
     rank = np.arange(len(places)) - np.repeat(first, np.diff(first, append=len(places)))
-    for number in range(int(rank.max(initial=-1)) + 1):  # no voxel of the target occurs twice in a pass
+    # no voxel of the target occurs twice in a pass
+    for number in range(int(rank.max(initial=-1)) + 1):
         now = rank == number
         result[places[now]] |= values[cells[now]]
     return np.moveaxis(result, 0, axis)
 
 
 def resampling_notes(source: GridSpec, target: GridSpec, name: str) -> list[str]:
-    """Return what is lost if a grid is expressed in the voxels of another one, one line each; empty if the voxels are the same.
+    """Return what is lost if a grid is expressed in the voxels of another one, one line each; empty
+    if the voxels are the same.
 
     Args:
         source: geometry of the grid, in the target's frame.
@@ -162,11 +197,20 @@ def resampling_notes(source: GridSpec, target: GridSpec, name: str) -> list[str]
     if (source.voxel_size > target.voxel_size * (1 + _SAME)).any():
         sizes = (" x ".join(f"{size:.3g}" for size in spec.voxel_size) for spec in (source, target))
         notes.append(
-            "the voxels of the grid {} are larger than those that are written: {} m, not {} m".format(name, *sizes)
+            "the voxels of the grid {} are larger than those that are written: {} m, not {} m".format(
+                name, *sizes
+            )
         )
     slack = source.voxel_size / 2
-    if (np.array(source.lower) > target.lower + slack).any() or (np.array(source.upper) < target.upper - slack).any():
+    if (np.array(source.lower) > target.lower + slack).any() or (
+        np.array(source.upper) < target.upper - slack
+    ).any():
         low, high = (np.maximum(source.lower, target.lower), np.minimum(source.upper, target.upper))
-        share = float(np.prod(np.maximum(high - low, 0)) / np.prod(np.subtract(target.upper, target.lower)))
-        notes.append(f"the grid {name} covers {100 * share:.0f} % of the volume that is written: the rest is unknown")
+        share = float(
+            np.prod(np.maximum(high - low, 0)) / np.prod(np.subtract(target.upper, target.lower))
+        )
+        notes.append(
+            f"the grid {name} covers {100 * share:.0f} % of the volume that is written: the rest "
+            f"is unknown"
+        )
     return notes

@@ -52,7 +52,8 @@ class ExportResult:
 
     Attributes:
         out: root of the data set that was written.
-        sequences: the folder of each sequence in it, or its file where a format has one, by the sequence's path in the source.
+        sequences: the folder of each sequence in it, or its file where a format has one, by the
+            sequence's path in the source.
         made: number of frames that were written.
         skipped: number of frames that existed already.
         failures: frames that could not be written.
@@ -70,7 +71,9 @@ class ExportResult:
 
 
 def check_outside(out: Path, source: str) -> None:
-    """Check that a folder to write to is neither the source nor inside it. A URL is never the same place.
+    """Check that a folder to write to is neither the source nor inside it.
+
+    A URL is never the same place.
 
     Raises:
         ConflictError: the folder is the source, or inside it.

@@ -1,4 +1,6 @@
-"""`convert`: writes each recording of another data set as a sequence of the layout, and makes grids from these sequences."""
+"""`convert`: writes each recording of another data set as a sequence of the layout, and makes grids
+from these sequences.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ from carlasc.storage.sinks import Sink
 from carlasc.storage.transport.targets import LocalTarget, check_shared
 
 Grids = GridOptions | Literal["voxels"] | None
-_LOOKED_AT = 3  # number of sequences, and of scans of each, in which points outside of the grid are counted
+_LOOKED_AT = (
+    3  # number of sequences, and of scans of each, in which points outside of the grid are counted
+)
 _MANY = 0.05  # share of the points between the sides of a grid: more points above it give a note
 
 
@@ -52,26 +56,31 @@ def convert(
     options: Mapping[str, Any] | None = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ConvertResult:
-    """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes; then make their grids, as `regrid` does.
+    """Write another data set as sequences of the CarlaSC layout: the same files, axes and classes;
+    then make their grids, as `regrid` does.
 
-    A second run skips the frames that exist. A frame that cannot be read is reported in the result, and the others are converted.
-    Worker processes import the main module again: scripts call this under `if __name__ == "__main__":`, or with `run=Run(workers=1)`.
+    A second run skips the frames that exist. A frame that cannot be read is reported in the result,
+    and the others are converted. Worker processes import the main module again: scripts call this
+    under `if __name__ == "__main__":`, or with `run=Run(workers=1)`.
 
     Args:
-        name: the converter: "kitti", "argoverse2", ..., or one of another distribution (see `converter_names`); or a class that
-            inherits `Converter`.
+        name: the converter: "kitti", "argoverse2", ..., or one of another distribution (see
+            `converter_names`); or a class that inherits `Converter`.
         source: folder of the data set, or of one of its sequences.
-        out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or any Sink, with grids if it can be
-            read while it is written.
+        out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or
+            any Sink, with grids if it can be read while it is written.
         sequences: which ones, by their names or the last part of them ("00"); None converts all.
         split: "train", "val" or "test": only sequences of this split; "all" converts every split.
         layout: how sequences are written: their classes, their axes, and whether they get flow.
-        poses: where poses come from, and whether poses are accepted if scans do not overlap under them, or if a calibration is missing.
-        grids: the grids that are made from scans merged over time; "voxels" takes the data set's own voxels, with count 0 where they are
-            unknown; None writes no grids.
-        options: options of the converter, by name; text is parsed as the type of the option (see `option_declarations`).
-        run: how the work is spread. A part converts whole recordings, because poses and motion are estimated along each of them. Grids
-            then keep their height, because the ground of the other recordings is not known.
+        poses: where poses come from, and whether poses are accepted if scans do not overlap under
+            them, or if a calibration is missing.
+        grids: the grids that are made from scans merged over time; "voxels" takes the data set's
+            own voxels, with count 0 where they are unknown; None writes no grids.
+        options: options of the converter, by name; text is parsed as the type of the option (see
+            `option_declarations`).
+        run: how the work is spread. A part converts whole recordings, because poses and motion are
+            estimated along each of them. Grids then keep their height, because the ground of the
+            other recordings is not known.
 
     Returns:
         What was written, what was skipped, and what failed.
@@ -96,13 +105,23 @@ def convert(
         _check_rays(recordings)
     plans = [
         plan_recording(
-            recording, converter, sink, target, poses, flow=layout.flow == "auto", voxels=isinstance(grids, str)
+            recording,
+            converter,
+            sink,
+            target,
+            poses,
+            flow=layout.flow == "auto",
+            voxels=isinstance(grids, str),
         )
         for recording in recordings
     ]
     origin = f"{name if isinstance(name, str) else name.__name__} {root.name}"
     ranges = converter.min_range_m, converter.max_range_m
-    said = {"license": converter.license, "citation": converter.citation, "simulated": converter.simulated or None}
+    said = {
+        "license": converter.license,
+        "citation": converter.citation,
+        "simulated": converter.simulated or None,
+    }
     known = {key: value for key, value in said.items() if value is not None}
     metadata = Metadata(layout.axes, target.classes, converter.sensor, *ranges, origin, known)
 
@@ -119,13 +138,20 @@ def convert(
         made = None
         if isinstance(grids, GridOptions):
             made = _make_grids(
-                conversions, grids, sink, out, poses, replace(pooled, part=Part(), progress=steps.stage())
+                conversions,
+                grids,
+                sink,
+                out,
+                poses,
+                replace(pooled, part=Part(), progress=steps.stage()),
             )
 
     failures = [failure for conversion in conversions for failure in conversion.failures]
     notes = [note for conversion in conversions for note in conversion.notes]
     if made is not None:
-        failures += [Failure(failure.sequence, failure.frame, failure.message) for failure in made.failures]
+        failures += [
+            Failure(failure.sequence, failure.frame, failure.message) for failure in made.failures
+        ]
         notes += made.notes
     return ConvertResult(
         tuple(sink.place(sequence_path(recording)) for recording in recordings),
@@ -146,7 +172,11 @@ class _ConvertedScans(Source):
         self._paths = {sequence_path(conversion.plan.recording) for conversion in conversions}
 
     def sequences(self) -> dict[str, Sequence]:
-        return {path: sequence for path, sequence in self._source.sequences().items() if path in self._paths}
+        return {
+            path: sequence
+            for path, sequence in self._source.sequences().items()
+            if path in self._paths
+        }
 
 
 def _make_grids(
@@ -159,17 +189,20 @@ def _make_grids(
 ) -> RegridResult | None:
     """Make grids of the converted sequences; None if no scan was converted.
 
-    All grids have the same bounds, so that they can be in one training set: the bounds of the options, moved to the height of the ground if
-    `follow_ground` is set.
+    All grids have the same bounds, so that they can be in one training set: the bounds of the
+    options, moved to the height of the ground if `follow_ground` is set.
     """
     conversions = [conversion for conversion in conversions if conversion.has_scans]
     if not conversions:
         return None  # every frame failed, and is reported
     spec, notes = grids.spec or GridSpec.published(), list[str]()
     if grids.follow_ground:
-        spec, notes = _fit(spec, [one.ground for one in conversions if one.ground is not None], sink.location)
+        spec, notes = _fit(
+            spec, [one.ground for one in conversions if one.ground is not None], sink.location
+        )
     observe = replace(
-        grids.observe if isinstance(grids.observe, FromScans) else FromScans(), poses=replace(poses, source="file")
+        grids.observe if isinstance(grids.observe, FromScans) else FromScans(),
+        poses=replace(poses, source="file"),
     )
     voting, scans = grids.voting or Voting(), _ConvertedScans(sink, conversions)
     notes += _what_is_cut(spec, scans)
@@ -178,20 +211,25 @@ def _make_grids(
 
 
 def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec, list[str]]:
-    """Return the grid, moved to the height of the ground, and notes for the user. `where` is the output."""
+    """Return the grid, moved to the height of the ground, and notes for the user.
+
+    `where` is the output.
+    """
     fitted = fit_to_ground(spec, joined(grounds)) if grounds else spec
     if fitted == spec:
         return spec, []
     low, high = (f"{pick(ground.below_m for ground in grounds):.2f}" for pick in (min, max))
     heights = f"the sensor is {low} m" if low == high else f"the sensors are {low} to {high} m"
     return fitted, [
-        f"{where}: {heights} above the ground, so grids reach from {fitted.lower[2]:g} to {fitted.upper[2]:g} m in z"
+        f"{where}: {heights} above the ground, so grids reach from {fitted.lower[2]:g} to "
+        f"{fitted.upper[2]:g} m in z"
         f" instead of {spec.lower[2]:g} to {spec.upper[2]:g} m; give --bounds to keep them"
     ]
 
 
 def _what_is_cut(spec: GridSpec, source: Source) -> list[str]:
-    """Return a note on the points above the grid, if there are many, from a few scans of a few sequences.
+    """Return a note on the points above the grid, if there are many, from a few scans of a few
+    sequences.
 
     Points below the grid are noted where the ground is measured.
     """
@@ -201,11 +239,15 @@ def _what_is_cut(spec: GridSpec, source: Source) -> list[str]:
         for frame in frames[:: max(len(frames) // _LOOKED_AT, 1)][:_LOOKED_AT]:
             axes = spec.to_axes(sequence.read("points", int(frame))[:, :3])
             heights = axes[((axes >= spec.lower) & (axes < spec.upper))[:, :2].all(axis=1), 2]
-            within, above = within + len(heights), above + int(np.count_nonzero(heights >= spec.upper[2]))
+            within, above = (
+                within + len(heights),
+                above + int(np.count_nonzero(heights >= spec.upper[2])),
+            )
     if above <= _MANY * within:
         return []
     return [
-        f"{source.location}: {100 * above / within:.0f}% of the points between the sides of the grid are above it (z > {spec.upper[2]:g} m);"
+        f"{source.location}: {100 * above / within:.0f}% of the points between the sides of the "
+        f"grid are above it (z > {spec.upper[2]:g} m);"
         " scans keep these points; give --bounds for a higher grid"
     ]
 
@@ -217,7 +259,11 @@ def _deal(recordings: Series[Recording], part: Part) -> list[Recording]:
     ends = np.cumsum([len(recording.frames) for recording in recordings])
     middles = ends - np.array([len(recording.frames) for recording in recordings]) / 2
     shares = np.minimum(middles * part.count // max(ends[-1], 1), part.count - 1)
-    return [recording for recording, share in zip(recordings, shares, strict=True) if share == part.number - 1]
+    return [
+        recording
+        for recording, share in zip(recordings, shares, strict=True)
+        if share == part.number - 1
+    ]
 
 
 def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> None:
@@ -230,14 +276,18 @@ def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> No
     """
     check_choice("split", split, SplitName)
     if not (isinstance(grids, GridOptions) or grids in ("voxels", None)):
-        raise ArgumentError("grids", expected='GridOptions(...), "voxels" or None', found=repr(grids))
+        raise ArgumentError(
+            "grids", expected='GridOptions(...), "voxels" or None', found=repr(grids)
+        )
     target = getattr(sink, "target", None)
     if isinstance(target, LocalTarget):
         check_outside(target.folder, str(source))
     if isinstance(grids, GridOptions):
         if not isinstance(grids.observe, FromScans | None):
             raise ArgumentError(
-                "observe", expected="FromScans(...), because scans are converted", found=str(grids.observe)
+                "observe",
+                expected="FromScans(...), because scans are converted",
+                found=str(grids.observe),
             )
         if not sink.is_readable:
             raise ArgumentError(
@@ -249,11 +299,14 @@ def _check(source: Path, sink: Sink, split: str, grids: Grids, part: Part) -> No
         if part.count > 1 and grids.follow_ground:
             raise ArgumentError(
                 "follow_ground",
-                expected="False, or `grids=None`, because a part does not know the ground of all recordings",
+                expected="False, or `grids=None`, because a part does not know the ground of all "
+                "recordings",
                 found="True",
             )
     if not source.exists():
-        raise MissingDataError(source, expected="a folder", found="nothing", advice="check the path")
+        raise MissingDataError(
+            source, expected="a folder", found="nothing", advice="check the path"
+        )
 
 
 def _check_rays(recordings: Series[Recording]) -> None:
@@ -263,5 +316,6 @@ def _check_rays(recordings: Series[Recording]) -> None:
                 "grids",
                 expected="voxels or none",
                 found=f"scans for {recording.location}",
-                advice="choose voxels or none: its points have no sensor positions, so free space cannot be distinguished from unknown space",
+                advice="choose voxels or none: its points have no sensor positions, so free space "
+                "cannot be distinguished from unknown space",
             )

@@ -1,4 +1,7 @@
-"""The first stage of a conversion, in workers: each frame is read once, and its scan is written. Also code that both stages share."""
+"""The first stage of a conversion, in workers: each frame is read once, and its scan is written.
+
+Also code that both stages share.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,9 @@ from carlasc.storage import layout
 from carlasc.storage.sinks import SequenceWriter
 
 VOXEL_FILES = "voxels_kitti"
-"""Folder of a sequence with the unchanged voxel files of the other data set, so that an export can write them again."""
+"""Folder of a sequence with the unchanged voxel files of the other data set, so that an export can
+write them again.
+"""
 
 Fields = Mapping[str, NDArray[Any]]
 """Arrays of a frame by the names of their fields, in the order in which they are written."""
@@ -47,7 +52,8 @@ class FrameJob:
 
 @dataclass
 class ConvertedFrame:
-    """The result of a stage for one frame: its fields were written, or are still to be written, or it failed.
+    """The result of a stage for one frame: its fields were written, or are still to be written, or
+    it failed.
 
     Attributes:
         number: frame number.
@@ -90,7 +96,9 @@ class StageBlock(ABC, Generic[Job]):
         """Return the fields of a frame to write, and add other requested data to the result."""
 
     def convert(self) -> list[ConvertedFrame]:
-        """Convert the frames, and write them if the writer can be used in workers. A frame that cannot be read has failed.
+        """Convert the frames, and write them if the writer can be used in workers.
+
+        A frame that cannot be read has failed.
 
         Raises:
             StorageError: the output cannot be written, so that all other frames would fail, too.
@@ -124,7 +132,8 @@ def write_frames(writer: SequenceWriter, frames: Iterable[ConvertedFrame]) -> No
 def in_blocks(
     items: Sequence[Item], number_of: Callable[[Item], int], writer: SequenceWriter
 ) -> Iterator[Sequence[Item]]:
-    """Yield frames in blocks, one per task: frames that are stored together, otherwise a few successive ones.
+    """Yield frames in blocks, one per task: frames that are stored together, otherwise a few
+    successive ones.
 
     Args:
         items: the frames, by increasing number.
@@ -134,7 +143,10 @@ def in_blocks(
     if writer.block == 1:
         yield from (items[i : i + _FRAMES] for i in range(0, len(items), _FRAMES))
     else:
-        yield from (list(block) for _, block in groupby(items, key=lambda item: number_of(item) // writer.block))
+        yield from (
+            list(block)
+            for _, block in groupby(items, key=lambda item: number_of(item) // writer.block)
+        )
 
 
 @dataclass(frozen=True)
@@ -177,7 +189,8 @@ class ScanBlock(StageBlock[ScanJob]):
 
 
 def make_fields(scan: Assembled, target: AxesAndClasses, where: str) -> dict[str, NDArray[Any]]:
-    """Return the fields of a scan in the axes and classes of the target, points last: a frame that has points is complete.
+    """Return the fields of a scan in the axes and classes of the target, points last: a frame that
+    has points is complete.
 
     Args:
         scan: the scan, right-handed, with class ids of the data set.
@@ -202,7 +215,9 @@ def make_fields(scan: Assembled, target: AxesAndClasses, where: str) -> dict[str
 def _voxel_fields(
     handle: FrameHandle, spec: GridSpec, target: AxesAndClasses, writer: SequenceWriter
 ) -> dict[str, NDArray[Any]]:
-    """Return the fields of the frame's own voxel grid, and keep its files; empty if it has none, or if it is written already."""
+    """Return the fields of the frame's own voxel grid, and keep its files; empty if it has none, or
+    if it is written already.
+    """
     grid = layout.grid_folder(spec)
     if writer.has(f"{grid}/counts", handle.number):
         return {}
@@ -210,7 +225,8 @@ def _voxel_fields(
     if voxels is None:
         return {}
     labels = target.map_labels(voxels.labels, f"voxels of {handle.location}")
-    known = voxels.known & ~((labels == 0) & (voxels.labels > 0))  # occupied, but its class has no target
+    # occupied, but its class has no target
+    known = voxels.known & ~((labels == 0) & (voxels.labels > 0))
     labels[~known] = 0
     for name, data in voxels.files.items():
         writer.write_document(f"{VOXEL_FILES}/{name}", data)

@@ -1,4 +1,6 @@
-"""The stages of the conversion of one recording: its scans are read once and written, then labels, boxes and flow from the motion of actors are added."""
+"""The stages of the conversion of one recording: its scans are read once and written, then labels,
+boxes and flow from the motion of actors are added.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,14 @@ from carlasc.converting.motion_stage import MotionBlock, MotionJob
 from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
 from carlasc.converting.protocol import Converter, FrameHandle
 from carlasc.converting.results import Failure
-from carlasc.converting.scan_stage import ConvertedFrame, ScanBlock, ScanJob, StageBlock, in_blocks, write_frames
+from carlasc.converting.scan_stage import (
+    ConvertedFrame,
+    ScanBlock,
+    ScanJob,
+    StageBlock,
+    in_blocks,
+    write_frames,
+)
 from carlasc.converting.trajectory import estimate_poses, fill_gaps, odometry_range
 from carlasc.core.boxes import Boxes
 from carlasc.groundtruth.heights import Ground, find_ground
@@ -45,7 +54,8 @@ class Conversion:
         steps: called after each frame of each stage.
         failures: frames that failed.
         notes: remarks about the result, one line each.
-        ground: the ground in some of its scans; None if none was found, or scans cannot be read back.
+        ground: the ground in some of its scans; None if none was found, or scans cannot be read
+            back.
     """
 
     plan: RecordingPlan
@@ -63,16 +73,23 @@ class Conversion:
         """Convert the recording, or the frames that an earlier run did not convert."""
         plan = self.plan
         begin(plan, self.target, metadata)
-        if plan.poses is None and plan.rig.needs_motion:  # the poses correct the scans: each scan is read twice
+        # the poses correct the scans: each scan is read twice
+        if plan.poses is None and plan.rig.needs_motion:
             self.steps.expect(len(plan.recording.frames))
-            plan.take_estimate(estimate_poses(plan.recording, self.converter, plan.times, self.steps, self.run_options))
+            plan.take_estimate(
+                estimate_poses(
+                    plan.recording, self.converter, plan.times, self.steps, self.run_options
+                )
+            )
             write_poses(plan, self.target)
         velocities = self._read_scans()
         if plan.poses is not None:
             write_poses(plan, self.target)
         self._finish(velocities)
         self._find_ground()
-        self.failures += [Failure(plan.recording.location, *problem) for problem in plan.recording.problems()]
+        self.failures += [
+            Failure(plan.recording.location, *problem) for problem in plan.recording.problems()
+        ]
         self.notes += self._remarks()
 
     @property
@@ -83,12 +100,16 @@ class Conversion:
     @property
     def has_scans(self) -> bool:
         """Whether the scan of any frame exists."""
-        return any(self.plan.writer.has("points", handle.number) for handle in self.plan.recording.frames)
+        return any(
+            self.plan.writer.has("points", handle.number) for handle in self.plan.recording.frames
+        )
 
     def _read_scans(self) -> Mapping[int, Mapping[int, Velocity]]:
-        """Read each frame once, and write its scan; return the velocities of numbered actors by frame.
+        """Read each frame once, and write its scan; return the velocities of numbered actors by
+        frame.
 
-        Missing poses are estimated meanwhile, and actors are tracked if their motion must be estimated.
+        Missing poses are estimated meanwhile, and actors are tracked if their motion must be
+        estimated.
         """
         plan = self.plan
         follow = plan.flow and plan.boxes is None and bool(plan.unfinished)
@@ -99,9 +120,13 @@ class Conversion:
             if follow or estimate or handle.number in plan.missing or plan.voxels
         ]
         self.steps(len(plan.recording.frames) - len(chosen))
-        jobs = [ScanJob(handle, plan.motion(handle), handle.number in plan.missing) for handle in chosen]
+        jobs = [
+            ScanJob(handle, plan.motion(handle), handle.number in plan.missing) for handle in chosen
+        ]
         blocks = [
-            ScanBlock(tuple(part), self.target, plan.writer, plan.rig, plan.voxels, estimate, follow)
+            ScanBlock(
+                tuple(part), self.target, plan.writer, plan.rig, plan.voxels, estimate, follow
+            )
             for part in in_blocks(jobs, lambda job: job.handle.number, plan.writer)
         ]
         actors = ActorMotion(self.converter.classes, self.run_options)
@@ -112,12 +137,19 @@ class Conversion:
             if follow:
                 actors.add(result.number, float(plan.times[result.number]), pose, result.actors)
                 self._unnumbered += result.unnumbered
-        if estimate and len(self._failed) < len(plan.recording.frames):  # otherwise, the failures are reported
-            plan.take_estimate(fill_gaps(list(found), np.array(list(found.values())), plan.recording))
+        # otherwise, the failures are reported
+        if estimate and len(self._failed) < len(plan.recording.frames):
+            plan.take_estimate(
+                fill_gaps(list(found), np.array(list(found.values())), plan.recording)
+            )
         return actors.finish()
 
-    def _placed(self, results: Iterator[ConvertedFrame]) -> Iterator[tuple[ConvertedFrame, NDArray[np.float64]]]:
-        """Yield the frames that were read with their poses, which are estimated if they are not known."""
+    def _placed(
+        self, results: Iterator[ConvertedFrame]
+    ) -> Iterator[tuple[ConvertedFrame, NDArray[np.float64]]]:
+        """Yield the frames that were read with their poses, which are estimated if they are not
+        known.
+        """
         usable = (result for result in results if result.failure is None)
         if self.plan.poses is not None:
             for result in usable:
@@ -141,11 +173,15 @@ class Conversion:
             yield waiting.popleft(), pose
 
     def _work(self, blocks: Sequence[StageBlock[Any]]) -> Iterator[ConvertedFrame]:
-        """Yield the frames of blocks after their conversion; if workers cannot write them, they are written here."""
+        """Yield the frames of blocks after their conversion; if workers cannot write them, they are
+        written here.
+        """
         run = partial(run_all, StageBlock.convert, run=self.run_options)
 
         def one_by_one(block: StageBlock[Any], message: str) -> list[ConvertedFrame]:
-            """Convert the frames of a lost block again, one by one, because one of them may have killed the workers."""
+            """Convert the frames of a lost block again, one by one, because one of them may have
+            killed the workers.
+            """
             if len(block.jobs) == 1 or self.plan.writer.block > 1:
                 return block.fail(message)
             singles = [replace(block, jobs=(job,)) for job in block.jobs]
@@ -157,7 +193,9 @@ class Conversion:
                 for frame in frames:
                     if frame.failure is not None:
                         self._failed.add(frame.number)
-                        self.failures.append(Failure(self.plan.recording.location, frame.number, frame.failure))
+                        self.failures.append(
+                            Failure(self.plan.recording.location, frame.number, frame.failure)
+                        )
                     yield frame
                 self.steps(len(frames))
 
@@ -193,43 +231,59 @@ class Conversion:
         deque(self._work(blocks), maxlen=0)  # frames are written; nothing is kept
 
     def _labelled_around(self, handle: FrameHandle) -> tuple[MotionJob, ...]:
-        """Return the labelled frames before and after an unlabelled frame of a recording with labels."""
+        """Return the labelled frames before and after an unlabelled frame of a recording with
+        labels.
+        """
         plan = self.plan
         if handle.labelled or not plan.recording.has_labels or plan.poses is None:
             return ()
         place = bisect(self._labelled, handle.number, key=attrgetter("number"))
         near = self._labelled[max(place - 1, 0) : place + 1]
-        return tuple(MotionJob(other, plan.motion(other), first_T_scan=plan.poses[other.number]) for other in near)
+        return tuple(
+            MotionJob(other, plan.motion(other), first_T_scan=plan.poses[other.number])
+            for other in near
+        )
 
     @cached_property
     def _labelled(self) -> list[FrameHandle]:
         """The frames with labels of their own."""
         return [
-            handle for handle in self.plan.recording.frames if handle.labelled and handle.number not in self._failed
+            handle
+            for handle in self.plan.recording.frames
+            if handle.labelled and handle.number not in self._failed
         ]
 
     def _box_tracks(self) -> tuple[list[Track] | None, dict[int, Boxes]]:
-        """Return the tracks of the recording's boxes, and the boxes of each annotated frame, in the classes of the target."""
+        """Return the tracks of the recording's boxes, and the boxes of each annotated frame, in the
+        classes of the target.
+        """
         plan = self.plan
         if plan.boxes is None or plan.poses is None:
             return None, {}
         where = f"boxes of {plan.recording.location}"
         boxes = {
-            number: replace(own, labels=self.target.map_labels(own.labels, f"{where}: frame {number}"))
+            number: replace(
+                own, labels=self.target.map_labels(own.labels, f"{where}: frame {number}")
+            )
             for number, own in plan.boxes.items()
         }
         numbers = sorted({handle.number for handle in plan.recording.frames} | set(boxes))
         times = {number: float(plan.times[number]) for number in numbers}
-        return tracks_from_boxes(boxes, {number: plan.poses[number] for number in boxes}, times), boxes
+        return tracks_from_boxes(
+            boxes, {number: plan.poses[number] for number in boxes}, times
+        ), boxes
 
     def _find_ground(self) -> None:
-        """Find the ground in some of the scans, and write the height of the sensor if the data set does not say it."""
+        """Find the ground in some of the scans, and write the height of the sensor if the data set
+        does not say it.
+        """
         plan, frames = self.plan, [handle.number for handle in self.plan.recording.frames]
         chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, _GROUND_FRAMES).astype(int)}
         scans = [
             points
             for number in sorted(chosen - self._failed)
-            if plan.writer.has("points", number) and (points := plan.writer.read("points", number)) is not None
+            if plan.writer.has("points", number)
+            and (points := plan.writer.read("points", number)) is not None
         ]
         self.ground = find_ground(scans)
         if self.ground is not None:
@@ -240,27 +294,40 @@ class Conversion:
         notes = [*plan.recording.notes(), *plan.notes]
         if plan.boxes is not None and not plan.recording.has_labels:
             notes.append(
-                "points have no labels: points in boxes got the class of the box, others are ground or have no class"
+                "points have no labels: points in boxes got the class of the box, others are "
+                "ground or have no class"
             )
-        elif plan.boxes is not None and not all(handle.labelled for handle in plan.recording.frames):
+        elif plan.boxes is not None and not all(
+            handle.labelled for handle in plan.recording.frames
+        ):
             unlabelled = sum(not handle.labelled for handle in plan.recording.frames)
             notes.append(
-                f"{unlabelled} scans have no labels: their points got the class of the box that they are in, or of labelled points nearby"
+                f"{unlabelled} scans have no labels: their points got the class of the box that "
+                f"they are in, or of labelled points nearby"
             )
         elif plan.boxes is None and not plan.recording.has_labels:
-            notes.append("scans have no labels, so neither labels nor instances nor flow were written")
+            notes.append(
+                "scans have no labels, so neither labels nor instances nor flow were written"
+            )
         if self._unnumbered:
             notes.append(
-                f"{self._unnumbered} moving points belong to no numbered actor; their flow is unknown and set to 0"
+                f"{self._unnumbered} moving points belong to no numbered actor; their flow is "
+                f"unknown and set to 0"
             )
         first, last = plan.recording.frames[0].number, plan.recording.frames[-1].number
         if gaps := last - first + 1 - len(plan.recording.frames):
-            notes.append(f"{gaps} of the {last - first + 1} frames from {first} to {last} have no scan")
+            notes.append(
+                f"{gaps} of the {last - first + 1} frames from {first} to {last} have no scan"
+            )
         return [f"{plan.writer.location}: {note}" for note in notes]
 
 
-def _near(tracks: list[Track], handles: Sequence[FrameHandle], poses: NDArray[np.float64]) -> tuple[Track, ...]:
-    """Return the tracks near the sensor in some frames, cut to these frames, so that little is sent to a worker."""
+def _near(
+    tracks: list[Track], handles: Sequence[FrameHandle], poses: NDArray[np.float64]
+) -> tuple[Track, ...]:
+    """Return the tracks near the sensor in some frames, cut to these frames, so that little is sent
+    to a worker.
+    """
     here = poses[handles[0].number, :2, 3]
     near = []
     for track in tracks:

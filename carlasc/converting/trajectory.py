@@ -1,4 +1,6 @@
-"""Poses and times of a recording: from its files or estimated from its scans, and whether the scans fit the poses."""
+"""Poses and times of a recording: from its files or estimated from its scans, and whether the scans
+fit the poses.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +31,14 @@ if TYPE_CHECKING:
 FILE, KISS_ICP = "file", "kiss-icp"
 _ESTIMATE = 'estimate poses from the scans with `poses="kiss-icp"`'
 _ACCEPT = "accept them as they are with `force=True`"
-_SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])  # fourth differences, which are nearly 0 for a vehicle
+# fourth differences, which are nearly 0 for a vehicle
+_SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 _JITTER_M = 0.05
 
 
 def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return (F,) seconds by frame number, by the clock of the recording; without times, 10 Hz from 0.
+    """Return (F,) seconds by frame number, by the clock of the recording; without times, 10 Hz from
+    0.
 
     Raises:
         FormatError: a frame has no time, or a time is not finite.
@@ -52,8 +56,11 @@ def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDAr
     return check_seconds(np.asarray(times[:frames], np.float64), recording.location)
 
 
-def read_trajectory(recording: Recording, times: NDArray[np.float64], options: PoseOptions) -> Trajectory | None:
-    """Return the poses of the vehicle at their own times, from the recording's files; None if they must be estimated.
+def read_trajectory(
+    recording: Recording, times: NDArray[np.float64], options: PoseOptions
+) -> Trajectory | None:
+    """Return the poses of the vehicle at their own times, from the recording's files; None if they
+    must be estimated.
 
     Poses without times belong to the frames, one by one.
 
@@ -70,7 +77,10 @@ def read_trajectory(recording: Recording, times: NDArray[np.float64], options: P
     if trajectory is None:
         if options.source == FILE:
             raise MissingDataError(
-                recording.location, expected="a file of poses", found="none", advice=f"copy it, or {_ESTIMATE}"
+                recording.location,
+                expected="a file of poses",
+                found="none",
+                advice=f"copy it, or {_ESTIMATE}",
             )
         return None
     last = recording.frames[-1].number
@@ -94,14 +104,21 @@ def read_trajectory(recording: Recording, times: NDArray[np.float64], options: P
 
 
 def at_frames(world_T_vehicle: NDArray[np.float64], times: NDArray[np.float64]) -> Trajectory:
-    """Return the trajectory of (F, 4, 4) poses of frames. If times do not increase, 0.1 s between frames is assumed."""
+    """Return the trajectory of (F, 4, 4) poses of frames.
+
+    If times do not increase, 0.1 s between frames is assumed.
+    """
     if not (np.diff(times) > 0).all():
         times = np.arange(len(times), dtype=np.float64) * layout.FRAME_PERIOD_S
     return Trajectory(world_T_vehicle, times)
 
 
-def scan_poses(trajectory: Trajectory, recording: Recording, times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F, 4, 4) first_T_scan by frame number. Poses with the times of frames are not changed, others are interpolated.
+def scan_poses(
+    trajectory: Trajectory, recording: Recording, times: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return (F, 4, 4) first_T_scan by frame number.
+
+    Poses with the times of frames are not changed, others are interpolated.
 
     Args:
         trajectory: poses of the vehicle, with times.
@@ -115,11 +132,15 @@ def scan_poses(trajectory: Trajectory, recording: Recording, times: NDArray[np.f
 
 
 def jitter(poses: NDArray[np.float64]) -> float:
-    """Return the noise of (F, 4, 4) poses of frames about a smooth path, metres: such as that of an unfiltered receiver."""
+    """Return the noise of (F, 4, 4) poses of frames about a smooth path, metres: such as that of an
+    unfiltered receiver.
+    """
     places = poses[:, :3, 3]
     if len(places) < 2 * len(_SMOOTH):
         return 0.0
-    jumps = np.stack([np.convolve(places[:, axis], _SMOOTH, mode="valid") for axis in range(3)], axis=1)
+    jumps = np.stack(
+        [np.convolve(places[:, axis], _SMOOTH, mode="valid") for axis in range(3)], axis=1
+    )
     return float(np.median(np.linalg.norm(jumps, axis=1)) / np.linalg.norm(_SMOOTH))
 
 
@@ -132,7 +153,9 @@ def jitter_note(poses: NDArray[np.float64]) -> str | None:
 
 @dataclass(frozen=True)
 class _ReadUsable:
-    """Reads the points of a scan for odometry, in a worker, while poses of earlier scans are estimated."""
+    """Reads the points of a scan for odometry, in a worker, while poses of earlier scans are
+    estimated.
+    """
 
     rig: Rig
 
@@ -148,12 +171,19 @@ class _ReadUsable:
 
 
 def estimate_poses(
-    recording: Recording, converter: Converter, times: NDArray[np.float64], step: Callable[[], object], run: Run
+    recording: Recording,
+    converter: Converter,
+    times: NDArray[np.float64],
+    step: Callable[[], object],
+    run: Run,
 ) -> NDArray[np.float64]:
-    """Estimate the pose of each scan with KISS-ICP. A frame without a scan gets the pose of the scan before it.
+    """Estimate the pose of each scan with KISS-ICP.
 
-    Points of sensors that are not corrected for motion are corrected by the estimate, if their times are known. Scans that cannot be
-    read are skipped: their conversion reports them. So are scans with too few points.
+    A frame without a scan gets the pose of the scan before it.
+
+    Points of sensors that are not corrected for motion are corrected by the estimate, if their
+    times are known. Scans that cannot be read are skipped: their conversion reports them. So are
+    scans with too few points.
 
     Args:
         recording: its scans.
@@ -189,7 +219,9 @@ def estimate_poses(
                     yield scan
 
     nearest, farthest = odometry_range(converter)
-    poses = list(odometry.follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest))
+    poses = list(
+        odometry.follow_scans(scans(), times=read_at, min_range_m=nearest, max_range_m=farthest)
+    )
     if len(errors) == len(recording.frames):
         raise errors[0]
     return fill_gaps(found, np.array(poses), recording)
@@ -200,8 +232,11 @@ def odometry_range(converter: Converter) -> tuple[float, float]:
     return converter.min_range_m or 0.0, converter.max_range_m or 100.0
 
 
-def fill_gaps(frames: list[int], poses: NDArray[np.float64], recording: Recording) -> NDArray[np.float64]:
-    """Return (F, 4, 4) poses by frame number from those of some frames: others have the pose of the frame before.
+def fill_gaps(
+    frames: list[int], poses: NDArray[np.float64], recording: Recording
+) -> NDArray[np.float64]:
+    """Return (F, 4, 4) poses by frame number from those of some frames: others have the pose of the
+    frame before.
 
     Args:
         frames: M frame numbers, increasing.
@@ -222,10 +257,13 @@ def fill_gaps(frames: list[int], poses: NDArray[np.float64], recording: Recordin
     return poses[np.clip(lines, 0, None)]
 
 
-def check_poses(recording: Recording, converter: Converter, poses: NDArray[np.float64]) -> str | None:
+def check_poses(
+    recording: Recording, converter: Converter, poses: NDArray[np.float64]
+) -> str | None:
     """Check that the scans overlap under their poses, which reads some scans.
 
-    Poses of another point of the vehicle, or some frames late, are accepted with a note, which is returned.
+    Poses of another point of the vehicle, or some frames late, are accepted with a note, which is
+    returned.
 
     Args:
         recording: its scans.
@@ -250,7 +288,8 @@ def check_poses(recording: Recording, converter: Converter, poses: NDArray[np.fl
         raise FormatError(
             recording.location,
             expected=expected,
-            found=f"{diagnosis.share_there:.0%} of a scan's structure overlaps that of an earlier scan; the likely cause is"
+            found=f"{diagnosis.share_there:.0%} of a scan's structure overlaps that of an earlier "
+            f"scan; the likely cause is"
             f" {diagnosis.correction.name} (with that corrected: {diagnosis.corrected_share:.0%})",
             advice=f"{diagnosis.correction.advice}, or {_ACCEPT}",
         )
@@ -260,7 +299,8 @@ def check_poses(recording: Recording, converter: Converter, poses: NDArray[np.fl
             recording.location,
             expected=expected,
             found=f"scans that are about ({x:.1f}, {y:.1f}, {z:.1f}) m away from each other",
-            advice=f"check that poses and calibration belong to this sequence, {_ESTIMATE}, or {_ACCEPT}",
+            advice=f"check that poses and calibration belong to this sequence, {_ESTIMATE}, or "
+            f"{_ACCEPT}",
         )
     mounting = None if diagnosis.quality is None else diagnosis.quality.mounting
     described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)

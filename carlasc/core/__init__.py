@@ -1,4 +1,6 @@
-"""Values without files: transforms, cells and grids, scans, boxes, class tables and the remaps between them."""
+"""Values without files: transforms, cells and grids, scans, boxes, class tables and the remaps
+between them.
+"""
 
 import lazy_loader
 

@@ -1,6 +1,8 @@
-"""Conversion between right-handed axes (y to the left) and the left-handed axes of CarlaSC (y to the right), and all permutations of axes.
+"""Conversion between right-handed axes (y to the left) and the left-handed axes of CarlaSC (y to
+the right), and all permutations of axes.
 
-The conversion changes the sign of y. It is its own inverse, so each function works in both directions.
+The conversion changes the sign of y. It is its own inverse, so each function works in both
+directions.
 """
 
 from __future__ import annotations
@@ -24,13 +26,18 @@ _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def choices_of_axes() -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Yield the 48 signed permutations of axes, the identity first: the new axes in terms of the old ones, such as "-y, x, z", and the (3, 3) matrix."""
+    """Yield the 48 signed permutations of axes, the identity first: the new axes in terms of the
+    old ones, such as "-y, x, z", and the (3, 3) matrix.
+    """
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
             matrix[range(3), order] = signs
             yield (
-                ", ".join(f"{'-' if s < 0 else ''}{'xyz'[axis]}" for s, axis in zip(signs, order, strict=True)),
+                ", ".join(
+                    f"{'-' if s < 0 else ''}{'xyz'[axis]}"
+                    for s, axis in zip(signs, order, strict=True)
+                ),
                 matrix,
             )
 
@@ -46,8 +53,14 @@ def mirror_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def mirror_boxes(boxes: Boxes) -> Boxes:
-    """Mirror boxes. The frame of each box is mirrored too, so that x is still along its length and the rotation is proper."""
-    return Boxes.from_poses(boxes.tracks, boxes.labels, mirror_poses(boxes.sensor_T_box), boxes.sizes, boxes.annotated)
+    """Mirror boxes.
+
+    The frame of each box is mirrored too, so that x is still along its length and the rotation is
+    proper.
+    """
+    return Boxes.from_poses(
+        boxes.tracks, boxes.labels, mirror_poses(boxes.sensor_T_box), boxes.sizes, boxes.annotated
+    )
 
 
 def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:
@@ -57,7 +70,9 @@ def mirror_grid(grid: NDArray[_Scalar]) -> NDArray[_Scalar]:
 
 
 def mirror_spec(spec: GridSpec) -> GridSpec:
-    """Return the geometry of a mirrored grid: the bounds of y, or of the azimuth, are swapped and negated."""
+    """Return the geometry of a mirrored grid: the bounds of y, or of the azimuth, are swapped and
+    negated.
+    """
     (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
     return GridSpec(spec.coordinates, spec.size, (x0, -y1, z0), (x1, -y0, z1))
 
@@ -74,6 +89,8 @@ def mirror_scan(scan: Scan) -> Scan:
         scan,
         points=mirror_points(scan.points),
         flow=None if scan.flow is None else mirror_points(scan.flow),
-        others={name: mirror_points(v) if name == "origins" else v for name, v in scan.others.items()},
+        others={
+            name: mirror_points(v) if name == "origins" else v for name, v in scan.others.items()
+        },
         boxes=None if scan.boxes is None else mirror_boxes(scan.boxes),
     )

@@ -18,35 +18,46 @@ from carlasc.errors import FormatError
 
 BOXES_DTYPE = np.dtype(
     [("track", "<u4"), ("label", "<u4")]
-    + [(name, "<f8") for name in ("x", "y", "z", "qw", "qx", "qy", "qz", "length", "width", "height")]
+    + [
+        (name, "<f8")
+        for name in ("x", "y", "z", "qw", "qx", "qy", "qz", "length", "width", "height")
+    ]
     + [("annotated", "u1")]
 )
 """One row per box, as in the files of the layout. See `Boxes` for the meaning of the columns."""
 
-_CENTER, _QUATERNION, _SIZE = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("length", "width", "height")
-_UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1, as for the rotations of poses
+_CENTER, _QUATERNION, _SIZE = (
+    ("x", "y", "z"),
+    ("qw", "qx", "qy", "qz"),
+    ("length", "width", "height"),
+)
+_UNIT_TOLERANCE = (
+    1e-3  # greatest deviation of a quaternion's norm from 1, as for the rotations of poses
+)
 
 
 @dataclass(frozen=True)
 class Boxes:
     """The tracked boxes of one frame.
 
-    Each box has a frame: its origin is the centre of the box, x points forward along the length, z up along the height.
+    Each box has a frame: its origin is the centre of the box, x points forward along the length, z
+    up along the height.
 
     Attributes:
-        tracks: (N,) uint32 track numbers of 1 or more, constant over a sequence, and equal to the field `instances` if it exists. A
-            track has at most one box per frame.
+        tracks: (N,) uint32 track numbers of 1 or more, constant over a sequence, and equal to the
+            field `instances` if it exists. A track has at most one box per frame.
         labels: (N,) uint32 class ids.
         centers: (N, 3) float64, metres, sensor frame.
-        quaternions: (N, 4) float64, unit quaternions w, x, y, z of the rotation from the box to the sensor frame. If the sensor is
-            tilted, boxes that are upright in the world are tilted too.
+        quaternions: (N, 4) float64, unit quaternions w, x, y, z of the rotation from the box to the
+            sensor frame. If the sensor is tilted, boxes that are upright in the world are tilted
+            too.
         sizes: (N, 3) float64, metres: length, width, height, along x, y, z of the box.
-        annotated: (N,) bool: whether the box was annotated in this frame. Other boxes are interpolated, for example between two annotated
-            frames.
+        annotated: (N,) bool: whether the box was annotated in this frame. Other boxes are
+            interpolated, for example between two annotated frames.
 
     Raises:
-        FormatError: shapes do not match, a number is not finite, a size is not positive, a quaternion is not a rotation, or a
-            track is 0 or occurs twice.
+        FormatError: shapes do not match, a number is not finite, a size is not positive, a
+            quaternion is not a rotation, or a track is 0 or occurs twice.
     """
 
     tracks: NDArray[np.uint32]
@@ -58,19 +69,38 @@ class Boxes:
 
     def __post_init__(self) -> None:
         count = len(self.tracks)
-        shapes = {"tracks": (), "labels": (), "centers": (3,), "quaternions": (4,), "sizes": (3,), "annotated": ()}
+        shapes = {
+            "tracks": (),
+            "labels": (),
+            "centers": (3,),
+            "quaternions": (4,),
+            "sizes": (3,),
+            "annotated": (),
+        }
         for name, row in shapes.items():
             array = getattr(self, name)
             if array.shape != (count, *row):
-                raise FormatError(f"boxes: {name}", expected=f"shape {(count, *row)}", found=str(array.shape))
+                raise FormatError(
+                    f"boxes: {name}", expected=f"shape {(count, *row)}", found=str(array.shape)
+                )
         for name in ("tracks", "labels"):
             if getattr(self, name).dtype.kind != "u":
-                raise FormatError(f"boxes: {name}", expected="unsigned integers", found=str(getattr(self, name).dtype))
+                raise FormatError(
+                    f"boxes: {name}",
+                    expected="unsigned integers",
+                    found=str(getattr(self, name).dtype),
+                )
         for name in ("centers", "quaternions", "sizes"):
             self._check(name, np.isfinite(getattr(self, name)).all(axis=1), "finite numbers")
-        self._check("sizes", (self.sizes > 0).all(axis=1), "positive lengths, widths and heights, in metres")
+        self._check(
+            "sizes", (self.sizes > 0).all(axis=1), "positive lengths, widths and heights, in metres"
+        )
         norms = np.linalg.norm(self.quaternions, axis=1)
-        self._check("quaternions", np.abs(norms - 1) <= _UNIT_TOLERANCE, "a rotation: a quaternion of length 1")
+        self._check(
+            "quaternions",
+            np.abs(norms - 1) <= _UNIT_TOLERANCE,
+            "a rotation: a quaternion of length 1",
+        )
         self._check("tracks", self.tracks > 0, "numbers above 0")
         first = np.zeros(count, np.bool_)
         first[np.unique(self.tracks, return_index=True)[1]] = True
@@ -102,7 +132,8 @@ class Boxes:
             annotated: (N,) whether a box was annotated; None for all.
 
         Raises:
-            FormatError: as for the constructor. The poses are not checked; use `carlasc.core.check_rigid`.
+            FormatError: as for the constructor. The poses are not checked; use
+                `carlasc.core.check_rigid`.
         """
         return cls(
             np.asarray(tracks, np.uint32),
@@ -139,7 +170,11 @@ class Boxes:
     def to_table(self) -> NDArray[np.void]:
         """Return the boxes as a table, (N,) `BOXES_DTYPE`."""
         table = np.empty(len(self), BOXES_DTYPE)
-        table["track"], table["label"], table["annotated"] = self.tracks, self.labels, self.annotated
+        table["track"], table["label"], table["annotated"] = (
+            self.tracks,
+            self.labels,
+            self.annotated,
+        )
         numbers = np.concatenate([self.centers, self.quaternions, self.sizes], axis=1)
         for name, column in zip((*_CENTER, *_QUATERNION, *_SIZE), numbers.T, strict=True):
             table[name] = column
@@ -170,31 +205,45 @@ class Boxes:
         Raises:
             FormatError: a track has a box in both.
         """
-        return Boxes(*(np.concatenate([own, vars(others)[name]]) for name, own in vars(self).items()))
+        return Boxes(
+            *(np.concatenate([own, vars(others)[name]]) for name, own in vars(self).items())
+        )
 
     def transform(self, dst_T_sensor: Transform) -> Boxes:
-        """Return the boxes in another frame, for example the world frame. `dst_T_sensor` is (4, 4) and rigid."""
-        return Boxes.from_poses(self.tracks, self.labels, dst_T_sensor @ self.sensor_T_box, self.sizes, self.annotated)
+        """Return the boxes in another frame, for example the world frame.
+
+        `dst_T_sensor` is (4, 4) and rigid.
+        """
+        return Boxes.from_poses(
+            self.tracks, self.labels, dst_T_sensor @ self.sensor_T_box, self.sizes, self.annotated
+        )
 
     def contains(self, points: NDArray[np.floating], margin_m: float = 0.0) -> NDArray[np.bool_]:
         """Return whether each point is in each box.
 
         Args:
             points: (M, 3) metres, sensor frame.
-            margin_m: margin by which the boxes are enlarged on all sides, metres; a negative margin shrinks them.
+            margin_m: margin by which the boxes are enlarged on all sides, metres; a negative margin
+                shrinks them.
 
         Returns:
             (N, M) bool.
         """
         inside = np.zeros((len(self), len(points)), np.bool_)
-        for row, (pose, half) in enumerate(zip(self.sensor_T_box, self.sizes / 2 + margin_m, strict=True)):
-            near = np.flatnonzero((np.abs(points - self.centers[row]) <= np.linalg.norm(half)).all(axis=1))
+        for row, (pose, half) in enumerate(
+            zip(self.sensor_T_box, self.sizes / 2 + margin_m, strict=True)
+        ):
+            near = np.flatnonzero(
+                (np.abs(points - self.centers[row]) <= np.linalg.norm(half)).all(axis=1)
+            )
             body = transform_points(invert(pose), points[near])
             inside[row, near] = (np.abs(body) <= half).all(axis=1)
         return inside
 
     def owners(self, points: NDArray[np.floating], margin_m: float = 0.0) -> NDArray[np.int64]:
-        """Return (M,) int64, the row of the box that contains each of (M, 3) points: the smallest of several boxes, -1 for no box."""
+        """Return (M,) int64, the row of the box that contains each of (M, 3) points: the smallest
+        of several boxes, -1 for no box.
+        """
         owners = np.full(len(points), -1, np.int64)
         inside = self.contains(points, margin_m)
         for row in np.argsort(-np.prod(self.sizes, axis=1), kind="stable").tolist():

@@ -1,7 +1,7 @@
 """Cameras of a recording: projection, pose, and their description in cameras.json.
 
-The camera frame has x to the right, y down and z forward along its axis, in metres. Pixel (0, 0) is the centre of the upper left pixel,
-so an image covers -0.5 <= u < width - 0.5.
+The camera frame has x to the right, y down and z forward along its axis, in metres. Pixel (0, 0) is
+the centre of the upper left pixel, so an image covers -0.5 <= u < width - 0.5.
 """
 
 from __future__ import annotations
@@ -20,13 +20,34 @@ from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import FormatError
 
 Lens = Literal["pinhole", "radial-tangential", "fisheye"]
-"""Camera models: without distortion; k1, k2, p1, p2, k3 .. k6 of OpenCV; the equidistant fisheye of OpenCV with k1 .. k4."""
+"""Camera models: without distortion; k1, k2, p1, p2, k3 .. k6 of OpenCV; the equidistant fisheye of
+OpenCV with k1 .. k4.
+"""
 
-_COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"pinhole": (0,), "radial-tangential": (4, 5, 8), "fisheye": (4,)}
-_WIDEST = {"pinhole": 1e3, "radial-tangential": 8.0, "fisheye": math.radians(110)}  # radius in the plane of `_distort`
+_COEFFICIENTS: Mapping[str, tuple[int, ...]] = {
+    "pinhole": (0,),
+    "radial-tangential": (4, 5, 8),
+    "fisheye": (4,),
+}
+# radius in the plane of `_distort`
+_WIDEST = {
+    "pinhole": 1e3,
+    "radial-tangential": 8.0,
+    "fisheye": math.radians(110),
+}
 _STEPS, _ROUNDS = 4096, 8  # length of the table of radii, and iterations of Newton's method
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-_KEYS = ("name", "width", "height", "model", "matrix", "distortion", "sensor_T_camera", "times", "images")
+_KEYS = (
+    "name",
+    "width",
+    "height",
+    "model",
+    "matrix",
+    "distortion",
+    "sensor_T_camera",
+    "times",
+    "images",
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,14 +60,19 @@ class CameraModel:
         height: rows of an image, pixels.
         model: "pinhole", "radial-tangential" or "fisheye" (equidistant).
         matrix: (3, 3) float64 intrinsic matrix, pixels.
-        distortion: coefficients in the order of OpenCV: none, four, five or eight (k1, k2, p1, p2, k3, ...), or four for a fisheye.
-        sensor_T_camera: (4, 4) float64, from the camera frame to the frame of the scans. It is a rotation if the axes of the scans are
-            right-handed, otherwise a reflection, because the camera frame is right-handed.
-        times: (F,) time of the image of each frame, seconds by the clock of times.txt, NaN for no image; None for the times of the scans.
-        images: path of the image of each frame, relative to the folder of the sequence, "" for no image; None for the folder of images.
+        distortion: coefficients in the order of OpenCV: none, four, five or eight (k1, k2, p1, p2,
+            k3, ...), or four for a fisheye.
+        sensor_T_camera: (4, 4) float64, from the camera frame to the frame of the scans. It is a
+            rotation if the axes of the scans are right-handed, otherwise a reflection, because the
+            camera frame is right-handed.
+        times: (F,) time of the image of each frame, seconds by the clock of times.txt, NaN for no
+            image; None for the times of the scans.
+        images: path of the image of each frame, relative to the folder of the sequence, "" for no
+            image; None for the folder of images.
 
     Raises:
-        FormatError: the model is unknown, the coefficients do not fit it, or a number is out of its range.
+        FormatError: the model is unknown, the coefficients do not fit it, or a number is out of its
+            range.
     """
 
     name: str
@@ -63,22 +89,39 @@ class CameraModel:
         where = f"camera {self.name}"
         if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
             raise FormatError(
-                "camera", expected="a name of letters, digits, - and _, at most 64", found=repr(self.name)
+                "camera",
+                expected="a name of letters, digits, - and _, at most 64",
+                found=repr(self.name),
             )
         if self.model not in get_args(Lens):
-            raise FormatError(where, expected=f"one of the models {', '.join(get_args(Lens))}", found=repr(self.model))
+            raise FormatError(
+                where,
+                expected=f"one of the models {', '.join(get_args(Lens))}",
+                found=repr(self.model),
+            )
         if len(self.distortion) not in _COEFFICIENTS[self.model]:
             counts = " or ".join(map(str, _COEFFICIENTS[self.model]))
             expected = f"{counts} coefficients of distortion for {self.model}"
             raise FormatError(where, expected=expected, found=str(len(self.distortion)))
         for name in ("width", "height"):
             if type(size := getattr(self, name)) is not int or not 0 < size <= 65536:
-                raise FormatError(where, expected=f"a {name} of 1 to 65536 pixels", found=repr(size))
+                raise FormatError(
+                    where, expected=f"a {name} of 1 to 65536 pixels", found=repr(size)
+                )
         matrix = np.asarray(self.matrix, np.float64)
-        focal = matrix.shape == (3, 3) and np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0
+        focal = (
+            matrix.shape == (3, 3)
+            and np.isfinite(matrix).all()
+            and matrix[0, 0] > 0
+            and matrix[1, 1] > 0
+        )
         if not focal or (matrix[2] != (0, 0, 1)).any() or not np.isfinite(self.distortion).all():
             found = np.array2string(matrix, separator=" ").replace("\n", "")
-            raise FormatError(where, expected="a matrix of fx s cx, 0 fy cy, 0 0 1, and finite numbers", found=found)
+            raise FormatError(
+                where,
+                expected="a matrix of fx s cx, 0 fy cy, 0 0 1, and finite numbers",
+                found=found,
+            )
         place = np.asarray(self.sensor_T_camera, np.float64)
         proper = (
             place * np.array([np.sign(np.linalg.det(place[:3, :3])) or 1.0, 1, 1, 1])
@@ -93,7 +136,8 @@ class CameraModel:
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return (N, 2) float64 pixel column and row of (N, 3) points in the camera frame, metres.
 
-        NaN for points behind the camera, or too far from its axis for the model. Pixels may be outside the image.
+        NaN for points behind the camera, or too far from its axis for the model. Pixels may be
+        outside the image.
         """
         x, y, z = np.asarray(points, np.float64).T
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -110,13 +154,19 @@ class CameraModel:
         return pixels
 
     def unproject(self, pixels: ArrayLike) -> NDArray[np.float64]:
-        """Return (N, 3) unit vectors in the camera frame, the viewing directions of (N, 2) pixels; NaN where the model is not valid."""
-        wanted = (np.asarray(pixels, np.float64) - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
+        """Return (N, 3) unit vectors in the camera frame, the viewing directions of (N, 2) pixels;
+        NaN where the model is not valid.
+        """
+        wanted = (np.asarray(pixels, np.float64) - self.matrix[:2, 2]) @ np.linalg.inv(
+            self.matrix[:2, :2]
+        ).T
         plane = wanted
         if self.distortion:
             radii = np.linspace(0.0, self._widest, _STEPS)
             reached = np.linalg.norm(wanted, axis=1)
-            scale = np.interp(reached, radii * self._radial(radii * radii), radii) / np.where(reached > 0, reached, 1)
+            scale = np.interp(reached, radii * self._radial(radii * radii), radii) / np.where(
+                reached > 0, reached, 1
+            )
             plane = wanted * np.where(reached > 0, scale, 1.0)[:, None]
             for _ in range(_ROUNDS):
                 plane = plane - self._newton_step(plane, wanted)
@@ -139,7 +189,8 @@ class CameraModel:
     def resized(self, width: int, height: int) -> CameraModel:
         """Return the camera for images of another size, with a scaled intrinsic matrix."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
-        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # pixel edges instead of pixel centres
+        # pixel edges instead of pixel centres
+        half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
         matrix = np.linalg.inv(half) @ scale @ half @ self.matrix
         return self.replaced(width=width, height=height, matrix=matrix)
 
@@ -165,9 +216,13 @@ class CameraModel:
         """
         needed = set(_KEYS[:7]) - {"distortion"}
         if not isinstance(about, dict) or not needed <= about.keys():
-            missing = ", ".join(sorted(needed - set(about))) if isinstance(about, dict) else "everything"
+            missing = (
+                ", ".join(sorted(needed - set(about))) if isinstance(about, dict) else "everything"
+            )
             raise FormatError(
-                where, expected=f"a camera with {', '.join(sorted(needed))}", found=f"a camera without {missing}"
+                where,
+                expected=f"a camera with {', '.join(sorted(needed))}",
+                found=f"a camera without {missing}",
             )
         values = {name: about[name] for name in _KEYS if about.get(name) is not None}
         try:
@@ -184,7 +239,10 @@ class CameraModel:
 
     @cached_property
     def _widest(self) -> float:
-        """Largest radius in the plane for which the distorted radius is monotonic. The model is not valid beyond it."""
+        """Largest radius in the plane for which the distorted radius is monotonic.
+
+        The model is not valid beyond it.
+        """
         radii = np.linspace(0.0, _WIDEST[self.model], _STEPS)
         falls = np.flatnonzero(np.diff(radii * self._radial(radii * radii)) <= 0)
         return float(radii[falls[0]] if len(falls) else radii[-1])
@@ -210,11 +268,16 @@ class CameraModel:
             bent[:, 1] += p1 * (squared + 2 * y * y) + 2 * p2 * x * y
         return bent
 
-    def _newton_step(self, plane: NDArray[np.float64], wanted: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return one step of Newton's method towards the undistorted points of the `wanted` distorted points."""
+    def _newton_step(
+        self, plane: NDArray[np.float64], wanted: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return one step of Newton's method towards the undistorted points of the `wanted`
+        distorted points.
+        """
         off, small = self._distort(plane) - wanted, 1e-6
         along_x, along_y = (
-            (self._distort(plane + shift) - self._distort(plane - shift)) / (2 * small) for shift in small * np.eye(2)
+            (self._distort(plane + shift) - self._distort(plane - shift)) / (2 * small)
+            for shift in small * np.eye(2)
         )
         determinant = along_x[:, 0] * along_y[:, 1] - along_y[:, 0] * along_x[:, 1]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -224,7 +287,8 @@ class CameraModel:
 
 
 def optical_axes(forward: tuple[float, float], axes: Literal["left", "right"]) -> Transform:
-    """Return the (4, 4) sensor_T_camera without translation of a level camera that looks along a horizontal direction.
+    """Return the (4, 4) sensor_T_camera without translation of a level camera that looks along a
+    horizontal direction.
 
     Args:
         forward: x and y of the direction, sensor frame.

@@ -1,8 +1,10 @@
-"""Compiled functions for the cell of a point: the rule of `GridSpec.to_axes` and `GridSpec.index`, one point at a time.
+"""Compiled functions for the cell of a point: the rule of `GridSpec.to_axes` and `GridSpec.index`,
+one point at a time.
 
-`find_voxel` is the exact rule. Loops over many points use faster arithmetic, and call it only for the few points near an edge of a cell.
-`fast_azimuth` is the fast arithmetic for cylindrical grids. The functions are compiled into the loops that call them, in
-`carlasc.groundtruth.voting` and `carlasc.dataset.stacking`. Importing this module loads Numba.
+`find_voxel` is the exact rule. Loops over many points use faster arithmetic, and call it only for
+the few points near an edge of a cell. `fast_azimuth` is the fast arithmetic for cylindrical grids.
+The functions are compiled into the loops that call them, in `carlasc.groundtruth.voting` and
+`carlasc.dataset.stacking`. Importing this module loads Numba.
 
 See the format page, `docs/format.md#cells`.
 """
@@ -59,10 +61,11 @@ def transform(pose: Pose, x: Real, y: Real, z: Real) -> tuple[Real, Real, Real]:
 
 @jit
 def find_voxel(x: float, y: float, z: float, cells: Cells) -> int:
-    """Return the flat index of the voxel of a point in the frame of the grid; the number of voxels if the point is outside.
+    """Return the flat index of the voxel of a point in the frame of the grid; the number of voxels
+    if the point is outside.
 
-    Cells are half-open. The index is rounded down and clipped to the last cell. In a cylindrical grid, an azimuth outside the bounds is
-    changed by 2 pi if it is then inside.
+    Cells are half-open. The index is rounded down and clipped to the last cell. In a cylindrical
+    grid, an azimuth outside the bounds is changed by 2 pi if it is then inside.
     """
     first, second = x, y
     if cells.cylindrical:
@@ -86,7 +89,8 @@ def find_voxel(x: float, y: float, z: float, cells: Cells) -> int:
     return (i * cells.size[1] + j) * cells.size[2] + k
 
 
-# atan(t) / t as a polynomial of t^2, |t| <= tan(pi / 8): Chebyshev interpolation, off by less than 3e-10.
+# atan(t) / t as a polynomial of t^2, |t| <= tan(pi / 8): Chebyshev interpolation, off by less than
+# 3e-10.
 _ATAN = (
     0.9999999993712274,
     -0.33333306893036774,
@@ -102,7 +106,9 @@ AZIMUTH_ERROR = 3e-10
 
 @fused
 def fast_azimuth(x: float, y: float) -> float:
-    """Return atan2(y, x) within AZIMUTH_ERROR, without a branch, so that loops vectorise; NaN at the origin."""
+    """Return atan2(y, x) within AZIMUTH_ERROR, without a branch, so that loops vectorise; NaN at
+    the origin.
+    """
     across, along = abs(y), abs(x)
     steep = across > along
     small, large = (along, across) if steep else (across, along)
@@ -129,7 +135,10 @@ def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the (K,) sorted unique keys, and the (N,) index of each key among them. Like `np.unique`, without sorting all keys."""
+    """Return the (K,) sorted unique keys, and the (N,) index of each key among them.
+
+    Like `np.unique`, without sorting all keys.
+    """
     first, number = numbered(keys[:, None])
     order = np.argsort(keys[first])
     place = np.empty_like(order)
@@ -147,7 +156,8 @@ def numbered(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
     size = 2
     while size < 2 * len(cells):
         size *= 2
-    table = np.zeros(size, np.int64)  # 1 + the number of each cell, at the hash of the cell or after it
+    # 1 + the number of each cell, at the hash of the cell or after it
+    table = np.zeros(size, np.int64)
     first, number, count = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64), 0
     for i in range(len(cells)):
         code = 0
@@ -172,15 +182,21 @@ def numbered(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
 
 
 def count_points(
-    points: NDArray[np.floating], grid_T_points: Transform, spec: GridSpec, counts: NDArray[np.int32] | None = None
+    points: NDArray[np.floating],
+    grid_T_points: Transform,
+    spec: GridSpec,
+    counts: NDArray[np.int32] | None = None,
 ) -> NDArray[np.int32]:
-    """Return the number of points per voxel, (V,). Same result as with `GridSpec.flat_index`, with less memory.
+    """Return the number of points per voxel, (V,).
+
+    Same result as with `GridSpec.flat_index`, with less memory.
 
     Args:
         points: (N, 3) metres.
         grid_T_points: (4, 4), from the frame of the points to the frame of the grid.
         spec: geometry of the grid.
-        counts: (V,) existing counts, to which the points are added in place; None starts with zeros.
+        counts: (V,) existing counts, to which the points are added in place; None starts with
+            zeros.
     """
     counts = np.zeros(spec.num_voxels, np.int32) if counts is None else counts
     _count(np.ascontiguousarray(points), as_pose(grid_T_points), Cells.of(spec), counts)
@@ -188,7 +204,9 @@ def count_points(
 
 
 @cached
-def _count(points: NDArray[np.floating], pose: Pose, cells: Cells, counts: NDArray[np.int32]) -> None:
+def _count(
+    points: NDArray[np.floating], pose: Pose, cells: Cells, counts: NDArray[np.int32]
+) -> None:
     for i in range(len(points)):
         point = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         x, y, z = transform(pose, point[0], point[1], point[2])

@@ -1,4 +1,7 @@
-"""The allowed values of options of the library and of its commands. Imports nothing heavy, so that the help of commands is fast."""
+"""The allowed values of options of the library and of its commands.
+
+Imports nothing heavy, so that the help of commands is fast.
+"""
 
 from typing import Literal
 
@@ -36,7 +39,9 @@ Voxels = Literal["known", "all"]
 """Which voxels are scored."""
 
 Around = Literal["present", "future"]
-"""The sensor pose around which forecast grids are centred: of the frame in which they are made, or of the frame that they predict."""
+"""The sensor pose around which forecast grids are centred: of the frame in which they are made, or
+of the frame that they predict.
+"""
 
 Images = Literal["none", "link", "copy"]
 """Treatment of camera images in a conversion."""
@@ -51,4 +56,6 @@ PaletteName = Literal["class", "colorblind", "height"]
 """The colours of classes, or colours by height."""
 
 GridColor = Literal["class", "confidence", "views", "votes", "inferred", "actor", "seen"]
-"""Meaning of the colours of a grid: its classes, one kind of evidence (see `docs/format.md#evidence`), or its actors."""
+"""Meaning of the colours of a grid: its classes, one kind of evidence (see
+`docs/format.md#evidence`), or its actors.
+"""

@@ -1,6 +1,8 @@
-"""Class tables: the ids, names, colours and roles of classes, and the remaps from one table to another.
+"""Class tables: the ids, names, colours and roles of classes, and the remaps from one table to
+another.
 
-See the format page, `docs/format.md#classes` (CarlaSC, and the renumbering in CARLA) and `docs/format.md#semantickitti`.
+See the format page, `docs/format.md#classes` (CarlaSC, and the renumbering in CARLA) and
+`docs/format.md#semantickitti`.
 """
 
 from __future__ import annotations
@@ -37,8 +39,10 @@ class ClassTable:
         deformable: ids of classes of objects that change shape while moving, such as people.
         ground: ids of classes of ground surfaces, such as roads, pavements, grass and water.
         geometry_only: id for the points of scans without labels; None takes the largest id.
-        ground_only: id for the ground points of scans without labels; None takes the lowest id of `ground`.
-        num_channels: number of vote channels, greater than every id. It may be greater than necessary if the format requires it.
+        ground_only: id for the ground points of scans without labels; None takes the lowest id of
+            `ground`.
+        num_channels: number of vote channels, greater than every id. It may be greater than
+            necessary if the format requires it.
 
     Raises:
         ArgumentError: an id has no name or no colour, or a value has the wrong type or range.
@@ -58,22 +62,36 @@ class ClassTable:
     def __post_init__(self) -> None:
         where = f"class table {self.name}"
         if not self.names or min(self.names) < 0 or max(self.names) > _MAX_ID:
-            raise ArgumentError(where, expected=f"names of ids 0..{_MAX_ID}", found=str(sorted(self.names)))
+            raise ArgumentError(
+                where, expected=f"names of ids 0..{_MAX_ID}", found=str(sorted(self.names))
+            )
         if set(self.names) != set(self.colors):
             without = sorted(set(self.names) ^ set(self.colors))
             raise ArgumentError(
-                where, expected="a name and a colour for each id", found=f"only one of them for {_listed(without)}"
+                where,
+                expected="a name and a colour for each id",
+                found=f"only one of them for {_listed(without)}",
             )
         for index, color in self.colors.items():
             if len(color) != 3 or not all(0 <= value <= 255 for value in color):
-                raise ArgumentError(where, expected="three values 0..255 for each colour", found=f"{color} for {index}")
+                raise ArgumentError(
+                    where,
+                    expected="three values 0..255 for each colour",
+                    found=f"{color} for {index}",
+                )
         for role in ROLES:
             if unknown := sorted(getattr(self, role) - set(self.names)):
-                raise ArgumentError(where, expected=f"ids of the table in {role}", found=_listed(unknown))
+                raise ArgumentError(
+                    where, expected=f"ids of the table in {role}", found=_listed(unknown)
+                )
         if self.geometry_only is not None and self.geometry_only not in self.names:
-            raise ArgumentError(where, expected="an id of the table in geometry_only", found=str(self.geometry_only))
+            raise ArgumentError(
+                where, expected="an id of the table in geometry_only", found=str(self.geometry_only)
+            )
         if self.ground_only is not None and self.ground_only not in self.ground:
-            raise ArgumentError(where, expected="an id of ground in ground_only", found=str(self.ground_only))
+            raise ArgumentError(
+                where, expected="an id of ground in ground_only", found=str(self.ground_only)
+            )
         if self.num_channels and not max(self.names) < self.num_channels <= _MAX_ID + 1:
             expected = f"num_channels above {max(self.names)}, up to {_MAX_ID + 1}"
             raise ArgumentError(where, expected=expected, found=str(self.num_channels))
@@ -91,7 +109,9 @@ class ClassTable:
         known = [entry.name for entry in fields(cls)]
         if unknown := sorted(set(values) - set(known)):
             raise FormatError(
-                f"{where}: classes", expected=f"only the keys {', '.join(known)}", found=", ".join(map(str, unknown))
+                f"{where}: classes",
+                expected=f"only the keys {', '.join(known)}",
+                found=", ".join(map(str, unknown)),
             )
         try:
             return cls(
@@ -105,13 +125,19 @@ class ClassTable:
             )
         except KeyError as error:
             raise FormatError(
-                f"{where}: classes", expected=f"the key {error}", found=", ".join(map(str, values)) or "none"
+                f"{where}: classes",
+                expected=f"the key {error}",
+                found=", ".join(map(str, values)) or "none",
             ) from error
         except ArgumentError as error:
-            raise FormatError(f"{where}: {error.where}", expected=error.expected, found=error.found) from error
+            raise FormatError(
+                f"{where}: {error.where}", expected=error.expected, found=error.found
+            ) from error
         except (TypeError, ValueError, AttributeError, OverflowError) as error:
             raise FormatError(
-                f"{where}: classes", expected="names and colours by id, and ids in the roles", found=str(error)
+                f"{where}: classes",
+                expected="names and colours by id, and ids in the roles",
+                found=str(error),
             ) from error
 
     def to_dict(self) -> dict[str, Any]:
@@ -122,12 +148,16 @@ class ClassTable:
             "colors": {str(index): list(color) for index, color in self.colors.items()},
         }
         values |= {role: sorted(getattr(self, role)) for role in ROLES if getattr(self, role)}
-        values |= {name: getattr(self, name) for name in _WITHOUT_LABELS if getattr(self, name) is not None}
+        values |= {
+            name: getattr(self, name) for name in _WITHOUT_LABELS if getattr(self, name) is not None
+        }
         return values | {"num_channels": self.num_channels}
 
     @cached_property
     def standing(self) -> dict[int, int]:
-        """Class of what moves -> class of the same kind of actor, for classes with names such as "moving-car" and "car"."""
+        """Class of what moves -> class of the same kind of actor, for classes with names such as
+        "moving-car" and "car".
+        """
         ids = {name: label for label, name in self.names.items()}
         kinds = {label: self.names[label].removeprefix("moving-") for label in self.moving}
         return {label: ids[kind] for label, kind in kinds.items() if ids.get(kind, label) != label}
@@ -139,12 +169,16 @@ class ClassTable:
 
     @property
     def ground_id(self) -> int | None:
-        """The id for the ground points of scans without labels; None if the table has no ground classes."""
+        """The id for the ground points of scans without labels; None if the table has no ground
+        classes.
+        """
         return min(self.ground, default=None) if self.ground_only is None else self.ground_only
 
     @property
     def dtype(self) -> np.dtype[np.unsignedinteger]:
-        """The smallest unsigned type that holds every id: uint8, or uint16 if there are more than 256 vote channels."""
+        """The smallest unsigned type that holds every id: uint8, or uint16 if there are more than
+        256 vote channels.
+        """
         return np.dtype(np.uint8 if self.num_channels <= 256 else np.uint16)
 
     @cached_property
@@ -171,7 +205,10 @@ class ClassTable:
         )
 
     def check(self, labels: NDArray[np.integer], where: str) -> None:
-        """Raise a FormatError if an id in `labels`, of any shape, is not in [0, `num_channels`). `where` is the file named in the message."""
+        """Raise a FormatError if an id in `labels`, of any shape, is not in [0, `num_channels`).
+
+        `where` is the file named in the message.
+        """
         if labels.size and (int(labels.max()) >= self.num_channels or int(labels.min()) < 0):
             bad = int(labels.max()) if int(labels.max()) >= self.num_channels else int(labels.min())
             count = int(np.count_nonzero(labels == bad))
@@ -217,15 +254,24 @@ class Remap:
 
     @cached_property
     def _lookup(self) -> NDArray[np.unsignedinteger]:
-        """The lookup table in the dtype of the target, with 0 for unknown ids. It is used only after the ids have been checked."""
+        """The lookup table in the dtype of the target, with 0 for unknown ids.
+
+        It is used only after the ids have been checked.
+        """
         return np.where(self.table < 0, 0, self.table).astype(self.target.dtype)
 
     def unknown(self, labels: NDArray[np.integer]) -> dict[int, int]:
-        """Return the ids in `labels`, of any shape, that are not in the mapping, with their number of occurrences."""
+        """Return the ids in `labels`, of any shape, that are not in the mapping, with their number
+        of occurrences.
+        """
         ids, counts = np.unique(labels, return_counts=True)
-        return {int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in self.mapping}
+        return {
+            int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in self.mapping
+        }
 
-    def __call__(self, labels: NDArray[np.integer], where: str = "labels") -> NDArray[np.unsignedinteger]:
+    def __call__(
+        self, labels: NDArray[np.integer], where: str = "labels"
+    ) -> NDArray[np.unsignedinteger]:
         """Return the remapped labels in the dtype of the target. The input is not changed.
 
         Args:
@@ -233,10 +279,13 @@ class Remap:
             where: the file named in errors.
 
         Raises:
-            FormatError: an id has no target; the message names these ids and the number of their occurrences.
+            FormatError: an id has no target; the message names these ids and the number of their
+                occurrences.
         """
         labels = np.asarray(labels)
-        outside = bool(labels.size) and (int(labels.max()) >= len(self.table) or int(labels.min()) < 0)
+        outside = bool(labels.size) and (
+            int(labels.max()) >= len(self.table) or int(labels.min()) < 0
+        )
         if not outside and (self._complete or not (self.table[labels] < 0).any()):
             return self._lookup[labels]
         found = ", ".join(f"{i} ({n} times)" for i, n in self.unknown(labels).items())
@@ -244,7 +293,8 @@ class Remap:
             where,
             expected=f"class ids of {self.source.name}",
             found=found,
-            advice=f"the remap {self.name} has no target for these ids: use another remap, or correct the labels",
+            advice=f"the remap {self.name} has no target for these ids: use another remap, or "
+            f"correct the labels",
         )
 
     @cached_property
@@ -252,15 +302,19 @@ class Remap:
         return bool((self.table >= 0).all())
 
 
-def class_weights(voxel_counts: NDArray[np.integer], remap: Remap | None = None) -> NDArray[np.float64]:
+def class_weights(
+    voxel_counts: NDArray[np.integer], remap: Remap | None = None
+) -> NDArray[np.float64]:
     """Return the loss weight of each class: `1 / ln(count + 0.001)`.
 
-    The formula is used for counts above 1,000, because it is not valid for small counts. Classes with fewer voxels get the largest of the
-    other weights, and classes without voxels get 0. See the format page, `docs/format.md#classes`.
+    The formula is used for counts above 1,000, because it is not valid for small counts. Classes
+    with fewer voxels get the largest of the other weights, and classes without voxels get 0. See
+    the format page, `docs/format.md#classes`.
 
     Args:
         voxel_counts: number of voxels of each class, by id of the source table of the remap.
-        remap: remap of the counts: they are first summed per target class; None uses the counts unchanged.
+        remap: remap of the counts: they are first summed per target class; None uses the counts
+            unchanged.
 
     Returns:
         (K,) float64 weights, by id of the target.

@@ -1,8 +1,9 @@
 """Compiling loops with Numba once per machine, with one cache folder for all environments.
 
-The cache of Numba is beside the source file, so each new environment compiles again. It checks the time of one file only, so it misses
-changes in other files whose functions are compiled into a loop. The key of this cache is the text of all these files, and the versions of
-Numba and NumPy. If several processes need the same function, one compiles it. Importing this module loads Numba.
+The cache of Numba is beside the source file, so each new environment compiles again. It checks the
+time of one file only, so it misses changes in other files whose functions are compiled into a loop.
+The key of this cache is the text of all these files, and the versions of Numba and NumPy. If
+several processes need the same function, one compiles it. Importing this module loads Numba.
 """
 
 from __future__ import annotations
@@ -32,9 +33,8 @@ from carlasc.core import first_use
 first_use.connect()
 
 jit = numba.njit(nogil=True, error_model="numpy")
-inlined = numba.njit(
-    nogil=True, error_model="numpy", forceinline=True
-)  # inlined, because a loop with function calls is not vectorised
+# inlined, because a loop with function calls is not vectorised
+inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)
 # Allows fused multiply-add. For code with margins that cover the different rounding.
 fused = numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})
 
@@ -47,15 +47,19 @@ def cached(function: Callable[..., Any], /) -> Any: ...
 
 
 @overload
-def cached(*, error_model: str = ..., fastmath: bool = ...) -> Callable[[Callable[..., Any]], Any]: ...
+def cached(
+    *, error_model: str = ..., fastmath: bool = ...
+) -> Callable[[Callable[..., Any]], Any]: ...
 
 
 def cached(function: Any = None, /, *, error_model: str = "numpy", fastmath: bool = False) -> Any:
-    """Compile a function, including the compiled functions that it calls, and cache the compiled code.
+    """Compile a function, including the compiled functions that it calls, and cache the compiled
+    code.
 
     Args:
         function: the function; None returns a decorator.
-        error_model: "numpy", in which a division by zero is infinite, or "python", in which it raises ZeroDivisionError.
+        error_model: "numpy", in which a division by zero is infinite, or "python", in which it
+            raises ZeroDivisionError.
         fastmath: whether sums may be reordered.
     """
     if function is None:
@@ -73,16 +77,27 @@ def _compile(function: FunctionType, **options: Any) -> Any:
 
 
 def cache_folder() -> Path:
-    """Return the folder of compiled code: `NUMBA_CACHE_DIR`, or a folder in the cache folder of the user (`XDG_CACHE_HOME`)."""
+    """Return the folder of compiled code: `NUMBA_CACHE_DIR`, or a folder in the cache folder of the
+    user (`XDG_CACHE_HOME`).
+    """
     settings: Any = config  # without types
-    usual = "~/Library/Caches" if sys.platform == "darwin" else os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    usual = (
+        "~/Library/Caches"
+        if sys.platform == "darwin"
+        else os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    )
     base = settings.CACHE_DIR or Path(usual, "carlasc")
     checked = "-checked" if settings.BOUNDSCHECK else ""
-    return Path(base).expanduser() / f"compiled-numba{numba.__version__}-numpy{np.__version__}{checked}"
+    return (
+        Path(base).expanduser()
+        / f"compiled-numba{numba.__version__}-numpy{np.__version__}{checked}"
+    )
 
 
 def fingerprint(function: FunctionType) -> int:
-    """Return a hash of the files of a function and of the compiled functions that it calls, and of the constants that they use."""
+    """Return a hash of the files of a function and of the compiled functions that it calls, and of
+    the constants that they use.
+    """
     files, constants = set(), []
     for part in _parts(function, set()):
         files.add(getfile(part))
@@ -151,13 +166,18 @@ class _CompiledFiles(CompileResultCacheImpl):
 
 
 class _SharedCache(FunctionCache):
-    """The cache of a function. If several processes need it at the same time, one compiles it and the others wait."""
+    """The cache of a function.
+
+    If several processes need it at the same time, one compiles it and the others wait.
+    """
 
     _impl_class = _CompiledFiles
 
     def __init__(self, function: FunctionType) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
-        name = f"{Path(getfile(function)).stem}.{function.__name__}-{fingerprint(function):08x}.lock"
+        name = (
+            f"{Path(getfile(function)).stem}.{function.__name__}-{fingerprint(function):08x}.lock"
+        )
         self._versions = f"*.{function.__name__}-*"  # files
         self._lock_path = Path(self.cache_path, name)
         self._lock: IO[bytes] | None = None
@@ -183,7 +203,9 @@ class _SharedCache(FunctionCache):
             self._release()
 
     def _acquire(self) -> None:
-        """Wait until no other process compiles the function, up to a limit: the other process may be stopped, or may have failed."""
+        """Wait until no other process compiles the function, up to a limit: the other process may
+        be stopped, or may have failed.
+        """
         self._release()  # left by an interrupted compilation
         try:
             self._lock = self._lock_path.open("ab")

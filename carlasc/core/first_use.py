@@ -1,7 +1,9 @@
-"""Notification that Numba is compiling. On the first use on a machine, compiling loops takes several seconds.
+"""Notification that Numba is compiling.
 
-Importing this module loads nothing heavy, so a program can request the notification before it imports Numba. `carlasc.core.compiling`
-connects the requests with Numba.
+On the first use on a machine, compiling loops takes several seconds.
+
+Importing this module loads nothing heavy, so a program can request the notification before it
+imports Numba. `carlasc.core.compiling` connects the requests with Numba.
 """
 
 from __future__ import annotations
@@ -20,7 +22,10 @@ _wishes: list[tuple[Callable[[], None], float]] = []  # passed on to worker proc
 
 
 class CompilingNote:
-    """Calls a function once, after this process has compiled for a given time. Loading compiled code from the cache does not count."""
+    """Calls a function once, after this process has compiled for a given time.
+
+    Loading compiled code from the cache does not count.
+    """
 
     def __init__(self, tell: Callable[[], None], after_s: float) -> None:
         """Create a note.
@@ -34,7 +39,10 @@ class CompilingNote:
         self._timer: Timer | None = None
 
     def start(self) -> None:
-        """Record that the compiler starts. Calls may be nested, for a loop that another loop calls."""
+        """Record that the compiler starts.
+
+        Calls may be nested, for a loop that another loop calls.
+        """
         self._depth += 1
         if self._depth == 1 and not self._told:
             self._started_s = time.perf_counter()
@@ -56,7 +64,8 @@ class CompilingNote:
 
 
 def note_compiling(tell: Callable[[], None], after_s: float = 1.0) -> None:
-    """Call a function once, after this process, or one of the worker processes that it starts later, has compiled for some time.
+    """Call a function once, after this process, or one of the worker processes that it starts
+    later, has compiled for some time.
 
     Args:
         tell: the function. It must be picklable by name, for worker processes.
@@ -78,7 +87,10 @@ def wishes() -> tuple[tuple[Callable[[], None], float], ...]:
 
 
 def note_in_workers(wishes: tuple[tuple[Callable[[], None], float], ...], first: Semaphore) -> None:
-    """Repeat the requests of the parent in a worker process. `first` is a semaphore by which only one worker calls the function."""
+    """Repeat the requests of the parent in a worker process.
+
+    `first` is a semaphore by which only one worker calls the function.
+    """
     for tell, after_s in wishes:
 
         def once(tell: Callable[[], None] = tell) -> None:

@@ -1,4 +1,6 @@
-"""Selections of frames: a half-open range of frame numbers, or a list; and a check that times are in seconds."""
+"""Selections of frames: a half-open range of frame numbers, or a list; and a check that times are
+in seconds.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ class FrameRange:
 
     def __post_init__(self) -> None:
         for bound in (self.start, self.stop, *(self.only or ())):
-            if bound is not None and (isinstance(bound, bool) or not isinstance(bound, int | np.integer)):
+            if bound is not None and (
+                isinstance(bound, bool) or not isinstance(bound, int | np.integer)
+            ):
                 raise ArgumentError("frames", expected="integers or None", found=repr(bound))
         if self.start is not None and self.stop is not None and self.start >= self.stop:
             raise ArgumentError("frames", expected="a range that holds a frame", found=str(self))
@@ -56,7 +60,9 @@ class FrameRange:
                 return cls(start, stop)
             case range() | list() | np.ndarray():
                 return cls._listed(frames)
-        expected = "a range, a slice without a step, A:B, a list of frame numbers, (start, stop) or None"
+        expected = (
+            "a range, a slice without a step, A:B, a list of frame numbers, (start, stop) or None"
+        )
         raise ArgumentError("frames", expected=expected, found=repr(frames))
 
     @classmethod
@@ -65,7 +71,9 @@ class FrameRange:
         try:
             chosen = sorted({operator.index(frame) for frame in frames})
         except TypeError:
-            raise ArgumentError("frames", expected="a list of integers", found=repr(frames)) from None
+            raise ArgumentError(
+                "frames", expected="a list of integers", found=repr(frames)
+            ) from None
         if not chosen:
             raise ArgumentError("frames", expected="a range that holds a frame", found=repr(frames))
         gapless = chosen[-1] - chosen[0] == len(chosen) - 1
@@ -82,13 +90,17 @@ class FrameRange:
         try:
             start, stop = int(first) if first else None, int(last) if last else None
         except ValueError:
-            raise ArgumentError("frames", expected="A:B, A:, :B or a frame number", found=repr(text)) from None
+            raise ArgumentError(
+                "frames", expected="A:B, A:, :B or a frame number", found=repr(text)
+            ) from None
         if not colon:
             return cls(start, None if start is None else start + 1)
         return cls(start, stop)
 
     def __contains__(self, frame: int) -> bool:
-        inside = (self.start is None or frame >= self.start) and (self.stop is None or frame < self.stop)
+        inside = (self.start is None or frame >= self.start) and (
+            self.stop is None or frame < self.stop
+        )
         return inside and (self.only is None or frame in self.only)
 
     def select(self, frames: NDArray[Any]) -> NDArray[Any]:
@@ -109,14 +121,20 @@ class FrameRange:
 
 
 def compact(frames: NDArray[np.int64]) -> range | NDArray[np.int64]:
-    """Return ascending frame numbers as a range if they are consecutive, because a range is pickled in a few bytes."""
+    """Return ascending frame numbers as a range if they are consecutive, because a range is pickled
+    in a few bytes.
+    """
     first, last = (int(frames[0]), int(frames[-1])) if len(frames) else (0, -1)
     return range(first, last + 1) if last - first == len(frames) - 1 else frames
 
 
 def expand(frames: range | NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the array of frame numbers from the result of `compact`."""
-    return np.arange(frames.start, frames.stop, dtype=np.int64) if isinstance(frames, range) else frames
+    return (
+        np.arange(frames.start, frames.stop, dtype=np.int64)
+        if isinstance(frames, range)
+        else frames
+    )
 
 
 if TYPE_CHECKING:  # at run time it is not generic
@@ -124,15 +142,27 @@ if TYPE_CHECKING:  # at run time it is not generic
 else:
     _Slice = slice
 
-Frames = FrameRange | tuple[int | None, int | None] | _Slice | range | str | list[int] | NDArray[np.integer] | None
-"""What a `frames` argument takes: a range, a slice, "A:B", a list of frame numbers, a FrameRange, a tuple of its bounds, or None for all frames."""
+Frames = (
+    FrameRange
+    | tuple[int | None, int | None]
+    | _Slice
+    | range
+    | str
+    | list[int]
+    | NDArray[np.integer]
+    | None
+)
+"""What a `frames` argument takes: a range, a slice, "A:B", a list of frame numbers, a FrameRange, a
+tuple of its bounds, or None for all frames.
+"""
 
 
 _LATEST_S = 1e11  # larger than any time in seconds; milliseconds since 1970 are larger
 
 
 def check_seconds(seconds: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """Check that (N,) times are finite and plausible as seconds, not milliseconds or nanoseconds since 1970, and return them.
+    """Check that (N,) times are finite and plausible as seconds, not milliseconds or nanoseconds
+    since 1970, and return them.
 
     Args:
         seconds: the times.

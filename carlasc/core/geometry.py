@@ -1,4 +1,7 @@
-"""Rigid transforms. A transform named `dst_T_src` converts points from frame `src` to frame `dst`: `R @ p + t`."""
+"""Rigid transforms.
+
+A transform named `dst_T_src` converts points from frame `src` to frame `dst`: `R @ p + t`.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,9 @@ _FARTHEST_M = 1e9  # larger than any distance on Earth
 def rotation_z(yaw_rad: float) -> Transform:
     """Return the (4, 4) rotation by `yaw_rad` about z. A positive angle turns x towards y."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    return np.array([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
+    return np.array(
+        [[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64
+    )
 
 
 def translation(xyz: ArrayLike) -> Transform:
@@ -31,7 +36,8 @@ def translation(xyz: ArrayLike) -> Transform:
 
 
 def multiply(*matrices: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the product of (..., N, K) and (..., K, M) small matrices, from left to right, bit for bit equal on every CPU.
+    """Return the product of (..., N, K) and (..., K, M) small matrices, from left to right, bit for
+    bit equal on every CPU.
 
     `@` calls BLAS, whose order of summation and rounding depend on the CPU.
     """
@@ -62,7 +68,9 @@ def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
 
 
 def rotate_vectors(dst_T_src: Transform, vectors: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Rotate (..., 3) vectors, such as velocities and normals, from frame `src` to frame `dst`, without translation."""
+    """Rotate (..., 3) vectors, such as velocities and normals, from frame `src` to frame `dst`,
+    without translation.
+    """
     source = np.asarray(vectors, np.float64)
     x, y, z = source[..., 0], source[..., 1], source[..., 2]
     rotated = np.empty((*source.shape[:-1], 3))
@@ -72,7 +80,9 @@ def rotate_vectors(dst_T_src: Transform, vectors: NDArray[np.floating]) -> NDArr
 
 
 def invert(dst_T_src: Transform) -> Transform:
-    """Return the inverse `src_T_dst` of one (4, 4) or many (..., 4, 4) rigid transforms, from the transposed rotation."""
+    """Return the inverse `src_T_dst` of one (4, 4) or many (..., 4, 4) rigid transforms, from the
+    transposed rotation.
+    """
     rotation = np.swapaxes(dst_T_src[..., :3, :3], -1, -2)
     src_T_dst = np.zeros_like(dst_T_src, dtype=np.float64)
     src_T_dst[..., :3, :3] = rotation
@@ -83,7 +93,9 @@ def invert(dst_T_src: Transform) -> Transform:
 
 def rotations_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the (N, 3, 3) rotations of (N, 4) quaternions w, x, y, z of any non-zero length."""
-    w, x, y, z = (np.asarray(quaternions, np.float64) / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    w, x, y, z = (
+        np.asarray(quaternions, np.float64) / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    ).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -92,8 +104,12 @@ def rotations_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def poses_from(quaternions: NDArray[np.floating], translations: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return (N, 4, 4) transforms from (N, 4) quaternions w, x, y, z of any non-zero length, and (N, 3) translations."""
+def poses_from(
+    quaternions: NDArray[np.floating], translations: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Return (N, 4, 4) transforms from (N, 4) quaternions w, x, y, z of any non-zero length, and
+    (N, 3) translations.
+    """
     poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
     poses[:, :3, :3] = rotations_of(quaternions)
     poses[:, :3, 3] = translations
@@ -101,7 +117,10 @@ def poses_from(quaternions: NDArray[np.floating], translations: NDArray[np.float
 
 
 def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the (N, 4) unit quaternions w, x, y, z of (N, 3, 3) rotations. The first non-zero number is positive."""
+    """Return the (N, 4) unit quaternions w, x, y, z of (N, 3, 3) rotations.
+
+    The first non-zero number is positive.
+    """
     r = np.asarray(rotations, np.float64)
     xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
     wx, wy, wz = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
@@ -123,14 +142,21 @@ def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def small_motions(motions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 6) translations and rotation vectors of (N, 4, 4) motions. Valid for rotations of a few degrees at most."""
+    """Return (N, 6) translations and rotation vectors of (N, 4, 4) motions.
+
+    Valid for rotations of a few degrees at most.
+    """
     m = motions
     turns = [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]]
     return np.concatenate([m[:, :3, 3], np.stack(turns, axis=1) / 2], axis=1)
 
 
-def slerp(poses: NDArray[np.float64], seconds: NDArray[np.floating], at: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Interpolate poses in time: positions linearly, rotations by slerp. Outside of the poses, the motion is extrapolated.
+def slerp(
+    poses: NDArray[np.float64], seconds: NDArray[np.floating], at: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Interpolate poses in time: positions linearly, rotations by slerp.
+
+    Outside of the poses, the motion is extrapolated.
 
     Args:
         poses: (K, 4, 4) rigid transforms.
@@ -150,11 +176,15 @@ def slerp(poses: NDArray[np.float64], seconds: NDArray[np.floating], at: NDArray
     axes = turns[:, 1:]
     lengths = np.linalg.norm(axes, axis=1)
     half = np.arctan2(lengths, turns[:, 0])[before] * share
-    units = np.divide(axes, lengths[:, None], out=np.zeros_like(axes), where=lengths[:, None] > 0)[before]
+    units = np.divide(axes, lengths[:, None], out=np.zeros_like(axes), where=lengths[:, None] > 0)[
+        before
+    ]
     between = np.tile(np.eye(4), (len(times), 1, 1))
     quaternions = np.concatenate([np.cos(half)[:, None], np.sin(half)[:, None] * units], axis=1)
     between[:, :3, :3] = multiply(poses[before, :3, :3], rotations_of(quaternions))
-    between[:, :3, 3] = poses[before, :3, 3] + share[:, None] * (poses[before + 1, :3, 3] - poses[before, :3, 3])
+    between[:, :3, 3] = poses[before, :3, 3] + share[:, None] * (
+        poses[before + 1, :3, 3] - poses[before, :3, 3]
+    )
     return between.reshape(*np.shape(at), 4, 4)
 
 
@@ -164,7 +194,9 @@ def relative_to(first: Transform, poses: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def inverse_of(transform: Transform) -> Transform:
-    """Return the inverse of a (4, 4) transform that may be slightly non-rigid, bit for bit equal on every CPU."""
+    """Return the inverse of a (4, 4) transform that may be slightly non-rigid, bit for bit equal on
+    every CPU.
+    """
     x, y, z = transform[:3, 0], transform[:3, 1], transform[:3, 2]
     rows = np.array([np.cross(y, z), np.cross(z, x), np.cross(x, y)])
     inverse = np.eye(4)
@@ -173,13 +205,16 @@ def inverse_of(transform: Transform) -> Transform:
     return inverse
 
 
-def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 1e-3) -> NDArray[np.float64]:
+def check_rigid(
+    transforms: NDArray[np.floating], name: str, tolerance: float = 1e-3
+) -> NDArray[np.float64]:
     """Check that transforms are finite, rigid and proper, and that their positions are plausible.
 
     Args:
         transforms: (4, 4) or (F, 4, 4).
         name: name of the transforms in errors: a file or an argument.
-        tolerance: maximum deviation of `R @ R.T` from the identity, and of the last row from 0 0 0 1.
+        tolerance: maximum deviation of `R @ R.T` from the identity, and of the last row from 0 0 0
+            1.
 
     Returns:
         The same transforms as float64.
@@ -192,16 +227,21 @@ def check_rigid(transforms: NDArray[np.floating], name: str, tolerance: float = 
         raise FormatError(name, expected="4 x 4 transforms", found=f"shape {poses.shape}")
     if _are_rigid(poses.reshape(-1, 4, 4), tolerance):
         return poses
-    for index, pose in enumerate(poses.reshape(-1, 4, 4)):  # find the first one that is not valid, and the reason
+    # find the first one that is not valid, and the reason
+    for index, pose in enumerate(poses.reshape(-1, 4, 4)):
         where = name if poses.ndim == 2 else f"{name}: transform {index}"
         if not np.isfinite(pose).all():
             raise FormatError(where, expected="finite numbers", found="NaN or infinity")
         if np.abs(pose[:3, 3]).max() > _FARTHEST_M:
             raise FormatError(
-                where, expected=f"a position within {_FARTHEST_M:.0e} m", found=f"{np.abs(pose[:3, 3]).max():g} m"
+                where,
+                expected=f"a position within {_FARTHEST_M:.0e} m",
+                found=f"{np.abs(pose[:3, 3]).max():g} m",
             )
         rotation = pose[:3, :3]
-        deviation = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - (0, 0, 0, 1)).max())
+        deviation = max(
+            np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - (0, 0, 0, 1)).max()
+        )
         if deviation > tolerance:
             raise FormatError(
                 where,

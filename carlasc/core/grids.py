@@ -1,6 +1,8 @@
-"""Voxel grids: the geometry of cells (GridSpec), their content (Grid), and flags about it (VoxelFlag).
+"""Voxel grids: the geometry of cells (GridSpec), their content (Grid), and flags about it
+(VoxelFlag).
 
-Axes are x, y, z in a Cartesian grid and radius, azimuth = atan2(y, x), z in a cylindrical one; points are Cartesian in both.
+Axes are x, y, z in a Cartesian grid and radius, azimuth = atan2(y, x), z in a cylindrical one;
+points are Cartesian in both.
 """
 
 from __future__ import annotations
@@ -21,10 +23,15 @@ from carlasc.errors import ArgumentError, FormatError, check_choice
 
 Triple = tuple[float, float, float]
 
-_PI32 = float(np.float32(np.pi))  # a little above pi: an azimuth of exactly pi is inside the published bounds
+# a little above pi: an azimuth of exactly pi is inside the published bounds
+_PI32 = float(np.float32(np.pi))
 _SIDE = float(np.float32(25.6))
 _PIXELS = 200  # width and height of a small picture
-_DARKEST = (0.3, 0.8)  # brightness of the lowest layer, for heights and for classes; the highest layer has 1
+# brightness of the lowest layer, for heights and for classes; the highest layer has 1
+_DARKEST = (
+    0.3,
+    0.8,
+)
 _PROPORTION = 128 * 0.234375  # azimuth cells times radial cell of the published cylindrical grid
 
 
@@ -49,14 +56,20 @@ class GridSpec:
 
     def __post_init__(self) -> None:
         if self.coordinates not in ("cartesian", "cylindrical"):
-            raise ArgumentError("coordinates", expected="cartesian or cylindrical", found=f"{self.coordinates!r}")
+            raise ArgumentError(
+                "coordinates", expected="cartesian or cylindrical", found=f"{self.coordinates!r}"
+            )
         for name, kind in (("size", int), ("lower", float), ("upper", float)):
             values = tuple(kind(v) for v in getattr(self, name))
             if len(values) != 3 or not all(math.isfinite(v) for v in values):
-                raise ArgumentError(f"grid {name}", expected="three finite numbers", found=str(getattr(self, name)))
+                raise ArgumentError(
+                    f"grid {name}", expected="three finite numbers", found=str(getattr(self, name))
+                )
             object.__setattr__(self, name, values)
         if min(self.size) < 1:
-            raise ArgumentError("grid size", expected="at least one cell per axis", found=str(self.size))
+            raise ArgumentError(
+                "grid size", expected="at least one cell per axis", found=str(self.size)
+            )
         if math.prod(self.size) >= 2**31:
             raise ArgumentError(
                 "grid size",
@@ -66,11 +79,15 @@ class GridSpec:
             )
         if any(low >= up for low, up in zip(self.lower, self.upper, strict=True)):
             raise ArgumentError(
-                "grid bounds", expected="lower < upper on every axis", found=f"{self.lower} and {self.upper}"
+                "grid bounds",
+                expected="lower < upper on every axis",
+                found=f"{self.lower} and {self.upper}",
             )
         if self.coordinates == "cylindrical":
             if self.lower[0] < 0:
-                raise ArgumentError("grid bounds", expected="a radius of 0 or more", found=f"{self.lower[0]}")
+                raise ArgumentError(
+                    "grid bounds", expected="a radius of 0 or more", found=f"{self.lower[0]}"
+                )
             if self.upper[1] - self.lower[1] > 2 * _PI32:
                 raise ArgumentError(
                     "grid bounds",
@@ -80,21 +97,27 @@ class GridSpec:
 
     @classmethod
     def published(cls, name: Preset | Coordinates = "coarse") -> GridSpec:
-        """Return a grid of the published data set: "coarse", "fine" or "cylindrical"; see `docs/format.md#layout`.
+        """Return a grid of the published data set: "coarse", "fine" or "cylindrical"; see
+        `docs/format.md#layout`.
 
-        The names of coordinates give the grid in which predictions are evaluated: "cartesian" is the coarse grid.
+        The names of coordinates give the grid in which predictions are evaluated: "cartesian" is
+        the coarse grid.
         """
         presets = {
             "coarse": cls("cartesian", (128, 128, 8), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
             "fine": cls("cartesian", (256, 256, 16), (-_SIDE, -_SIDE, -2.0), (_SIDE, _SIDE, 1.0)),
-            "cylindrical": cls("cylindrical", (128, 128, 8), (0.0, -_PI32, -2.0), (30.0, _PI32, 1.0)),
+            "cylindrical": cls(
+                "cylindrical", (128, 128, 8), (0.0, -_PI32, -2.0), (30.0, _PI32, 1.0)
+            ),
         }
         check_choice("published grid", name, (*presets, "cartesian"))
         return presets["coarse" if name == "cartesian" else name]
 
     @classmethod
     def from_params(cls, params: Mapping[str, Any], where: str = "params.json") -> GridSpec:
-        """Return the grid from the keys of a params.json, with unchanged numbers. `where` is the file named in errors.
+        """Return the grid from the keys of a params.json, with unchanged numbers.
+
+        `where` is the file named in errors.
 
         Raises:
             FormatError: a key is missing, or a value is not valid.
@@ -113,12 +136,17 @@ class GridSpec:
         except FormatError:
             raise  # a FormatError is a ValueError
         except KeyError as error:
-            raise FormatError(where, expected=f"the key {error}", found=f"{', '.join(params) or 'none'}") from error
+            raise FormatError(
+                where, expected=f"the key {error}", found=f"{', '.join(params) or 'none'}"
+            ) from error
         except (ArgumentError, TypeError, ValueError, OverflowError) as error:
             raise FormatError(where, problem=str(error)) from error
 
     def to_params(self, num_channels: int = 25) -> dict[str, Any]:
-        """Return the five published keys of params.json. Sizes are floats, as in the published files."""
+        """Return the five published keys of params.json.
+
+        Sizes are floats, as in the published files.
+        """
         return {
             "grid_size": [float(n) for n in self.size],
             "min_bound": list(self.lower),
@@ -142,10 +170,11 @@ class GridSpec:
     def with_resolution(self, resolution: float | Sequence[float]) -> GridSpec:
         """Return a grid of cells of the given size that covers these bounds (the rule of `--res`).
 
-        Let w be the width of the bounds along an axis. The number of cells n is w / R, rounded to the nearest integer if it is
-        within 1e-4 of it, otherwise rounded up. The bounds grow to n R: symmetrically about the centre for x and y, upwards from the
-        lower bound for z and the radius. The bounds of the azimuth do not change. In a cylindrical grid, a single R applies to the
-        radius and to z, and the azimuth keeps the published proportion.
+        Let w be the width of the bounds along an axis. The number of cells n is w / R, rounded to
+        the nearest integer if it is within 1e-4 of it, otherwise rounded up. The bounds grow to n
+        R: symmetrically about the centre for x and y, upwards from the lower bound for z and the
+        radius. The bounds of the azimuth do not change. In a cylindrical grid, a single R applies
+        to the radius and to z, and the azimuth keeps the published proportion.
 
         Args:
             resolution: metres, or one value per axis (cylindrical: metres, radians, metres).
@@ -153,17 +182,25 @@ class GridSpec:
         Raises:
             ArgumentError: a resolution is not a positive number.
         """
-        per_axis = [float(v) for v in (resolution if isinstance(resolution, Sequence) else [resolution])]
+        per_axis = [
+            float(v) for v in (resolution if isinstance(resolution, Sequence) else [resolution])
+        ]
         if len(per_axis) not in (1, 3) or not all(math.isfinite(r) and r > 0 for r in per_axis):
             raise ArgumentError(
-                "resolution", expected="one or three positive numbers", found=", ".join(map(str, per_axis))
+                "resolution",
+                expected="one or three positive numbers",
+                found=", ".join(map(str, per_axis)),
             )
         size, lower, upper = list(self.size), list(self.lower), list(self.upper)
         for axis, step in enumerate(per_axis * (3 // len(per_axis))):
             width = self.upper[axis] - self.lower[axis]
             cells = _cells(width, step)
             if self.coordinates == "cylindrical" and axis == 1:
-                size[1] = cells if len(per_axis) == 3 else max(1, round(_PROPORTION * width / (2 * _PI32) / step))
+                size[1] = (
+                    cells
+                    if len(per_axis) == 3
+                    else max(1, round(_PROPORTION * width / (2 * _PI32) / step))
+                )
                 continue
             size[axis] = cells
             if axis == 2 or self.coordinates == "cylindrical":
@@ -187,7 +224,8 @@ class GridSpec:
 
     @property
     def voxel_size(self) -> NDArray[np.float64]:
-        """(3,) size of a cell per axis: the float32 difference of the bounds divided by the size; see `docs/format.md#cells`.
+        """(3,) size of a cell per axis: the float32 difference of the bounds divided by the size;
+        see `docs/format.md#cells`.
 
         If the bounds are not float32 numbers, their exact difference is used.
         """
@@ -197,10 +235,11 @@ class GridSpec:
         return np.where(exact, upper - lower, rounded) / np.array(self.size, np.float64)
 
     def to_axes(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Convert Cartesian points to the axes of the grid: unchanged in a Cartesian grid, otherwise radius, azimuth, z.
+        """Convert Cartesian points to the axes of the grid: unchanged in a Cartesian grid,
+        otherwise radius, azimuth, z.
 
-        An azimuth outside the bounds is changed by a full turn if it is then inside. An azimuth of exactly +pi is therefore in the
-        first cell if the upper bound is pi.
+        An azimuth outside the bounds is changed by a full turn if it is then inside. An azimuth of
+        exactly +pi is therefore in the first cell if the upper bound is pi.
 
         Args:
             points: (N, 3) metres, in the frame of the grid.
@@ -216,7 +255,12 @@ class GridSpec:
         ).astype(azimuth.dtype)
         inside = (turned >= self.lower[1]) & (turned < self.upper[1])
         return np.stack(
-            [np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2), np.where(inside, turned, azimuth), points[:, 2]], axis=1
+            [
+                np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2),
+                np.where(inside, turned, azimuth),
+                points[:, 2],
+            ],
+            axis=1,
         )
 
     def from_axes(self, axes: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -227,13 +271,15 @@ class GridSpec:
         return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
     def index(self, axes: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-        """Return the cells of points on the axes of the grid: half-open, floor, clip; see `docs/format.md#cells`.
+        """Return the cells of points on the axes of the grid: half-open, floor, clip; see
+        `docs/format.md#cells`.
 
         Args:
             axes: (N, 3) result of `to_axes`.
 
         Returns:
-            (N, 3) int32 cells, clamped to the grid, and (N,) bool: whether the point is inside. NaN is outside.
+            (N, 3) int32 cells, clamped to the grid, and (N,) bool: whether the point is inside. NaN
+            is outside.
         """
         lower, upper = np.array(self.lower), np.array(self.upper)
         inside: NDArray[np.bool_] = np.all((axes >= lower) & (axes < upper), axis=1)
@@ -241,24 +287,37 @@ class GridSpec:
         return np.clip(cells, 0, np.array(self.size) - 1).astype(np.int32), inside
 
     def flat_index(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Return (N,) C-order voxel indices of (N, 3) Cartesian points, -1 outside. The steps are `to_axes`, `index`, ravel."""
+        """Return (N,) C-order voxel indices of (N, 3) Cartesian points, -1 outside.
+
+        The steps are `to_axes`, `index`, ravel.
+        """
         cells, inside = self.index(self.to_axes(points))
         return np.where(inside, np.ravel_multi_index(tuple(cells.T), self.size), -1)
 
     def seen_from_above(
-        self, labels: NDArray[np.integer], palette: NDArray[np.uint8] | None = None, *, left_handed: bool = True
+        self,
+        labels: NDArray[np.integer],
+        palette: NDArray[np.uint8] | None = None,
+        *,
+        left_handed: bool = True,
     ) -> NDArray[np.uint8]:
-        """Return a small picture, (H, W, 3) RGB, of the highest occupied voxel of each column: x points up, y to the right.
+        """Return a small picture, (H, W, 3) RGB, of the highest occupied voxel of each column: x
+        points up, y to the right.
 
         Args:
             labels: (X, Y, Z) class ids, 0 is free.
             palette: (K, 3) RGB by class id; None draws heights in grey.
-            left_handed: False for data with y to the left; y then points to the left of the picture.
+            left_handed: False for data with y to the left; y then points to the left of the
+                picture.
         """
         occupied, layers = labels > 0, self.size[2]
         top = layers - 1 - np.argmax(occupied[:, :, ::-1], axis=2)
         highest = np.take_along_axis(labels, top[:, :, None], axis=2)[:, :, 0]
-        colors = np.full((*highest.shape, 3), 255.0) if palette is None else palette[highest].astype(np.float64)
+        colors = (
+            np.full((*highest.shape, 3), 255.0)
+            if palette is None
+            else palette[highest].astype(np.float64)
+        )
         darkest = _DARKEST[palette is not None]
         colors *= darkest + (1 - darkest) * top[:, :, None] / max(layers - 1, 1)
         colors[~occupied.any(axis=2)] = 255
@@ -269,7 +328,10 @@ class GridSpec:
             else [*zip(self.lower, self.upper, strict=True)][:2]
         )
         x, y = (low + (high - low) * steps for low, high in ends)
-        above = np.stack(np.broadcast_arrays(x[::-1, None], y if left_handed else y[::-1], self.lower[2]), axis=-1)
+        above = np.stack(
+            np.broadcast_arrays(x[::-1, None], y if left_handed else y[::-1], self.lower[2]),
+            axis=-1,
+        )
         cells, inside = self.index(self.to_axes(above.reshape(-1, 3)))
         picture = np.where(inside[:, None], colors[cells[:, 0], cells[:, 1]], 255)
         return picture.astype(np.uint8).reshape(_PIXELS, _PIXELS, 3)
@@ -280,7 +342,9 @@ class GridSpec:
 
     def centers(self) -> NDArray[np.float64]:
         """Return the (X, Y, Z, 3) centres of the cells, on the axes of the grid."""
-        lines = [self.lower[a] + (np.arange(self.size[a]) + 0.5) * self.voxel_size[a] for a in range(3)]
+        lines = [
+            self.lower[a] + (np.arange(self.size[a]) + 0.5) * self.voxel_size[a] for a in range(3)
+        ]
         return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
 
     def __str__(self) -> str:
@@ -294,7 +358,8 @@ class Grid:
     Attributes:
         spec: geometry of the cells.
         labels: (X, Y, Z) unsigned integer class ids. 0 is free space, and also unknown space.
-        counts: (X, Y, Z) number of votes. 0 means unknown (never evaluated). None if the grid has no counts.
+        counts: (X, Y, Z) number of votes. 0 means unknown (never evaluated). None if the grid has
+            no counts.
 
     Raises:
         FormatError: the shape of an array is not the size of the spec.
@@ -307,7 +372,9 @@ class Grid:
     def __post_init__(self) -> None:
         for name, array in (("labels", self.labels), ("counts", self.counts)):
             if array is not None and array.shape != self.spec.size:
-                raise FormatError(f"grid {name}", expected=f"shape {self.spec.size}", found=str(array.shape))
+                raise FormatError(
+                    f"grid {name}", expected=f"shape {self.spec.size}", found=str(array.shape)
+                )
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -315,13 +382,21 @@ class Grid:
         return np.ones(self.spec.size, np.bool_) if self.counts is None else self.counts > 0
 
     def __repr__(self) -> str:
-        occupied, free = np.count_nonzero(self.labels), np.count_nonzero(self.known & (self.labels == 0))
+        occupied, free = (
+            np.count_nonzero(self.labels),
+            np.count_nonzero(self.known & (self.labels == 0)),
+        )
         return f"<Grid {self.spec}: {occupied:,} occupied and {free:,} free voxels>"
 
     def _repr_html_(self) -> str:
-        """Return the HTML for notebooks: the geometry, and the heights of the occupied voxels from above."""
+        """Return the HTML for notebooks: the geometry, and the heights of the occupied voxels from
+        above.
+        """
         spec = self.spec
-        rows = {"bounds": f"{spec.lower} to {spec.upper}", "classes": np.unique(self.labels[self.labels > 0]).tolist()}
+        rows = {
+            "bounds": f"{spec.lower} to {spec.upper}",
+            "classes": np.unique(self.labels[self.labels > 0]).tolist(),
+        }
         return describe(repr(self), rows, spec.seen_from_above(self.labels))
 
 
@@ -330,7 +405,10 @@ def _float32(value: float) -> float:
 
 
 def _cells(width: float, step: float) -> int:
-    """Return the number of cells of size `step` that cover `width`. The tolerance accounts for the float32 bounds of the format."""
+    """Return the number of cells of size `step` that cover `width`.
+
+    The tolerance accounts for the float32 bounds of the format.
+    """
     ratio = width / step
     return max(1, round(ratio) if abs(ratio - round(ratio)) <= 1e-4 else math.ceil(ratio))
 
@@ -341,7 +419,8 @@ def most_frequent(
     """Return the most frequent label in each cell; for a tie, the lowest of them.
 
     Args:
-        cells: (N,) cell numbers of 0 or more. The largest one times the number of labels must be below 2**63.
+        cells: (N,) cell numbers of 0 or more. The largest one times the number of labels must be
+            below 2**63.
         labels: (N,) labels of 0 or more.
 
     Returns:
@@ -377,8 +456,8 @@ def is_confident(occupied: NDArray[np.floating], min_confidence: float) -> NDArr
     """Return which voxels are free or occupied with a minimum probability.
 
     Args:
-        occupied: probability that each voxel is occupied, of any shape. It is compared as float16, as in the file, so that a grid and
-            its file give the same result.
+        occupied: probability that each voxel is occupied, of any shape. It is compared as float16,
+            as in the file, so that a grid and its file give the same result.
         min_confidence: minimum of max(p, 1 - p); 0 to 0.5 accepts every voxel.
 
     Returns:

@@ -18,13 +18,20 @@ if TYPE_CHECKING:
     import pandas
 
 
-def describe(title: str, rows: Mapping[str, object], picture: NDArray[np.uint8] | None = None) -> str:
+def describe(
+    title: str, rows: Mapping[str, object], picture: NDArray[np.uint8] | None = None
+) -> str:
     """Return HTML with a title, a table, and an optional picture, (H, W, 3) uint8 RGB."""
     lines = "".join(
-        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>{html.escape(str(value))}</td></tr>"
+        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td "
+        f"style='text-align:left'>{html.escape(str(value))}</td></tr>"
         for name, value in rows.items()
     )
-    image = "" if picture is None else f"<img alt='seen from above' src='data:image/png;base64,{_png(picture)}'>"
+    image = (
+        ""
+        if picture is None
+        else f"<img alt='seen from above' src='data:image/png;base64,{_png(picture)}'>"
+    )
     return f"<div><b>{html.escape(title)}</b><table>{lines}</table>{image}</div>"
 
 
@@ -41,7 +48,9 @@ def data_frame(rows: Iterable[Mapping[str, object]], index: str) -> pandas.DataF
     try:
         import pandas
     except ImportError as error:
-        raise DependencyError("pandas is not installed", advice="install it with `pip install pandas`") from error
+        raise DependencyError(
+            "pandas is not installed", advice="install it with `pip install pandas`"
+        ) from error
     table = pandas.DataFrame(list(rows))
     return table if table.empty else table.set_index(index)
 
@@ -50,7 +59,9 @@ def _png(rgb: NDArray[np.uint8]) -> str:
     """Return an (H, W, 3) picture as a PNG file in base64, without Pillow, which is optional."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     height, width, _ = rgb.shape
     rows = b"".join(b"\0" + row.tobytes() for row in rgb)
@@ -59,4 +70,6 @@ def _png(rgb: NDArray[np.uint8]) -> str:
         (b"IDAT", zlib.compress(rows)),
         (b"IEND", b""),
     )
-    return base64.b64encode(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)).decode()
+    return base64.b64encode(
+        b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+    ).decode()

@@ -11,16 +11,19 @@ from typing import Any
 
 
 def from_plain(value: Any, kind: Any, name: str = "the value") -> Any:
-    """Convert a JSON value to a type. Lists become tuples, and objects become mappings or dataclasses.
+    """Convert a JSON value to a type.
+
+    Lists become tuples, and objects become mappings or dataclasses.
 
     Args:
         value: the value.
-        kind: int, float, str, bool, None, Any, a union of types, `tuple[...]`, `Mapping[str, ...]`, a dataclass or a TypedDict. Keys
-            that a dataclass lacks are ignored.
+        kind: int, float, str, bool, None, Any, a union of types, `tuple[...]`, `Mapping[str, ...]`,
+            a dataclass or a TypedDict. Keys that a dataclass lacks are ignored.
         name: name of the value in errors.
 
     Raises:
-        ValueError: the value has another type, lacks a key, or is a number that is not finite or has more than 64 bits.
+        ValueError: the value has another type, lacks a key, or is a number that is not finite or
+            has more than 64 bits.
     """
     origin, parts = typing.get_origin(kind) or kind, typing.get_args(kind)
     if kind is Any:
@@ -48,7 +51,10 @@ def from_plain(value: Any, kind: Any, name: str = "the value") -> Any:
 
 
 def _as_one_of(value: Any, kinds: tuple[Any, ...], name: str) -> Any:
-    """Convert a value to the first type that fits. If none fits, raise the error of the first type that is not None."""
+    """Convert a value to the first type that fits.
+
+    If none fits, raise the error of the first type that is not None.
+    """
     first: ValueError | None = None
     for kind in kinds:
         try:

@@ -25,11 +25,13 @@ class Scan:
     Attributes:
         points: (N, 3) float32, metres, sensor frame.
         labels: (N,) unsigned integer class ids, 0 is unlabelled; or None.
-        flow: (N, 3) float32 m/s, velocity of the actor hit, sensor frame, ego motion removed; or None.
+        flow: (N, 3) float32 m/s, velocity of the actor hit, sensor frame, ego motion removed; or
+            None.
         instances: (N,) uint32 actor ids, 0 is none; or None.
         remission: (N,) float32, the 4th column of the file (zero in CarlaSC); or None.
         others: other fields of the layout with one row per point, by name.
-        boxes: tracked boxes of the frame, sensor frame; may be empty; or None if the frame is not annotated.
+        boxes: tracked boxes of the frame, sensor frame; may be empty; or None if the frame is not
+            annotated.
 
     Raises:
         FormatError: the shapes of the arrays do not match.
@@ -47,21 +49,38 @@ class Scan:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise FormatError("scan points", expected="shape (N, 3)", found=str(self.points.shape))
         count = len(self.points)
-        expected = {"labels": (count,), "flow": (count, 3), "instances": (count,), "remission": (count,)}
+        expected = {
+            "labels": (count,),
+            "flow": (count, 3),
+            "instances": (count,),
+            "remission": (count,),
+        }
         for name, shape in expected.items():
             array = getattr(self, name)
             if array is not None and array.shape != shape:
-                raise FormatError(f"scan {name}", expected=f"shape {shape} for {count} points", found=str(array.shape))
+                raise FormatError(
+                    f"scan {name}",
+                    expected=f"shape {shape} for {count} points",
+                    found=str(array.shape),
+                )
         for name, array in self.others.items():
             if len(array) != count:
-                raise FormatError(f"scan {name}", expected=f"{count} rows for {count} points", found=str(len(array)))
+                raise FormatError(
+                    f"scan {name}",
+                    expected=f"{count} rows for {count} points",
+                    found=str(len(array)),
+                )
 
     def __len__(self) -> int:
         return len(self.points)
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the fields with one row per point, without `points`."""
-        own = (name for name in ("labels", "flow", "instances", "remission") if getattr(self, name) is not None)
+        own = (
+            name
+            for name in ("labels", "flow", "instances", "remission")
+            if getattr(self, name) is not None
+        )
         return (*own, *self.others)
 
     def __repr__(self) -> str:
@@ -72,7 +91,9 @@ class Scan:
         """Return the HTML for notebooks: the fields, and the heights of the points from above."""
         reach = float(np.percentile(np.abs(self.points[:, :2]), 99)) if len(self) else 1.0
         low, high = np.percentile(self.points[:, 2], (1, 99)).tolist() if len(self) else (0.0, 1.0)
-        spec = GridSpec("cartesian", (200, 200, 32), (-reach, -reach, low), (reach, reach, max(high, low + 0.1)))
+        spec = GridSpec(
+            "cartesian", (200, 200, 32), (-reach, -reach, low), (reach, reach, max(high, low + 0.1))
+        )
         labels = np.zeros(spec.num_voxels, np.uint8)
         voxels = spec.flat_index(self.points)
         labels[voxels[voxels >= 0]] = 1
@@ -80,7 +101,9 @@ class Scan:
         return describe(repr(self), rows, spec.seen_from_above(labels.reshape(spec.size)))
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
-        """Return a scan with the points selected by an (N,) mask or (M,) indices, with all their fields. Boxes are kept."""
+        """Return a scan with the points selected by an (N,) mask or (M,) indices, with all their
+        fields. Boxes are kept.
+        """
 
         def chosen(values: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if values is None else values[keep]
@@ -103,7 +126,9 @@ def sorted_by_origin(origins: NDArray[np.floating]) -> NDArray[np.int64]:
     return np.argsort(np.repeat(group, np.diff([*starts, len(origins)])), kind="stable")
 
 
-def runs_of_origins(origins: NDArray[np.floating] | None, count: int) -> list[tuple[slice, NDArray[np.floating]]]:
+def runs_of_origins(
+    origins: NDArray[np.floating] | None, count: int
+) -> list[tuple[slice, NDArray[np.floating]]]:
     """Return the runs of consecutive points with equal origins, and the (3,) origin of each run.
 
     Args:
@@ -118,7 +143,8 @@ def runs_of_origins(origins: NDArray[np.floating] | None, count: int) -> list[tu
 
 def _starts(origins: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return where each run of equal rows begins."""
-    x, y, z = (axis[1:] != axis[:-1] for axis in origins.T)  # five times as fast column by column as row by row
+    # five times as fast column by column as row by row
+    x, y, z = (axis[1:] != axis[:-1] for axis in origins.T)
     changes = x | y | z
     return np.concatenate([np.zeros(min(len(origins), 1), np.int64), np.flatnonzero(changes) + 1])
 
@@ -129,7 +155,8 @@ class RaysFromPlace:
 
     Attributes:
         part: slice of the points of the scan at which these rays end.
-        sensor_T_place: (4, 4), from the frame at the ray origin, with the axes of the sensor, to the sensor frame.
+        sensor_T_place: (4, 4), from the frame at the ray origin, with the axes of the sensor, to
+            the sensor frame.
         points: (M, 3) float32, these points relative to the ray origin, metres.
         order: (M,) int32, indices of `points` by increasing azimuth.
         azimuth: (M,) uint16, sorted azimuths from -pi, in steps; a full circle has `_TURN` steps.
@@ -142,20 +169,27 @@ class RaysFromPlace:
     azimuth: NDArray[np.uint16]
 
     @classmethod
-    def of(cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]) -> RaysFromPlace:
-        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan, given relative to the origin."""
+    def of(
+        cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]
+    ) -> RaysFromPlace:
+        """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan,
+        given relative to the origin.
+        """
         own = points[part]
         azimuth = _steps(np.arctan2(own[:, 1], own[:, 0])).astype(np.uint16)
-        order = np.argsort(azimuth, kind="stable").astype(np.int32)  # a radix sort, because they have 16 bits
+        # a radix sort, because they have 16 bits
+        order = np.argsort(azimuth, kind="stable").astype(np.int32)
         return cls(part, translation(origin), own, order, azimuth[order])
 
     def through(
         self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> NDArray[np.int32]:
-        """Return the indices of the points whose rays, from the origin to the point, intersect a box.
+        """Return the indices of the points whose rays, from the origin to the point, intersect a
+        box.
 
         Args:
-            box_T_sensor: (4, 4), from the frame of `points` to the frame in which the box is axis-aligned.
+            box_T_sensor: (4, 4), from the frame of `points` to the frame in which the box is
+                axis-aligned.
             lower: (3,) lower corner.
             upper: (3,) upper corner.
         """
@@ -174,9 +208,12 @@ class RaysFromPlace:
     ) -> NDArray[np.int32]:
         """Return the indices of the points in the range of azimuths that a box covers."""
         origin = box_T_sensor[:3, 3]
-        if ((origin > lower) & (origin < upper))[:2].all():  # the sensor is above, below or inside the box
+        # the sensor is above, below or inside the box
+        if ((origin > lower) & (origin < upper))[:2].all():
             return self.order
-        corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
+        corners = np.stack(
+            np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), axis=-1
+        ).reshape(-1, 3)
         seen = transform_points(invert(box_T_sensor), corners)
         angles = np.arctan2(seen[:, 1], seen[:, 0])
         middle = np.arctan2(np.sin(angles).sum(), np.cos(angles).sum())
@@ -185,7 +222,13 @@ class RaysFromPlace:
             return self.order
         low, high = np.floor(_steps(middle - half)) - 1, np.ceil(_steps(middle + half)) + 1
         parts = [
-            self.order[slice(*np.searchsorted(self.azimuth, np.clip([low + turn, high + turn + 1], 0, _TURN + 1)))]
+            self.order[
+                slice(
+                    *np.searchsorted(
+                        self.azimuth, np.clip([low + turn, high + turn + 1], 0, _TURN + 1)
+                    )
+                )
+            ]
             for turn in (0, _TURN, -_TURN)
         ]
         return np.concatenate(parts)
@@ -209,7 +252,12 @@ def finite(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def check_finite(points: NDArray[np.floating], name: str) -> None:
-    """Raise a FormatError for the first of (N, 3) points that is NaN or infinite. `name` is the file named in the message."""
+    """Raise a FormatError for the first of (N, 3) points that is NaN or infinite.
+
+    `name` is the file named in the message.
+    """
     if not np.isfinite(points).all():
         row = int(np.flatnonzero(~np.isfinite(points).reshape(len(points), -1).all(axis=1))[0])
-        raise FormatError(name, expected="finite coordinates", found=f"{points[row].tolist()} at point {row}")
+        raise FormatError(
+            name, expected="finite coordinates", found=f"{points[row].tolist()} at point {row}"
+        )

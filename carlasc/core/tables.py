@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable, Color, Remap
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
-_CARLA: tuple[tuple[str, Color, int], ...] = (  # name, colour, 11-class id; ids in order: docs/format.md#classes
+# name, colour, 11-class id; ids in order: docs/format.md#classes
+_CARLA: tuple[tuple[str, Color, int], ...] = (
     ("Free", (255, 255, 255), 0),
     ("Building", (70, 70, 70), 1),
     ("Fence", (100, 40, 40), 2),
@@ -50,10 +51,21 @@ CARLA = ClassTable(
 )
 CARLASC11 = ClassTable(
     "carlasc11",
-    dict(enumerate("Free Building Barrier Other Pedestrian Pole Road Ground Sidewalk Vegetation Vehicles".split())),
     dict(
         enumerate(
-            [(245, 150, 100), (245, 230, 100), (150, 60, 30), (180, 30, 80), (255, 80, 100), (30, 30, 255)]
+            "Free Building Barrier Other Pedestrian Pole Road Ground Sidewalk Vegetation Vehicles".split()
+        )
+    ),
+    dict(
+        enumerate(
+            [
+                (245, 150, 100),
+                (245, 230, 100),
+                (150, 60, 30),
+                (180, 30, 80),
+                (255, 80, 100),
+                (30, 30, 255),
+            ]
             + [(200, 40, 255), (90, 30, 150), (255, 0, 255), (255, 150, 255), (75, 0, 75)]
         )
     ),
@@ -64,7 +76,8 @@ CARLASC11 = ClassTable(
     ground_only=7,  # Ground
 )
 
-_KITTI: tuple[tuple[int, str, Color, int], ...] = (  # raw id, name, colour, class of the benchmark (0: ignored)
+# raw id, name, colour, class of the benchmark (0: ignored)
+_KITTI: tuple[tuple[int, str, Color, int], ...] = (
     (0, "unlabeled", (255, 255, 255), 0),
     (1, "outlier", (90, 90, 90), 0),
     (10, "car", (80, 130, 240), 1),
@@ -111,11 +124,14 @@ SEMANTICKITTI = ClassTable(
     geometry_only=99,  # other-object
     ground_only=49,  # other-ground
 )
-_KITTI19 = {0: "unlabeled"} | {k: name for i, name, _, k in _KITTI if k and i < 252 and i not in (13, 16, 60)}
+_KITTI19 = {0: "unlabeled"} | {
+    k: name for i, name, _, k in _KITTI if k and i < 252 and i not in (13, 16, 60)
+}
 SEMANTICKITTI19 = ClassTable(
     "semantickitti19",
     dict(sorted(_KITTI19.items())),
-    {0: (255, 255, 255)} | {k: color for i, _, color, k in _KITTI if k and i < 252 and i not in (13, 16, 60)},
+    {0: (255, 255, 255)}
+    | {k: color for i, _, color, k in _KITTI if k and i < 252 and i not in (13, 16, 60)},
     movable=frozenset(range(1, 9)),
     deformable=frozenset({6}),
     ground=frozenset({9, 10, 11, 12, 17}),
@@ -171,15 +187,19 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
     {
         remap.name: remap
         for remap in (
-            # Ids 23 and 24 exist only as vote channels; the table in the paper has no class for them.
+            # Ids 23 and 24 exist only as vote channels; the table in the paper has no class for
+            # them.
             Remap("carlasc11", CARLA, CARLASC11, {i: k for i, (_, _, k) in enumerate(_CARLA)}),
-            Remap("semantickitti19", SEMANTICKITTI, SEMANTICKITTI19, {i: k for i, _, _, k in _KITTI}),
+            Remap(
+                "semantickitti19", SEMANTICKITTI, SEMANTICKITTI19, {i: k for i, _, _, k in _KITTI}
+            ),
             Remap(
                 "semantickitti_to_carla",
                 SEMANTICKITTI,
                 CARLA,
                 _ranges(
-                    "10,11,13,15,16,18,20,252,256..259->10 30..32,253..255->4 40->7 60->6 44,49->14 48->8 50->1 51->2"
+                    "10,11,13,15,16,18,20,252,256..259->10 30..32,253..255->4 40->7 60->6 "
+                    "44,49->14 48->8 50->1 51->2"
                     " 52->19 70,71->9 72->22 80->5 81->12 99->3 0,1->0"
                 ),
             ),
@@ -188,19 +208,25 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
                 CARLA,
                 SEMANTICKITTI,
                 _ranges(
-                    "0->0 1->50 2->51 3->99 4->30 5->80 6->60 7->40 8->48 9->70 10->10 11->52 12->81 13->0 14->49 15->52 16->49 17->51"
+                    "0->0 1->50 2->51 3->99 4->30 5->80 6->60 7->40 8->48 9->70 10->10 11->52 "
+                    "12->81 13->0 14->49 15->52 16->49 17->51"
                     " 18->80 19->52 20->99 21->0 22->72"
                 ),
             ),
             Remap("semanticposs_to_carla", SEMANTICPOSS, CARLA, _POSS_TO_CARLA),
-            Remap(  # tags of CARLA 0.9.14 and later; those of earlier versions are the ids of the table CARLA above
+            # tags of CARLA 0.9.14 and later; those of earlier versions are the ids of the table
+            # CARLA above
+            Remap(
                 "carla0914_to_carla",
                 ClassTable(
-                    "carla0.9.14", {i: f"tag {i}" for i in range(29)}, dict.fromkeys(range(29), (128, 128, 128))
+                    "carla0.9.14",
+                    {i: f"tag {i}" for i in range(29)},
+                    dict.fromkeys(range(29), (128, 128, 128)),
                 ),
                 CARLA,
                 _ranges(
-                    "0->0 1->7 2->8 3->1 4->11 5->2 6->5 7->18 8->12 9->9 10->22 11->13 12,13->4 14..19->10 20->19 21->20 22->3"
+                    "0->0 1->7 2->8 3->1 4->11 5->2 6->5 7->18 8->12 9->9 10->22 11->13 12,13->4 "
+                    "14..19->10 20->19 21->20 22->3"
                     " 23->21 24->6 25->14 26->15 27->16 28->17"
                 ),
             ),
@@ -218,7 +244,8 @@ TRAIN_VOXEL_COUNTS = np.array(
     ],
     np.int64,
 )  # fmt: skip
-"""(23,) number of voxels of each CARLA class in the training split, in the coarse Cartesian grid."""
+"""(23,) number of voxels of each CARLA class in the training split, in the coarse Cartesian grid.
+"""
 
 
 def table_named(name: str) -> ClassTable:
@@ -240,7 +267,8 @@ def table_from_json(value: object, where: str) -> ClassTable:
         where: the file, for errors.
 
     Raises:
-        FormatError: no table has this name, the values are not valid, or a table in `TABLES` has the same name and other values.
+        FormatError: no table has this name, the values are not valid, or a table in `TABLES` has
+            the same name and other values.
     """
     if not isinstance(value, Mapping):
         try:
@@ -275,14 +303,22 @@ def remap_named(name: str) -> Remap:
 
 
 def benchmark_remap(classes: ClassTable) -> Remap | None:
-    """Return the remap to the classes that are usually used for training and scores: carlasc11, semantickitti19, or None for other tables."""
+    """Return the remap to the classes that are usually used for training and scores: carlasc11,
+    semantickitti19, or None for other tables.
+    """
     return next(
-        (r for r in REMAPS.values() if r.source == classes and r.name in ("carlasc11", "semantickitti19")), None
+        (
+            r
+            for r in REMAPS.values()
+            if r.source == classes and r.name in ("carlasc11", "semantickitti19")
+        ),
+        None,
     )
 
 
 def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
-    """Return the remaps that convert ids of one table to another, in order: none, one, or two with the table CARLA in between.
+    """Return the remaps that convert ids of one table to another, in order: none, one, or two with
+    the table CARLA in between.
 
     Raises:
         ArgumentError: no such remaps exist.
@@ -297,9 +333,13 @@ def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
         return (remap,)
     first, second = direct(source, CARLA), direct(CARLA, target)
     if first is None or second is None:
-        ways = sorted({r.target.name for r in REMAPS.values() if r.source == source} | {source.name})
+        ways = sorted(
+            {r.target.name for r in REMAPS.values() if r.source == source} | {source.name}
+        )
         raise ArgumentError(
-            "classes", expected=f"one of {', '.join(ways)} for labels of {source.name}", found=target.name
+            "classes",
+            expected=f"one of {', '.join(ways)} for labels of {source.name}",
+            found=target.name,
         )
     return first, second
 

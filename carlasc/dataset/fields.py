@@ -37,7 +37,10 @@ RAGGED = ("points", "point_labels", "flow", "remission")  # one row per point of
 
 
 class Sample(TypedDict, total=False):
-    """A sample of a `Dataset`: the requested fields, and `valid`, `sequence` and `frame`. For shapes and units, see `Dataset`."""
+    """A sample of a `Dataset`: the requested fields, and `valid`, `sequence` and `frame`.
+
+    For shapes and units, see `Dataset`.
+    """
 
     occupancy: NDArray[np.uint8]
     density: NDArray[np.uint16]
@@ -69,18 +72,27 @@ Values = dict[str, Any]
 
 
 def collate(samples: Sequence[Mapping[str, object]]) -> dict[str, Any]:
-    """Return a batch of samples, also with fields that have one row per point. Use it as the `collate_fn` of a DataLoader.
+    """Return a batch of samples, also with fields that have one row per point.
 
-    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, and `cameras` a list, one per sample. All other fields are stacked as by torch's
-    default_collate does.
+    Use it as the `collate_fn` of a DataLoader.
+
+    `points`, `point_labels`, `flow` and `remission` become lists of B tensors, and `cameras` a
+    list, one per sample. All other fields are stacked as by torch's default_collate does.
 
     Raises:
         DependencyError: torch is not installed.
     """
     torch = import_extra("torch", "torch")
     given: list[Values] = [dict(sample) for sample in samples]
-    dense = [{name: value for name, value in sample.items() if name not in (*RAGGED, *PLAIN)} for sample in given]
+    dense = [
+        {name: value for name, value in sample.items() if name not in (*RAGGED, *PLAIN)}
+        for sample in given
+    ]
     batch: dict[str, Any] = import_extra("torch.utils.data", "torch").default_collate(dense)
-    ragged = {name: [torch.from_numpy(sample[name]) for sample in given] for name in given[0] if name in RAGGED}
+    ragged = {
+        name: [torch.from_numpy(sample[name]) for sample in given]
+        for name in given[0]
+        if name in RAGGED
+    }
     ragged |= {name: [sample[name] for sample in given] for name in given[0] if name in PLAIN}
     return {name: ragged[name] if name in ragged else batch[name] for name in given[0]}

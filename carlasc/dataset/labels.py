@@ -1,4 +1,6 @@
-"""The fields of a sample from labels and grids: mapped class ids, known voxels, and their certainty."""
+"""The fields of a sample from labels and grids: mapped class ids, known voxels, and their
+certainty.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from carlasc.storage import Sequence, layout
 from carlasc.storage.field_files import dense_velocity
 
 RemapLike = str | Remap | Mapping[int, int] | ArrayLike | None
-"""Type of `remap` arguments: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids, "auto"; None keeps the ids."""
+"""Type of `remap` arguments: a name in `carlasc.core.REMAPS`, a Remap, a mapping or table of ids,
+"auto"; None keeps the ids.
+"""
 
 _GREY = (128, 128, 128)
 
@@ -40,9 +44,13 @@ class LabelMap:
         self.name = self._remap.name if self._remap else "none"
         self.source = self._remap.source if self._remap else classes
         self.target = self._remap.target if self._remap else classes
-        self._table = self._remap.table if self._remap else np.arange(classes.num_channels, dtype=np.int32)
+        self._table = (
+            self._remap.table if self._remap else np.arange(classes.num_channels, dtype=np.int32)
+        )
 
-    def __call__(self, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.unsignedinteger]:
+    def __call__(
+        self, labels: NDArray[np.unsignedinteger], where: str
+    ) -> NDArray[np.unsignedinteger]:
         """Map labels of any shape to the target table, in its dtype.
 
         Raises:
@@ -69,10 +77,14 @@ def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: Class
     else:
         table = np.asarray(remap)
         if table.ndim != 1 or table.dtype.kind not in "iu" or not table.size:
-            raise ArgumentError("remap", expected="a name, a mapping or a table of ids", found=type(remap).__name__)
+            raise ArgumentError(
+                "remap", expected="a name, a mapping or a table of ids", found=type(remap).__name__
+            )
         mapping = dict(enumerate(table.tolist()))
     if not mapping or min(mapping.values()) < 0:
-        raise ArgumentError("remap", expected="ids of 0 or more", found="a negative id" if mapping else "no ids")
+        raise ArgumentError(
+            "remap", expected="ids of 0 or more", found="a negative id" if mapping else "no ids"
+        )
     ids = sorted(set(mapping.values()))
     target = ClassTable("custom", {i: f"class {i}" for i in ids}, dict.fromkeys(ids, _GREY))
     return Remap("custom", classes, target, mapping)
@@ -92,13 +104,14 @@ _PARTS = {  # field of a sample -> fields of the grid
 }
 OF_GRID = frozenset(_PARTS)
 """The fields of a sample that come from a grid."""
+# types in samples
 _PLAIN: dict[str, type[np.generic]] = {
     "occupied": np.float32,
     "flags": np.uint8,
     "views": np.uint16,
     "instances": np.int64,
     "camera_visible": np.uint8,
-}  # types in samples
+}
 
 
 @dataclass(frozen=True)
@@ -108,7 +121,8 @@ class GridFields:
     Attributes:
         fields: names of fields. Fields that do not come from a grid are ignored.
         inferred: whether completed voxels, which no scan saw, count as known.
-        min_confidence: minimum probability of known voxels: a voxel is known if it is free or occupied with at least this probability.
+        min_confidence: minimum probability of known voxels: a voxel is known if it is free or
+            occupied with at least this probability.
 
     Raises:
         ArgumentError: `min_confidence` is not in 0 <= c < 1.
@@ -121,7 +135,9 @@ class GridFields:
     def __post_init__(self) -> None:
         if not 0 <= self.min_confidence < 1:
             found = str(self.min_confidence)
-            raise ArgumentError("min_confidence", expected="a probability from 0 to below 1", found=found)
+            raise ArgumentError(
+                "min_confidence", expected="a probability from 0 to below 1", found=found
+            )
 
     def parts(self, grids: Sequence, grid: str) -> set[str]:
         """Return the names of the required fields of the grid."""
@@ -129,8 +145,13 @@ class GridFields:
         if self._needs_known:
             parts |= set() if self.inferred else {"flags"}
             parts |= {"occupied"} if self.min_confidence else set()
-        if "counts" in parts and "counts" not in self.fields and not len(grids.frames(f"{grid}/counts")):
-            parts = parts - {"counts"} | {"labels"}  # all voxels are known in all frames with labels
+        if (
+            "counts" in parts
+            and "counts" not in self.fields
+            and not len(grids.frames(f"{grid}/counts"))
+        ):
+            # all voxels are known in all frames with labels
+            parts = parts - {"counts"} | {"labels"}
         return parts
 
     def read(self, grids: Sequence, grid: str, frame: int, label_map: LabelMap) -> Values:
@@ -146,9 +167,14 @@ class GridFields:
         def where(part: str) -> str:
             return f"{grids.location}: {grid}/{part} of frame {frame}"
 
-        sample: Values = {name: np.array(read(*_PARTS[name]), _PLAIN[name]) for name in self.fields & _PLAIN.keys()}
+        sample: Values = {
+            name: np.array(read(*_PARTS[name]), _PLAIN[name])
+            for name in self.fields & _PLAIN.keys()
+        }
         if "voxel_flow" in self.fields:
-            sample["voxel_flow"] = dense_velocity(read("velocity"), grids.grids[grid].size, where("velocity"))
+            sample["voxel_flow"] = dense_velocity(
+                read("velocity"), grids.grids[grid].size, where("velocity")
+            )
         if "labels" in self.fields:
             sample["labels"] = label_map(read("labels"), where("labels"))
         if "counts" in self.fields:
@@ -163,7 +189,9 @@ class GridFields:
             sample["known"] = known
         if "posterior" in self.fields:
             occupied, classes = read("occupied"), read("classes")
-            sample["posterior"] = soft_labels(occupied, classes, sample["known"], label_map, where("classes"))
+            sample["posterior"] = soft_labels(
+                occupied, classes, sample["known"], label_map, where("classes")
+            )
         return sample
 
     @property
@@ -180,9 +208,10 @@ def soft_labels(
 ) -> NDArray[np.float32]:
     """Return the probability of each class in each voxel.
 
-    If a voxel is occupied with probability p, and by a class with probability c given that it is occupied, the soft labels are 1 - p for
-    free (class 0) and p * c for the class. Classes that map to the same id are added up. If the class probabilities of a voxel do not sum
-    to 1, neither do its soft labels.
+    If a voxel is occupied with probability p, and by a class with probability c given that it is
+    occupied, the soft labels are 1 - p for free (class 0) and p * c for the class. Classes that map
+    to the same id are added up. If the class probabilities of a voxel do not sum to 1, neither do
+    its soft labels.
 
     Args:
         occupied: (X, Y, Z), the field `<grid>/occupied`.

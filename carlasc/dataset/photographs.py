@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from carlasc.dataset.fields import Sample, Values
 from carlasc.errors import ArgumentError, MissingDataError, import_extra
 from carlasc.storage import Sequence, layout
-from carlasc.storage.camera_files import cameras_of, has_image, image_fields, read_image, scan_T_camera
+from carlasc.storage.camera_files import (
+    cameras_of,
+    has_image,
+    image_fields,
+    read_image,
+    scan_T_camera,
+)
 
 OF_CAMERAS = frozenset({"images", "cameras"})
 """The fields of a sample that come from cameras."""
@@ -25,11 +31,16 @@ def frames_with_images(scans: Sequence, frames: NDArray[np.int64]) -> NDArray[np
         MissingDataError: the sequence has no cameras, or no frame has all images.
     """
     cameras = cameras_of(scans)
-    kept = [all(has_image(scans, camera, frame) for camera in cameras.values()) for frame in frames.tolist()]
+    kept = [
+        all(has_image(scans, camera, frame) for camera in cameras.values())
+        for frame in frames.tolist()
+    ]
     if not cameras or not any(kept):
         found = "no frame with all images" if cameras else f"no {layout.CAMERAS}"
         advice = "convert with --images copy or link"
-        raise MissingDataError(scans.location, expected="an image of each camera", found=found, advice=advice)
+        raise MissingDataError(
+            scans.location, expected="an image of each camera", found=found, advice=advice
+        )
     return frames[kept]
 
 
@@ -39,7 +50,8 @@ def stored_images(scans: Sequence) -> dict[tuple[Sequence, str], None]:
 
 
 def read_cameras(scans: Sequence, frame: int) -> Values:
-    """Return the images of a frame, and the camera models with their poses at the time of the images, both by camera name.
+    """Return the images of a frame, and the camera models with their poses at the time of the
+    images, both by camera name.
 
     Raises:
         FormatError: an image is damaged, or does not fit its camera.
@@ -57,7 +69,9 @@ def read_cameras(scans: Sequence, frame: int) -> Values:
 
 @dataclass(frozen=True)
 class ResizeImages:
-    """Resizes the images of samples, and scales the camera matrices. It is a `transform` of a Dataset.
+    """Resizes the images of samples, and scales the camera matrices.
+
+    It is a `transform` of a Dataset.
 
     Attributes:
         width: number of columns, pixels.
@@ -72,7 +86,9 @@ class ResizeImages:
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1:
-            raise ArgumentError("width", expected="1 or more pixels", found=f"{self.width} x {self.height}")
+            raise ArgumentError(
+                "width", expected="1 or more pixels", found=f"{self.width} x {self.height}"
+            )
 
     def __call__(self, sample: Sample) -> Sample:
         """Return the sample with resized images. The input is not changed.
@@ -84,10 +100,14 @@ class ResizeImages:
         picture = import_extra("PIL.Image", "render")
         if "images" in made:
             images: Mapping[str, NDArray[np.uint8]] = made["images"]
-            shrunk = picture.Resampling.BILINEAR  # when shrinking, Pillow averages over all source pixels
+            # when shrinking, Pillow averages over all source pixels
+            shrunk = picture.Resampling.BILINEAR
             made["images"] = {
-                name: np.array(picture.fromarray(one).resize(size, shrunk)) for name, one in images.items()
+                name: np.array(picture.fromarray(one).resize(size, shrunk))
+                for name, one in images.items()
             }
         if "cameras" in made:
-            made["cameras"] = {name: camera.resized(*size) for name, camera in made["cameras"].items()}
+            made["cameras"] = {
+                name: camera.resized(*size) for name, camera in made["cameras"].items()
+            }
         return cast(Sample, made)

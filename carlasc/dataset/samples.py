@@ -1,7 +1,8 @@
 """`Dataset`: the frames of any Source as training samples, which are dicts of NumPy arrays.
 
-It is a map-style data set for the DataLoader of torch, and does not import torch. A sample is one frame: the grid to predict, and the
-last `history` scans, moved to the sensor frame of the frame and binned. See the format page, `docs/format.md#training-samples`.
+It is a map-style data set for the DataLoader of torch, and does not import torch. A sample is one
+frame: the grid to predict, and the last `history` scans, moved to the sensor frame of the frame and
+binned. See the format page, `docs/format.md#training-samples`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,15 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Coordinates, GridSpec
 from carlasc.core.notebook import describe
-from carlasc.dataset.fields import ACTOR_FIELDS, ALWAYS, CAMERA_FIELDS, EVIDENCE_FIELDS, FIELDS, Sample, Values
+from carlasc.dataset.fields import (
+    ACTOR_FIELDS,
+    ALWAYS,
+    CAMERA_FIELDS,
+    EVIDENCE_FIELDS,
+    FIELDS,
+    Sample,
+    Values,
+)
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
 from carlasc.dataset.photographs import OF_CAMERAS, frames_with_images, read_cameras, stored_images
 from carlasc.dataset.selection import (
@@ -52,44 +61,50 @@ else:
 class Dataset(_MapStyle):
     """Frames of one or more sequences as training samples.
 
-    A sample is a dict with the requested `fields`. T is `history`, and (X, Y, Z) is the size of the grid:
+    A sample is a dict with the requested `fields`. T is `history`, and (X, Y, Z) is the size of the
+    grid:
 
-        occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the scan of the frame last
-        density       (T, X, Y, Z) uint16, number of points per voxel
-        visibility    (T, X, Y, Z) uint8, 2 where a scan has a point, 1 where only its rays passed, 0 elsewhere
-        labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and also unknown
-        known         (X, Y, Z) bool, voxels with a vote: ignore all other voxels in losses and metrics
-        counts        (X, Y, Z) float32, number of votes per voxel
-        posterior     (K, X, Y, Z) float32, soft labels: probability of each class, 0 for free; zeros where not known. K is the
+        occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the
+        scan of the frame last density       (T, X, Y, Z) uint16, number of points per voxel
+        visibility    (T, X, Y, Z) uint8, 2 where a scan has a point, 1 where only its rays passed,
+        0 elsewhere labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0
+        is free, and also unknown known         (X, Y, Z) bool, voxels with a vote: ignore all other
+        voxels in losses and metrics counts        (X, Y, Z) float32, number of votes per voxel
+        posterior     (K, X, Y, Z) float32, soft labels: probability of each class, 0 for free;
+        zeros where not known. K is the
                       largest id of `classes` plus 1
-        occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where it is unknown
-        flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`
-        views         (X, Y, Z) uint16, number of scans that saw the voxel
-        instances     (X, Y, Z) int64, number of the actor that the voxel belongs to, 0 for none; the same in all frames of a sequence
-        voxel_flow    (X, Y, Z, 3) float32 m/s, velocity of the actor in the voxel, sensor frame; zero where nothing moves
-        camera_visible (X, Y, Z) uint8, bit i: the i-th camera of cameras.json sees the voxel; see `carlasc.Voting(keep_seen=True)`
-        images        {camera: (H, W, 3) uint8}, RGB; `carlasc.dataset.ResizeImages` resizes them
-        cameras       {camera: `carlasc.core.CameraModel`}, with their poses at the times of these images
-        points        (N, 3) float32 metres, sensor frame of the frame; all points of the scan
-        point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
-        flow          (N, 3) float32 m/s, velocity of each point, sensor frame
-        remission     (N,) float32, fourth column of the scan: remission in KITTI, zero in CarlaSC
-        poses         (T, 4, 4) float64 current_T_past; the identity where not valid
-        valid         (T,) bool, whether the scan exists; in every sample
-        sequence      str, name of the sequence; in every sample
-        frame         int, number of the frame; in every sample
+        occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where it is
+        unknown flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag` views         (X, Y, Z)
+        uint16, number of scans that saw the voxel instances     (X, Y, Z) int64, number of the
+        actor that the voxel belongs to, 0 for none; the same in all frames of a sequence voxel_flow
+        (X, Y, Z, 3) float32 m/s, velocity of the actor in the voxel, sensor frame; zero where
+        nothing moves camera_visible (X, Y, Z) uint8, bit i: the i-th camera of cameras.json sees
+        the voxel; see `carlasc.Voting(keep_seen=True)` images        {camera: (H, W, 3) uint8},
+        RGB; `carlasc.dataset.ResizeImages` resizes them cameras       {camera:
+        `carlasc.core.CameraModel`}, with their poses at the times of these images points        (N,
+        3) float32 metres, sensor frame of the frame; all points of the scan point_labels  (N,)
+        uint8 class of each point (uint16 if ids exceed 255) flow          (N, 3) float32 m/s,
+        velocity of each point, sensor frame remission     (N,) float32, fourth column of the scan:
+        remission in KITTI, zero in CarlaSC poses         (T, 4, 4) float64 current_T_past; the
+        identity where not valid valid         (T,) bool, whether the scan exists; in every sample
+        sequence      str, name of the sequence; in every sample frame         int, number of the
+        frame; in every sample
 
-    The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are empty, and their `valid` is False.
-    Frames that lack a requested field are left out. `posterior`, `occupied`, `flags` and `views` need grids made with
-    `carlasc.Voting(keep_evidence=True)`; `instances` and `voxel_flow` need grids made with `keep_actors=True`. Points outside the range
-    `min_range_m` to `max_range_m` of carlasc.json are left out. Arrays have the axes of the sequences: right-handed data are not mirrored,
-    and cannot be mixed with left-handed data.
+    The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are
+    empty, and their `valid` is False. Frames that lack a requested field are left out. `posterior`,
+    `occupied`, `flags` and `views` need grids made with `carlasc.Voting(keep_evidence=True)`;
+    `instances` and `voxel_flow` need grids made with `keep_actors=True`. Points outside the range
+    `min_range_m` to `max_range_m` of carlasc.json are left out. Arrays have the axes of the
+    sequences: right-handed data are not mirrored, and cannot be mixed with left-handed data.
 
     Attributes:
-        sequences: the sequences in use, in order. `sequence` of a sample is the name of one of them.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
+        sequences: the sequences in use, in order. `sequence` of a sample is the name of one of
+            them.
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
+            left).
         classes: table of the class ids in samples, after the remap.
-        transform: called with each sample; returns the sample to use. It can be set later (see `carlasc.Flip`).
+        transform: called with each sample; returns the sample to use. It can be set later (see
+            `carlasc.Flip`).
     """
 
     def __init__(
@@ -112,39 +127,53 @@ class Dataset(_MapStyle):
 
         Args:
             source: anything that `carlasc.open` takes, or a Source.
-            split: "train", "val" or "test" (case-insensitive), the name of a sequence, or a list of names; None takes all sequences.
+            split: "train", "val" or "test" (case-insensitive), the name of a sequence, or a list of
+                names; None takes all sequences.
             history: T, number of scans in a stack, including the scan of the frame.
-            coordinates: coordinates of the grids: "cartesian" or "cylindrical"; ignored if `grid` is a GridSpec. Scans, poses and
-                times are read from the folder of that name if it has scans, otherwise from `cartesian/`.
-            grid: name of the grid (its folder); its params.json has the geometry. Or a GridSpec: `labels`, `known` and `counts` are then
-                read from the grid with this geometry; without these fields, the grid need not exist.
-            grids_source: a separate source of grids, such as eval_fine.zip and eval_cylindrical.zip. Its sequences are matched to those of
-                `source` by split and name. None reads grids from `source`.
+            coordinates: coordinates of the grids: "cartesian" or "cylindrical"; ignored if `grid`
+                is a GridSpec. Scans, poses and times are read from the folder of that name if it
+                has scans, otherwise from `cartesian/`.
+            grid: name of the grid (its folder); its params.json has the geometry. Or a GridSpec:
+                `labels`, `known` and `counts` are then read from the grid with this geometry;
+                without these fields, the grid need not exist.
+            grids_source: a separate source of grids, such as eval_fine.zip and
+                eval_cylindrical.zip. Its sequences are matched to those of `source` by split and
+                name. None reads grids from `source`.
             fields: the fields of a sample, from the list above.
-            remap: mapping of `labels` and `point_labels`: "auto" to the usual training classes (carlasc11 or semantickitti19; other tables
-                keep their ids), a name in `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a table of new ids by old id; None keeps
-                the ids of the data.
-            align: move past scans to the sensor frame of the frame by their poses; False stacks them unmoved.
-            inferred: False excludes completed voxels, which no scan saw, from `known` and `posterior`.
-            min_confidence: minimum probability: voxels that are neither free nor occupied with at least this probability are excluded from
-                `known` and `posterior`; 0 to 0.5 keeps all.
+            remap: mapping of `labels` and `point_labels`: "auto" to the usual training classes
+                (carlasc11 or semantickitti19; other tables keep their ids), a name in
+                `carlasc.core.REMAPS`, a Remap, a mapping of ids, or a table of new ids by old id;
+                None keeps the ids of the data.
+            align: move past scans to the sensor frame of the frame by their poses; False stacks
+                them unmoved.
+            inferred: False excludes completed voxels, which no scan saw, from `known` and
+                `posterior`.
+            min_confidence: minimum probability: voxels that are neither free nor occupied with at
+                least this probability are excluded from `known` and `posterior`; 0 to 0.5 keeps
+                all.
             transform: called with each sample.
 
         Raises:
             ArgumentError: an argument is not valid, or the remap is for another class table.
-            MissingDataError: a split or sequence does not exist, or a sequence lacks a requested field.
-            FormatError: sequences differ in grid, axes or class table, or poses.txt does not fit the scans.
+            MissingDataError: a split or sequence does not exist, or a sequence lacks a requested
+                field.
+            FormatError: sequences differ in grid, axes or class table, or poses.txt does not fit
+                the scans.
         """
         self.fields = _check_fields(fields)
         if isinstance(history, bool) or not isinstance(history, int | np.integer) or history < 1:
-            raise ArgumentError("history", expected="a number of scans of 1 or more", found=repr(history))
+            raise ArgumentError(
+                "history", expected="a number of scans of 1 or more", found=repr(history)
+            )
         self.history = int(history)
         self.align = align
         self._grid_fields = GridFields(frozenset(self.fields), inferred, min_confidence)
         self.transform = transform
         coordinates = grid.coordinates if isinstance(grid, GridSpec) else coordinates
         if coordinates not in layout.COORDINATES:
-            raise ArgumentError("coordinates", expected="cartesian or cylindrical", found=repr(coordinates))
+            raise ArgumentError(
+                "coordinates", expected="cartesian or cylindrical", found=repr(coordinates)
+            )
 
         opened = as_source(source)
         chosen = choose_sequences(opened, split, coordinates)
@@ -160,13 +189,27 @@ class Dataset(_MapStyle):
         self._starts = np.cumsum([0, *(len(part.frames) for part in self._parts)])
         if not len(self):
             raise MissingDataError(
-                opened.location, expected=f"frames with {', '.join(self.fields)}", found="no frame with all of them"
+                opened.location,
+                expected=f"frames with {', '.join(self.fields)}",
+                found="no frame with all of them",
             )
 
         self.sequences = tuple(part.scans for part in self._parts)
-        self.axes: Axes = common_value({scans.location: scans.metadata.axes for scans in self.sequences}, "axes")
-        specs = {part.grids.location: part.grids.grids[part.grid] for part in self._parts if part.grids is not None}
-        self._spec = grid if isinstance(grid, GridSpec) else common_value(specs, "grid geometry") if specs else None
+        self.axes: Axes = common_value(
+            {scans.location: scans.metadata.axes for scans in self.sequences}, "axes"
+        )
+        specs = {
+            part.grids.location: part.grids.grids[part.grid]
+            for part in self._parts
+            if part.grids is not None
+        }
+        self._spec = (
+            grid
+            if isinstance(grid, GridSpec)
+            else common_value(specs, "grid geometry")
+            if specs
+            else None
+        )
         self._label_map = self._make_label_map(remap)
         self.classes: ClassTable = self._label_map.target
 
@@ -179,7 +222,9 @@ class Dataset(_MapStyle):
         """
         if self._spec is None:
             raise ArgumentError(
-                "fields", expected="a field that needs a grid, such as occupancy", found=", ".join(self.fields)
+                "fields",
+                expected="a field that needs a grid, such as occupancy",
+                found=", ".join(self.fields),
             )
         return self._spec
 
@@ -191,11 +236,14 @@ class Dataset(_MapStyle):
     @overload
     def __getitem__(self, index: slice) -> Self: ...
     def __getitem__(self, index: SupportsIndex | slice) -> Sample | Self:
-        """Return one sample. A negative index counts from the end. A slice returns a Dataset of these samples.
+        """Return one sample.
+
+        A negative index counts from the end. A slice returns a Dataset of these samples.
 
         Raises:
             IndexError: the index is out of range.
-            ArgumentError: the step of a slice is negative: samples are always in the order of frames.
+            ArgumentError: the step of a slice is negative: samples are always in the order of
+                frames.
             FormatError: the content of a file is not valid; the message names the file.
         """
         if isinstance(index, slice):
@@ -225,7 +273,9 @@ class Dataset(_MapStyle):
     def _part_of(self, chosen: slice) -> Self:
         """Return a Dataset of a slice of the samples."""
         if chosen.step is not None and chosen.step < 0:
-            raise ArgumentError("index", expected="a slice with a step of 1 or more", found=str(chosen.step))
+            raise ArgumentError(
+                "index", expected="a slice with a step of 1 or more", found=str(chosen.step)
+            )
         part, places = copy.copy(self), np.arange(len(self))[chosen]
         ends = zip(self._starts[:-1].tolist(), self._starts[1:].tolist(), self._parts, strict=True)
         part._parts = [
@@ -243,7 +293,11 @@ class Dataset(_MapStyle):
     @property
     def is_cached(self) -> bool:
         """Whether at least a part of the data is remote and was opened with a cache."""
-        return any(isinstance(sequence.tree, CachedTree) for part in self._parts for sequence, _ in part.fields)
+        return any(
+            isinstance(sequence.tree, CachedTree)
+            for part in self._parts
+            for sequence, _ in part.fields
+        )
 
     def cached_files(self, indices: Iterable[int]) -> list[tuple[CachedTree, str]]:
         """Return the files of samples that are read through a cache, each once."""
@@ -255,7 +309,9 @@ class Dataset(_MapStyle):
         for part, numbers in frames.items():
             for sequence, field in part.fields:
                 if isinstance(tree := sequence.tree, CachedTree):
-                    read = part.with_history(numbers, self.history) if field == "points" else numbers
+                    read = (
+                        part.with_history(numbers, self.history) if field == "points" else numbers
+                    )
                     files |= dict.fromkeys((tree, path) for path in sequence.files_of(field, read))
         return list(files)
 
@@ -269,7 +325,9 @@ class Dataset(_MapStyle):
             if part.scans.name == sequence and frame in part.frames:
                 return int(start + np.searchsorted(part.frames, frame))
         raise MissingDataError(
-            f"frame {frame} of {sequence}", expected=f"the frame of one of the {len(self)} samples", found="none"
+            f"frame {frame} of {sequence}",
+            expected=f"the frame of one of the {len(self)} samples",
+            found="none",
         )
 
     def __repr__(self) -> str:
@@ -286,7 +344,9 @@ class Dataset(_MapStyle):
         picture = None
         if self._spec is not None and "labels" in self.fields and len(self):
             labels = self[0]["labels"]
-            picture = self._spec.seen_from_above(labels, self.classes.palette, left_handed=self.axes == "left")
+            picture = self._spec.seen_from_above(
+                labels, self.classes.palette, left_handed=self.axes == "left"
+            )
         return describe(repr(self), rows, picture)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -312,7 +372,9 @@ class Dataset(_MapStyle):
             parts = self._grid_fields.parts(grids, grid)
             wanted |= {(grids, f"{grid}/{part}"): None for part in sorted(parts)}
         wanted |= stored_images(scans) if (shows := self._asks(OF_CAMERAS)) else {}
-        frames = frames_with_images(scans, common_frames(wanted)) if shows else common_frames(wanted)
+        frames = (
+            frames_with_images(scans, common_frames(wanted)) if shows else common_frames(wanted)
+        )
         part = SequenceFrames(scans, grids, grid, frames, tuple(wanted))
         if self._needs_poses:
             part.check_poses()
@@ -342,11 +404,15 @@ class Dataset(_MapStyle):
         which = int(np.searchsorted(self._starts, place, side="right")) - 1
         return self._parts[which], int(self._parts[which].frames[place - self._starts[which]])
 
-    def _stacks(self, part: SequenceFrames, past: list[int | None], poses: NDArray[np.float64] | None) -> Values:
+    def _stacks(
+        self, part: SequenceFrames, past: list[int | None], poses: NDArray[np.float64] | None
+    ) -> Values:
         from carlasc.dataset.stacking import stack_scans
 
         spec = self.spec
-        moves = poses if self.align and poses is not None else np.tile(np.eye(4), (self.history, 1, 1))
+        moves = (
+            poses if self.align and poses is not None else np.tile(np.eye(4), (self.history, 1, 1))
+        )
         scans = self._recent.read(part.scans, past)
         ranges = (part.scans.metadata.min_range_m, part.scans.metadata.max_range_m)
         stacks: Values = {}
@@ -371,10 +437,14 @@ class Dataset(_MapStyle):
         sample: Values = {}
         if "points" in self.fields:
             (points,) = self._recent.read(part.scans, [frame])
-            sample["points"] = np.array(points[:, :3] if points is not None else (), np.float32, order="C")
+            sample["points"] = np.array(
+                points[:, :3] if points is not None else (), np.float32, order="C"
+            )
         if "point_labels" in self.fields:
             labels = part.scans.read("labels", frame)
-            sample["point_labels"] = self._label_map(labels, f"{part.scans.location}: labels of frame {frame}")
+            sample["point_labels"] = self._label_map(
+                labels, f"{part.scans.location}: labels of frame {frame}"
+            )
         if "flow" in self.fields:
             sample["flow"] = np.array(part.scans.read("flow", frame), np.float32, order="C")
         if "remission" in self.fields:
@@ -382,7 +452,9 @@ class Dataset(_MapStyle):
         lengths = {name: len(array) for name, array in sample.items()}
         if len(set(lengths.values())) > 1:
             found = ", ".join(f"{length} {name}" for name, length in lengths.items())
-            raise FormatError(f"{part.scans.location}: frame {frame}", expected="one value per point", found=found)
+            raise FormatError(
+                f"{part.scans.location}: frame {frame}", expected="one value per point", found=found
+            )
         return sample
 
 

@@ -1,7 +1,9 @@
-"""The order of samples in training: shards in random order, and frames shuffled within a window of shards.
+"""The order of samples in training: shards in random order, and frames shuffled within a window of
+shards.
 
-Frames that are stored together are read at about the same time, so that each file of an object store is fetched once. Threads fetch the
-files of the next samples into the cache of a remote store during training.
+Frames that are stored together are read at about the same time, so that each file of an object
+store is fetched once. Threads fetch the files of the next samples into the cache of a remote store
+during training.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ from carlasc.errors import ArgumentError, CarlascError
 from carlasc.storage.transport.caching import CachedTree
 
 _STORED_TOGETHER = 16  # frames per file of packed zarr stores
-_READ_AGAIN = 4  # minimum length of a shard, relative to the additional frames that are read for histories
+_READ_AGAIN = (
+    4  # minimum length of a shard, relative to the additional frames that are read for histories
+)
 
 if TYPE_CHECKING:  # for type checkers it is a torch Sampler; torch is not imported at run time
     from torch.utils.data import Sampler as TorchSampler
@@ -35,23 +39,26 @@ else:
 
 
 class ShardSampler(_Sampler):
-    """Yields the indices of the samples of a Dataset in random order, as the `sampler` of a torch DataLoader.
+    """Yields the indices of the samples of a Dataset in random order, as the `sampler` of a torch
+    DataLoader.
 
-    A shard is a run of consecutive frames of one sequence. Shards are shuffled, and each frame moves to a random position within the next
-    `window` shards, so that frames of at most `window` shards are mixed at any time. The order depends only on the data, the seed, the
-    epoch, `shard` and `window`, not on the number of processes or of workers of a loader.
+    A shard is a run of consecutive frames of one sequence. Shards are shuffled, and each frame
+    moves to a random position within the next `window` shards, so that frames of at most `window`
+    shards are mixed at any time. The order depends only on the data, the seed, the epoch, `shard`
+    and `window`, not on the number of processes or of workers of a loader.
 
-    Process r of n takes every n-th sample, beginning with the r-th: with batches of B / n samples per process, step s uses the same B
-    samples for every n. If n does not divide the number of samples, the first samples are repeated, so that all processes make the same
-    number of steps (as with the DistributedSampler of torch).
+    Process r of n takes every n-th sample, beginning with the r-th: with batches of B / n samples
+    per process, step s uses the same B samples for every n. If n does not divide the number of
+    samples, the first samples are repeated, so that all processes make the same number of steps (as
+    with the DistributedSampler of torch).
 
-    If the data are opened with a cache (`carlasc.open(url, cache=folder)`), threads fetch the files of the next shards into it during an
-    epoch. They end with the iteration.
+    If the data are opened with a cache (`carlasc.open(url, cache=folder)`), threads fetch the files
+    of the next shards into it during an epoch. They end with the iteration.
 
-        dataset = Dataset(carlasc.open("s3://bucket/carlasc.zarr", cache="/scratch/cache"), "train", history=16)
-        sampler = ShardSampler(dataset, seed=0)
-        loader = torch.utils.data.DataLoader(dataset, batch_size=4, sampler=sampler, num_workers=2)
-        for epoch in range(epochs):
+        dataset = Dataset(carlasc.open("s3://bucket/carlasc.zarr", cache="/scratch/cache"), "train",
+        history=16) sampler = ShardSampler(dataset, seed=0) loader =
+        torch.utils.data.DataLoader(dataset, batch_size=4, sampler=sampler, num_workers=2) for epoch
+        in range(epochs):
             sampler.set_epoch(epoch)
             for batch in loader: ...
 
@@ -80,9 +87,11 @@ class ShardSampler(_Sampler):
         Args:
             dataset: the samples. To sample a part of them, give a Dataset of this part.
             seed: seed of the order, 0 or more.
-            shard: number of frames per shard, a multiple of 16 if files of a store have 16 frames. None takes 16 for samples with one
-                scan, otherwise 64 or more, because each shard also needs earlier frames for the histories of its first samples.
-            window: number of shards whose frames are mixed. A larger window mixes better, and needs a larger cache.
+            shard: number of frames per shard, a multiple of 16 if files of a store have 16 frames.
+                None takes 16 for samples with one scan, otherwise 64 or more, because each shard
+                also needs earlier frames for the histories of its first samples.
+            window: number of shards whose frames are mixed. A larger window mixes better, and needs
+                a larger cache.
             rank: number of this process, from 0.
             world: number of processes that train together.
             read_ahead: number of shards that are fetched in advance; 0 turns this off.
@@ -91,12 +100,21 @@ class ShardSampler(_Sampler):
             ArgumentError: an argument is not valid.
         """
         least = {"seed": 0, "shard": 1, "window": 1, "rank": 0, "world": 1, "read_ahead": 0}
-        given = {"seed": seed, "shard": shard, "window": window, "rank": rank, "world": world, "read_ahead": read_ahead}
+        given = {
+            "seed": seed,
+            "shard": shard,
+            "window": window,
+            "rank": rank,
+            "world": world,
+            "read_ahead": read_ahead,
+        }
         for name, value in given.items():
             if value is not None and value < least[name]:
                 raise ArgumentError(name, expected=f"{least[name]} or more", found=str(value))
         if rank >= world:
-            raise ArgumentError("rank", expected=f"0 to {world - 1}, for {world} processes", found=str(rank))
+            raise ArgumentError(
+                "rank", expected=f"0 to {world - 1}, for {world} processes", found=str(rank)
+            )
         self.dataset = dataset
         self.seed = seed
         self.epoch = 0
@@ -116,22 +134,32 @@ class ShardSampler(_Sampler):
         return math.ceil(len(self._shards) / self.world)
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the next epoch. For the epoch of `load_state_dict`, the iteration continues at its position."""
+        """Set the next epoch.
+
+        For the epoch of `load_state_dict`, the iteration continues at its position.
+        """
         if epoch != self.epoch:
             self._next = self._begun = self._drawn = 0
         self.epoch = epoch
 
     def order(self, epoch: int) -> NDArray[np.int64]:
-        """Return the (N,) indices of all samples, for all processes together, in the order of an epoch."""
+        """Return the (N,) indices of all samples, for all processes together, in the order of an
+        epoch.
+        """
         drawn = np.random.default_rng([self.seed, epoch])
-        place = np.argsort(np.argsort(drawn.random(int(self._shards[-1]) + 1), kind="stable"), kind="stable")
-        return np.argsort(place[self._shards] + self.window * drawn.random(len(self._shards)), kind="stable")
+        place = np.argsort(
+            np.argsort(drawn.random(int(self._shards[-1]) + 1), kind="stable"), kind="stable"
+        )
+        return np.argsort(
+            place[self._shards] + self.window * drawn.random(len(self._shards)), kind="stable"
+        )
 
     def __iter__(self) -> Iterator[int]:
         """Iterate over an epoch, or over the rest of it after `load_state_dict`."""
         epoch, start = self.epoch, self._next
         self._next = self._begun = self._drawn = 0
-        if start == len(self._shards):  # the state of a finished epoch was loaded: continue with the next epoch
+        # the state of a finished epoch was loaded: continue with the next epoch
+        if start == len(self._shards):
             self.epoch += 1
         else:
             self._begun = self._drawn = start
@@ -148,26 +176,34 @@ class ShardSampler(_Sampler):
                 yield index
 
     def state_dict(self, trained: int | None = None) -> dict[str, int]:
-        """Return the position in the epoch. A sampler of the same data can load it, with any number of processes.
+        """Return the position in the epoch.
 
-        A DataLoader with workers draws samples in advance. Pass the number of samples that were trained on:
+        A sampler of the same data can load it, with any number of processes.
+
+        A DataLoader with workers draws samples in advance. Pass the number of samples that were
+        trained on:
 
             for step, batch in enumerate(loader):
                 ...
-                torch.save({"sampler": sampler.state_dict(trained=(step + 1) * batch_size), ...}, path)
+                torch.save({"sampler": sampler.state_dict(trained=(step + 1) * batch_size), ...},
+                path)
 
         Args:
-            trained: number of samples that were trained on since the start of the iteration, summed over all processes. None takes all
-                drawn samples, for the StatefulDataLoader of torchdata, which counts itself.
+            trained: number of samples that were trained on since the start of the iteration, summed
+                over all processes. None takes all drawn samples, for the StatefulDataLoader of
+                torchdata, which counts itself.
         """
         position = self._drawn if trained is None else min(self._begun + trained, len(self._shards))
         return {"seed": self.seed, "epoch": self.epoch, "position": position} | self._about()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue at a position. The next iteration yields the rest of its epoch, later iterations whole epochs.
+        """Continue at a position.
+
+        The next iteration yields the rest of its epoch, later iterations whole epochs.
 
         Raises:
-            ArgumentError: the state is from a sampler of other data, or with another `shard` or `window`.
+            ArgumentError: the state is from a sampler of other data, or with another `shard` or
+                `window`.
         """
         different = [name for name, value in self._about().items() if state.get(name) != value]
         if different or not 0 <= state.get("position", -1) <= len(self._shards):
@@ -185,8 +221,15 @@ class ShardSampler(_Sampler):
         places = zip(self.dataset.sequences, self.dataset.frames, strict=True)
         digest = 0
         for sequence, frames in places:
-            digest = zlib.crc32(np.asarray(frames, "<i8").tobytes(), zlib.crc32(sequence.name.encode(), digest))
-        return {"samples": len(self._shards), "data": digest, "shard": self.shard, "window": self.window}
+            digest = zlib.crc32(
+                np.asarray(frames, "<i8").tobytes(), zlib.crc32(sequence.name.encode(), digest)
+            )
+        return {
+            "samples": len(self._shards),
+            "data": digest,
+            "shard": self.shard,
+            "window": self.window,
+        }
 
 
 def _number_shards(dataset: Dataset, length: int) -> NDArray[np.int64]:
@@ -205,18 +248,28 @@ _THREADS = 3  # files that are fetched in parallel, each in several ranges
 
 
 class ReadAhead:
-    """Threads that fetch the files of shards, in the order of their first samples, inside a `with` block.
+    """Threads that fetch the files of shards, in the order of their first samples, inside a `with`
+    block.
 
-    They start when the first sample is drawn, after a loader has forked its workers. Without a cache, no thread is started.
+    They start when the first sample is drawn, after a loader has forked its workers. Without a
+    cache, no thread is started.
     """
 
-    # Class attributes, because at interpreter exit the globals of this module may be deleted during an iteration.
+    # Class attributes, because at interpreter exit the globals of this module may be deleted during
+    # an iteration.
     _clock = staticmethod(time.monotonic)
     _this_thread = staticmethod(threading.current_thread)
-    _stop_s = 5.0  # longest wait for running fetches at the end: requests to a lost server are repeated for minutes
+    # longest wait for running fetches at the end: requests to a lost server are repeated for
+    # minutes
+    _stop_s = 5.0
 
     def __init__(
-        self, dataset: Dataset, order: NDArray[np.int64], shards: NDArray[np.int64], start: int, count: int
+        self,
+        dataset: Dataset,
+        order: NDArray[np.int64],
+        shards: NDArray[np.int64],
+        start: int,
+        count: int,
     ) -> None:
         """Compute the order in which shards are needed.
 
@@ -253,7 +306,8 @@ class ReadAhead:
             self._changed.notify_all()
         if not self._threads:
             self._threads = [
-                threading.Thread(target=self._run, name="carlasc-read-ahead", daemon=True) for _ in range(_THREADS)
+                threading.Thread(target=self._run, name="carlasc-read-ahead", daemon=True)
+                for _ in range(_THREADS)
             ]
             for thread in self._threads:
                 thread.start()
@@ -262,25 +316,32 @@ class ReadAhead:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
         end = self._clock() + self._stop_s
         for thread in self._threads:
-            if thread is not self._this_thread():  # the garbage collector may close an iterator in any thread
+            # the garbage collector may close an iterator in any thread
+            if thread is not self._this_thread():
                 thread.join(max(0.0, end - self._clock()))
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._stopped or self._waiting or self._may_begin_shard())
+                self._changed.wait_for(
+                    lambda: self._stopped or self._waiting or self._may_begin_shard()
+                )
                 if self._stopped:
                     return
                 file = self._waiting.popleft() if self._waiting else None
                 shard = self._next_shards.popleft() if file is None else -1
-            with suppress(CarlascError):  # the reader of the file gets the same error, and reports it
+            # the reader of the file gets the same error, and reports it
+            with suppress(CarlascError):
                 if file is not None:
                     tree, path = file
                     tree.fetch(path, wait=False)

@@ -1,4 +1,6 @@
-"""The sequences and frames of a Dataset: sequences of a split, their grids, frames with all fields, and a cache of recent scans."""
+"""The sequences and frames of a Dataset: sequences of a split, their grids, frames with all fields,
+and a cache of recent scans.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,8 @@ class SequenceFrames:
 
     Attributes:
         scans: sequence from which scans, poses and metadata are read.
-        grids: sequence from which grids are read: the same sequence, its other `<coordinates>` folder, or a sequence of another source;
-            None if no grid is needed.
+        grids: sequence from which grids are read: the same sequence, its other `<coordinates>`
+            folder, or a sequence of another source; None if no grid is needed.
         grid: name of the grid in `grids`.
         frames: frame numbers of the samples, increasing.
         fields: the fields from which samples are read, each with its sequence.
@@ -56,7 +58,9 @@ class SequenceFrames:
         self.__dict__.update(state, frames=expand(state["frames"]))
 
     def history(self, frame: int, length: int) -> list[int | None]:
-        """Return the frame numbers of a stack, oldest first; None before the start of the sequence or before a gap."""
+        """Return the frame numbers of a stack, oldest first; None before the start of the sequence
+        or before a gap.
+        """
         past: list[int | None] = [None] * length
         for back in range(length):
             if frame - back not in self._scanned:
@@ -66,12 +70,18 @@ class SequenceFrames:
 
     def with_history(self, frames: Iterable[int], length: int) -> list[int]:
         """Return the sorted numbers of all frames in the stacks of some frames."""
-        return sorted({past for frame in frames for past in self.history(frame, length) if past is not None})
+        return sorted(
+            {past for frame in frames for past in self.history(frame, length) if past is not None}
+        )
 
     def current_T_past(self, frame: int, past: list[int | None]) -> NDArray[np.float64]:
-        """Return (T, 4, 4) float64 transforms from past sensor frames to the sensor frame of `frame`; the identity for `frame` and for None."""
+        """Return (T, 4, 4) float64 transforms from past sensor frames to the sensor frame of
+        `frame`; the identity for `frame` and for None.
+        """
         transforms = np.tile(np.eye(4), (len(past), 1, 1))
-        others = {row: number for row, number in enumerate(past) if number is not None and number != frame}
+        others = {
+            row: number for row, number in enumerate(past) if number is not None and number != frame
+        }
         if others:
             first_T_past = np.array([self.scans.read_pose(number) for number in others.values()])
             transforms[list(others)] = np.linalg.inv(self.scans.read_pose(frame)) @ first_T_past
@@ -87,7 +97,8 @@ class SequenceFrames:
         where = f"{self.scans.location}/{layout.POSES}"
         poses = self.scans.poses
         if len(self.frames):
-            self.scans.read_pose(int(self.frames[-1]))  # if the last frame has a line, all frames have
+            # if the last frame has a line, all frames have
+            self.scans.read_pose(int(self.frames[-1]))
         rotations = np.nan_to_num(poses[:, :3, :3])
         rigid = np.isfinite(poses).all((1, 2)) & (np.abs(np.linalg.det(rotations) - 1) < _RIGID)
         if not rigid.all():
@@ -99,8 +110,12 @@ class SequenceFrames:
             )
 
 
-def choose_sequences(source: Source, split: str | Iterable[str] | None, coordinates: Coordinates) -> list[Sequence]:
-    """Return the sequences of a split or with the given names, in the order of the source. Scans are read from these sequences.
+def choose_sequences(
+    source: Source, split: str | Iterable[str] | None, coordinates: Coordinates
+) -> list[Sequence]:
+    """Return the sequences of a split or with the given names, in the order of the source.
+
+    Scans are read from these sequences.
 
     Raises:
         ArgumentError: `split` is not a split, the name of a sequence or a list of names.
@@ -110,11 +125,13 @@ def choose_sequences(source: Source, split: str | Iterable[str] | None, coordina
     return [_with_scans(groups[key], coordinates) for key in _match(source, groups, split)]
 
 
-def find_grid_sequences(chosen: list[Sequence], source: Source, coordinates: Coordinates) -> list[Sequence]:
+def find_grid_sequences(
+    chosen: list[Sequence], source: Source, coordinates: Coordinates
+) -> list[Sequence]:
     """Return, for each sequence, the sequence from which its grids are read.
 
-    Sequences are matched by split and name, or by name alone if a path has no split. If both sources have a single sequence, these match
-    regardless of their names.
+    Sequences are matched by split and name, or by name alone if a path has no split. If both
+    sources have a single sequence, these match regardless of their names.
 
     Raises:
         MissingDataError: a sequence has no counterpart.
@@ -128,11 +145,19 @@ def find_grid_sequences(chosen: list[Sequence], source: Source, coordinates: Coo
             for (split, name, _), group in groups.items()
             if name == scans.name and (split == scans.split or None in (split, scans.split))
         ]
-        exact = [group for group in candidates if any(member.location == scans.location for member in group.values())]
+        exact = [
+            group
+            for group in candidates
+            if any(member.location == scans.location for member in group.values())
+        ]
         group = next(iter(exact or candidates or only), {})
         if coordinates not in group:
             existing = ", ".join(
-                sorted(f"{member.split or '?'}/{member.name}" for g in groups.values() for member in g.values())
+                sorted(
+                    f"{member.split or '?'}/{member.name}"
+                    for g in groups.values()
+                    for member in g.values()
+                )
             )
             raise MissingDataError(
                 source.location,
@@ -188,7 +213,9 @@ def common_frames(wanted: Mapping[tuple[Sequence, str], None]) -> NDArray[np.int
 def _advice(part: str) -> str:
     """Return the advice for a missing field or part of a grid."""
     kept = {"evidence": layout.EVIDENCE_FIELDS, "actors": layout.ACTOR_FIELDS, "seen": ("seen",)}
-    return next((_ADVICE_KEEP.format(name) for name, parts in kept.items() if part in parts), _ADVICE)
+    return next(
+        (_ADVICE_KEEP.format(name) for name, parts in kept.items() if part in parts), _ADVICE
+    )
 
 
 def common_value(values: Mapping[str, _T], what: str) -> _T:
@@ -232,17 +259,19 @@ def _with_scans(group: dict[str, Sequence], coordinates: Coordinates) -> Sequenc
             found=f"only {other.coordinates}",
             advice=f"give `coordinates={other.coordinates!r}`",
         )
-    return next((sequence for sequence in candidates if len(sequence.frames("points"))), candidates[0])
+    return next(
+        (sequence for sequence in candidates if len(sequence.frames("points"))), candidates[0]
+    )
 
 
-def _match(source: Source, groups: Mapping[_Key, object], split: str | Iterable[str] | None) -> list[_Key]:
+def _match(
+    source: Source, groups: Mapping[_Key, object], split: str | Iterable[str] | None
+) -> list[_Key]:
     if split is None:
         return list(groups)
     if isinstance(split, str) and split.lower() not in map(str.lower, layout.SPLITS):
         if not any(split in _names(key) for key in groups):
-            expected = (
-                f"{', '.join(layout.SPLITS)} in any case, or one or more of {first_names(key[1] for key in groups)}"
-            )
+            expected = f"{', '.join(layout.SPLITS)} in any case, or one or more of {first_names(key[1] for key in groups)}"
             raise ArgumentError("split", expected=expected, found=repr(split))
         split = [split]
     if isinstance(split, str):
@@ -271,7 +300,8 @@ def _names(key: _Key) -> set[str]:
 
 
 class RecentScans(threading.local):
-    """Caches the last decoded scans of a thread, because the stacks of consecutive frames differ by one scan only.
+    """Caches the last decoded scans of a thread, because the stacks of consecutive frames differ by
+    one scan only.
 
     The memory of a dropped scan is reused for the next one, so each thread has a separate cache.
     """
@@ -282,8 +312,12 @@ class RecentScans(threading.local):
         self.capacity = capacity
         self._scans: OrderedDict[tuple[Sequence, int], NDArray[np.float32]] = OrderedDict()
 
-    def read(self, sequence: Sequence, frames: list[int | None]) -> list[NDArray[np.float32] | None]:
-        """Return the points of each frame like `Sequence.read_xyz`, and None for None. They are valid until the next call.
+    def read(
+        self, sequence: Sequence, frames: list[int | None]
+    ) -> list[NDArray[np.float32] | None]:
+        """Return the points of each frame like `Sequence.read_xyz`, and None for None.
+
+        They are valid until the next call.
 
         All scans that are not cached are read in one call.
         """

@@ -1,8 +1,10 @@
-"""Compiled code that turns scans into dense arrays: it transforms, bins and counts points in one pass, and maps labels in another.
+"""Compiled code that turns scans into dense arrays: it transforms, bins and counts points in one
+pass, and maps labels in another.
 
-The result is equal to that of `GridSpec` (`to_axes`, `index`). Points for which the fast arithmetic may be wrong are binned by the exact
-rule. A scan is processed in blocks that fit into the CPU cache: the columns are split first, and the other steps vectorise. Importing
-this module loads Numba.
+The result is equal to that of `GridSpec` (`to_axes`, `index`). Points for which the fast arithmetic
+may be wrong are binned by the exact rule. A scan is processed in blocks that fit into the CPU
+cache: the columns are split first, and the other steps vectorise. Importing this module loads
+Numba.
 """
 
 from __future__ import annotations
@@ -33,11 +35,12 @@ def stack_scans(
     """Bin scans into a stack of grids.
 
     Args:
-        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, as rows or as the transpose of contiguous
-            x, y and z; None gives an empty grid.
+        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, as rows or as
+            the transpose of contiguous x, y and z; None gives an empty grid.
         grid_T_scans: (T, 4, 4) transforms from the frame of each scan to the frame of the grid.
         spec: the grid.
-        what: "occupancy" marks voxels with a point, "density" counts points per voxel (at most 65535).
+        what: "occupancy" marks voxels with a point, "density" counts points per voxel (at most
+            65535).
         min_range_m: points nearer to their sensor than this are left out; None keeps all.
         max_range_m: points farther from their sensor than this are left out; None keeps all.
 
@@ -51,7 +54,11 @@ def stack_scans(
     for grid, points, row in zip(stack.reshape(len(scans), -1), scans, rows, strict=True):
         if points is not None and len(points):
             planes = points[:, :3].T
-            if planes.flags.aligned and planes.strides[1] == planes.itemsize and points.dtype == np.float32:
+            if (
+                planes.flags.aligned
+                and planes.strides[1] == planes.itemsize
+                and points.dtype == np.float32
+            ):
                 x, y, z = map(_read_only, planes)
                 _bin_planes(x, y, z, tuple(row), cells, geometry, ranges, grid)
             else:
@@ -59,15 +66,21 @@ def stack_scans(
     return stack
 
 
-def look_up(labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype: np.dtype[Any]) -> NDArray[Any] | None:
-    """Return `table[labels]` as `dtype`, with the shape of `labels`; None if a label is not in the table (after its end, or its value is -1)."""
+def look_up(
+    labels: NDArray[np.unsignedinteger], table: NDArray[np.int32], dtype: np.dtype[Any]
+) -> NDArray[Any] | None:
+    """Return `table[labels]` as `dtype`, with the shape of `labels`; None if a label is not in the
+    table (after its end, or its value is -1).
+    """
     found = np.empty(labels.shape, dtype)
     flat = np.ascontiguousarray(labels).reshape(-1)
     return found if _look_up(_read_only(flat), table, found.reshape(-1)) else None
 
 
 def _geometry(spec: GridSpec) -> tuple[Any, ...]:
-    """Return the constants of the fast arithmetic: lower bounds, cells per metre or radian, sizes, and its maximum error in cells."""
+    """Return the constants of the fast arithmetic: lower bounds, cells per metre or radian, sizes,
+    and its maximum error in cells.
+    """
     voxel, sizes = spec.voxel_size, tuple(float(n) for n in spec.size)
     # Rounding, the difference of voxel_size * size from the bounds, and the error of the azimuth.
     doubt = 1e-6 + 1e-7 * max(sizes)
@@ -76,7 +89,9 @@ def _geometry(spec: GridSpec) -> tuple[Any, ...]:
 
 
 def _as_words(points: NDArray[np.float32]) -> NDArray[np.uint64]:
-    """Return the bytes of the points as (2 N,) words: x and y in one, z and the fourth number in the next."""
+    """Return the bytes of the points as (2 N,) words: x and y in one, z and the fourth number in
+    the next.
+    """
     if points.shape[1] != 4:
         points = np.column_stack([points[:, :3], np.zeros(len(points), np.float32)])
     words = np.ascontiguousarray(points, np.float32).reshape(-1).view(np.uint64)
@@ -91,12 +106,16 @@ def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
-_step = numba.njit(nogil=True, inline="always")  # inlined into the loop over blocks, which does not vectorise otherwise
+# inlined into the loop over blocks, which does not vectorise otherwise
+_step = numba.njit(nogil=True, inline="always")
 
 
 @_step
 def _split_columns(words, x, y, z):  # type: ignore[no-untyped-def]
-    """Split points into x, y and z. Reading two 64-bit words per point vectorises; reading four floats does not."""
+    """Split points into x, y and z.
+
+    Reading two 64-bit words per point vectorises; reading four floats does not.
+    """
     for n in range(len(words) // 2):
         xy, zw = words[2 * n], words[2 * n + 1]
         x[n] = np.uint32(xy).view(np.float32)
@@ -136,18 +155,22 @@ def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore
     for n in range(count):
         squared = x[n] * x[n] + y[n] * y[n]
         angle = fast_azimuth(x[n], y[n])
-        turned = angle + 2 * np.pi if angle < lower else (angle - 2 * np.pi if angle >= upper else angle)
+        turned = (
+            angle + 2 * np.pi if angle < lower else (angle - 2 * np.pi if angle >= upper else angle)
+        )
         angle = turned if (turned >= lower) & (turned < upper) else angle
-        azimuth[n] = angle if squared > 0 else lower  # a point at the origin is on an edge, so the exact rule decides
+        # a point at the origin is on an edge, so the exact rule decides
+        azimuth[n] = angle if squared > 0 else lower
         radius[n] = np.sqrt(squared)
 
 
 @_step
 def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def]
-    """Write the flat voxel index of each point on the axes of the grid: -1 outside, -2 if it is uncertain.
-
-    Three divisions per point would take half of the time. The code multiplies instead, and marks points near the edge of a cell as
+    """Write the flat voxel index of each point on the axes of the grid: -1 outside, -2 if it is
     uncertain.
+
+    Three divisions per point would take half of the time. The code multiplies instead, and marks
+    points near the edge of a cell as uncertain.
     """
     (l0, l1, l2), (w0, w1, w2), (s0, s1, s2), doubt = geometry
     clear = 0.5 - doubt
@@ -156,7 +179,11 @@ def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def
         a, b, c = (x[n] - l0) * w0, (y[n] - l1) * w1, (z[n] - l2) * w2
         i, j, k = np.floor(a), np.floor(b), np.floor(c)
         inside = (i >= 0) & (i < s0) & (j >= 0) & (j < s1) & (k >= 0) & (k < s2)
-        edge = (np.abs(a - i - 0.5) > clear) | (np.abs(b - j - 0.5) > clear) | (np.abs(c - k - 0.5) > clear)
+        edge = (
+            (np.abs(a - i - 0.5) > clear)
+            | (np.abs(b - j - 0.5) > clear)
+            | (np.abs(c - k - 0.5) > clear)
+        )
         doubtful += edge
         cell = (i * s1 + j) * s2 + k if inside else -1.0
         cells[n] = np.int32(-2.0 if edge else cell)
@@ -202,7 +229,9 @@ def _bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-un
     for start in range(0, len(words), 2 * _BLOCK):
         block = words[start : start + 2 * _BLOCK]
         _split_columns(block, x, y, z)
-        _bin_block(x, y, z, radius, azimuth, found, len(block) // 2, rows, cells, geometry, ranges, grid)
+        _bin_block(
+            x, y, z, radius, azimuth, found, len(block) // 2, rows, cells, geometry, ranges, grid
+        )
 
 
 @cached
@@ -211,7 +240,11 @@ def _bin_planes(xs, ys, zs, rows, cells, geometry, ranges, grid):  # type: ignor
     radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
     found = np.empty(_BLOCK, np.int32)
     for start in range(0, len(xs), _BLOCK):
-        xb, yb, zb = xs[start : start + _BLOCK], ys[start : start + _BLOCK], zs[start : start + _BLOCK]
+        xb, yb, zb = (
+            xs[start : start + _BLOCK],
+            ys[start : start + _BLOCK],
+            zs[start : start + _BLOCK],
+        )
         _copy_columns(xb, yb, zb, x, y, z)
         _bin_block(x, y, z, radius, azimuth, found, len(xb), rows, cells, geometry, ranges, grid)
 

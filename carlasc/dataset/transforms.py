@@ -19,20 +19,32 @@ from carlasc.errors import ArgumentError
 _DIRECTIONS = ("x", "y")
 _TOLERANCE = 1e-5  # the published azimuth bounds are pi as float32, with an error of 9e-8
 _FIRST_GRID_AXIS = {"occupancy": 1, "density": 1, "visibility": 1, "posterior": 1} | dict.fromkeys(
-    ("labels", "known", "counts", "occupied", "flags", "views", "instances", "voxel_flow", "camera_visible"), 0
+    (
+        "labels",
+        "known",
+        "counts",
+        "occupied",
+        "flags",
+        "views",
+        "instances",
+        "voxel_flow",
+        "camera_visible",
+    ),
+    0,
 )
 
 
 class Flip:
     """Mirrors samples at random along x and along y, independently: grids, points, flow and poses.
 
-    In a Cartesian grid, a flip reverses an axis. In a cylindrical grid, a flip of y reverses the azimuth, and a flip of x reverses the
-    azimuth and rolls it by half a turn; the radius is never flipped. Poses are conjugated with the reflection, so they still align the
-    flipped scans.
+    In a Cartesian grid, a flip reverses an axis. In a cylindrical grid, a flip of y reverses the
+    azimuth, and a flip of x reverses the azimuth and rolls it by half a turn; the radius is never
+    flipped. Poses are conjugated with the reflection, so they still align the flipped scans.
 
-    With a seed, the flips of a sample depend only on the seed, the epoch, and `sequence` and `frame` of the sample: they are equal in
-    every worker process. `set_epoch` also reaches persistent workers; without it, every epoch has the same flips. Without a seed, every
-    call is random.
+    With a seed, the flips of a sample depend only on the seed, the epoch, and `sequence` and
+    `frame` of the sample: they are equal in every worker process. `set_epoch` also reaches
+    persistent workers; without it, every epoch has the same flips. Without a seed, every call is
+    random.
 
         dataset.transform = flips = Flip(dataset.spec, seed=0)
         for epoch in range(epochs):
@@ -61,7 +73,9 @@ class Flip:
         """
         self.directions = tuple(directions)
         if not set(self.directions) <= set(_DIRECTIONS):
-            raise ArgumentError("directions", expected="x, y or both", found=", ".join(map(repr, self.directions)))
+            raise ArgumentError(
+                "directions", expected="x, y or both", found=", ".join(map(repr, self.directions))
+            )
         if not 0 <= probability <= 1:
             raise ArgumentError("probability", expected="0..1", found=str(probability))
         if seed is not None and seed < 0:
@@ -75,14 +89,22 @@ class Flip:
                 _check_symmetric(spec, direction)
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the next epoch. Call this before iterating over the DataLoader, as with a DistributedSampler."""
+        """Set the next epoch.
+
+        Call this before iterating over the DataLoader, as with a DistributedSampler.
+        """
         self._epoch.value = epoch
 
     def __call__(self, sample: Sample) -> Sample:
         """Return the sample, possibly flipped. The input is not changed."""
         seed: list[int] | None = None
         if self.seed is not None:
-            seed = [self.seed, self._epoch.value, zlib.crc32(sample["sequence"].encode()), sample["frame"]]
+            seed = [
+                self.seed,
+                self._epoch.value,
+                zlib.crc32(sample["sequence"].encode()),
+                sample["frame"],
+            ]
         drawn = np.random.default_rng(seed).random(len(_DIRECTIONS)) < self.probability
         for direction, flipped in zip(_DIRECTIONS, drawn, strict=True):
             if flipped and direction in self.directions:
@@ -94,7 +116,8 @@ def flip(sample: Sample, direction: str, spec: GridSpec | None) -> Sample:
     """Return a sample mirrored in "x" or "y".
 
     Args:
-        sample: a sample of a Dataset. Fields other than grids, points, flow and poses are unchanged.
+        sample: a sample of a Dataset. Fields other than grids, points, flow and poses are
+            unchanged.
         direction: "x" or "y".
         spec: the grid of the sample; None if it has no grid.
 
@@ -144,7 +167,9 @@ def _check_symmetric(spec: GridSpec, direction: str) -> None:
     lower, upper = spec.lower[bounds], spec.upper[bounds]
     if not math.isclose(lower, -upper, abs_tol=_TOLERANCE):
         raise ArgumentError(
-            f"flip of {direction}", expected="a grid that is symmetric about 0", found=f"{lower}..{upper} ({spec})"
+            f"flip of {direction}",
+            expected="a grid that is symmetric about 0",
+            found=f"{lower}..{upper} ({spec})",
         )
     if spec.coordinates == "cylindrical" and direction == "x":
         turn = math.isclose(upper - lower, 2 * math.pi, abs_tol=_TOLERANCE)

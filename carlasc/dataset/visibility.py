@@ -26,22 +26,32 @@ def stack_visibility(
 ) -> NDArray[np.uint8]:
     """Trace the rays of scans through a stack of grids.
 
-    A ray is sampled from its point back to the sensor, with the shortest edge of a voxel as step, so it may miss a voxel of which it crosses
-    only a corner. If a scan has many more points than the outer surface of the grid has voxel faces (and more than 40,000), every N-th ray
-    is traced. On the published grid, this misses 4 % of the voxels that rays pass, and takes less than half the time.
+    A ray is sampled from its point back to the sensor, with the shortest edge of a voxel as step,
+    so it may miss a voxel of which it crosses only a corner. If a scan has many more points than
+    the outer surface of the grid has voxel faces (and more than 40,000), every N-th ray is traced.
+    On the published grid, this misses 4 % of the voxels that rays pass, and takes less than half
+    the time.
 
     Args:
-        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, with the sensor at the origin; None is an empty scan.
+        scans: T scans, each (N, 3) or (N, 4) float32 metres in its own sensor frame, with the
+            sensor at the origin; None is an empty scan.
         grid_T_scans: (T, 4, 4) transforms from the frame of each scan to the frame of the grid.
         spec: the grid.
-        min_range_m: points nearer to the sensor than this are left out with their rays; None keeps all.
-        max_range_m: points farther from the sensor than this are left out with their rays; None keeps all.
+        min_range_m: points nearer to the sensor than this are left out with their rays; None keeps
+            all.
+        max_range_m: points farther from the sensor than this are left out with their rays; None
+            keeps all.
 
     Returns:
-        (T, X, Y, Z) uint8: `HIT` where a scan has a point, `PASSED` where only rays passed, otherwise `UNSEEN`.
+        (T, X, Y, Z) uint8: `HIT` where a scan has a point, `PASSED` where only rays passed,
+        otherwise `UNSEEN`.
     """
     seen = 2 * stack_scans(scans, grid_T_scans, spec, "occupancy", min_range_m, max_range_m)
-    step_m = float(spec.voxel_size[[0, 2]].min() if spec.coordinates == "cylindrical" else spec.voxel_size.min())
+    step_m = float(
+        spec.voxel_size[[0, 2]].min()
+        if spec.coordinates == "cylindrical"
+        else spec.voxel_size.min()
+    )
     x, y, z = spec.size
     most = max(_FEWEST_RAYS, 2 * (x * y + y * z + x * z))
     limits = min_range_m or 0.0, math.inf if max_range_m is None else max_range_m

@@ -1,4 +1,6 @@
-"""Ground truth: observations give votes, votes give grids, and a run makes the grids of a whole data set."""
+"""Ground truth: observations give votes, votes give grids, and a run makes the grids of a whole
+data set.
+"""
 
 import lazy_loader
 

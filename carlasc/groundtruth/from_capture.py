@@ -30,19 +30,26 @@ _TURNING_M_S = 1.0  # the velocity of slower actors does not show their heading
 
 @dataclass(frozen=True)
 class CaptureFrame(FrameInput):
-    """One frame of a capture: each sensor is a voter, and the grid is in the frame of the ego sensor."""
+    """One frame of a capture: each sensor is a voter, and the grid is in the frame of the ego
+    sensor.
+    """
 
     capture: Capture
     sensors: tuple[int, ...]
     number: int
     source_frame: int
-    around: tuple[int, int]  # a frame before and one after: the turn rates of actors are measured between them
+    # a frame before and one after: the turn rates of actors are measured between them
+    around: tuple[int, int]
 
     def fields(self) -> tuple[str, ...]:
         """Return points, labels, flow and instances, and the pictures that the frame has."""
         always = ("points", "labels", "flow", "instances")
         bev = ("bev",) if self.capture.has_bev(self.source_frame) else ()
-        return (*always, *bev, *(self.capture.image_fields(self.source_frame) if self.capture.cameras else ()))
+        return (
+            *always,
+            *bev,
+            *(self.capture.image_fields(self.source_frame) if self.capture.cameras else ()),
+        )
 
     def views(self) -> Views:
         """Return the cameras of the capture: their images are taken at the instant of the frame."""
@@ -51,7 +58,8 @@ class CaptureFrame(FrameInput):
     def make(self, plan: GridPlan) -> FrameData:
         """Read the ego sensor's recording, which is the scan, and count the votes of all sensors.
 
-        The other recordings are read one at a time, so memory does not grow with the number of sensors.
+        The other recordings are read one at a time, so memory does not grow with the number of
+        sensors.
         """
         ego = self.capture.read(self.sensors[0], self.source_frame)
         fields: dict[str, NDArray[Any]] = {
@@ -66,30 +74,45 @@ class CaptureFrame(FrameInput):
         if self.capture.cameras:
             fields |= self.capture.read_images(self.source_frame)
         step, classes = plan.voting.free_step_m, self.capture.classes
-        who = ActorPoints(plan.spec, self._turns(), classes.deformable) if plan.voting.keep_actors else None
+        who = (
+            ActorPoints(plan.spec, self._turns(), classes.deformable)
+            if plan.voting.keep_actors
+            else None
+        )
         seen = self._observations(ego, who)
         boxes = plan.voting.keep_seen
-        votes = count_votes(seen, plan.spec, classes, rule=plan.rule, free_step_m=step, keep_boxes=boxes)
+        votes = count_votes(
+            seen, plan.spec, classes, rule=plan.rule, free_step_m=step, keep_boxes=boxes
+        )
         grid = votes.to_grid()
         actors = None if who is None else who.of(grid.labels)
         return FrameData(fields, grid, votes, actors=actors, boxes=votes.boxes)
 
     def _observations(self, ego: SensorRecording, who: ActorPoints | None) -> Iterator[Observation]:
         for sensor in self.sensors:
-            recording = ego if sensor == self.sensors[0] else self.capture.read(sensor, self.source_frame)
+            recording = (
+                ego if sensor == self.sensors[0] else self.capture.read(sensor, self.source_frame)
+            )
             ego_T_sensor = relative_to(ego.world_T_sensor, recording.world_T_sensor)
             if who is not None:
                 who.add(recording, ego_T_sensor)
             yield Observation(recording.scan.points, _present(recording.scan.labels), ego_T_sensor)
 
     def _turns(self) -> dict[int, float]:
-        """Return the turn rates of actors about the vertical, rad/s: the change of the direction of their velocity."""
+        """Return the turn rates of actors about the vertical, rad/s: the change of the direction of
+        their velocity.
+        """
         before, after = (self.capture.read_velocities(frame) for frame in self.around)
-        seconds, turns = (self.around[1] - self.around[0]) * layout.FRAME_PERIOD_S, dict[int, float]()
+        seconds, turns = (
+            (self.around[1] - self.around[0]) * layout.FRAME_PERIOD_S,
+            dict[int, float](),
+        )
         for actor in before.keys() & after.keys() if seconds else ():
             first, last = before[actor], after[actor]
             if min(np.hypot(*first[:2]), np.hypot(*last[:2])) > _TURNING_M_S:
-                angle = np.arctan2(first[0] * last[1] - first[1] * last[0], first[0] * last[0] + first[1] * last[1])
+                angle = np.arctan2(
+                    first[0] * last[1] - first[1] * last[0], first[0] * last[0] + first[1] * last[1]
+                )
                 turns[actor] = float(angle) / seconds
         return turns
 
@@ -98,18 +121,29 @@ class CaptureSequence(SequenceInput):
     """A capture as a sequence: its frames are renumbered from 0."""
 
     def __init__(self, capture: Capture, path: str, plan: GridPlan) -> None:
-        self.path, self.location, self.metadata = path, capture.location, Metadata(classes=capture.classes)
+        self.path, self.location, self.metadata = (
+            path,
+            capture.location,
+            Metadata(classes=capture.classes),
+        )
         self.capture, self.plan = capture, plan
 
     def _find_frames(self) -> tuple[FrameInput, ...]:
         capture = self.capture
         numbers = choose_frames(self.plan.frames, np.array(capture.frames), capture.location)
-        # Frames hold a copy of the capture without its cached listing, which would be pickled with each frame.
+        # Frames hold a copy of the capture without its cached listing, which would be pickled with
+        # each frame.
         light, known = capture.light(), capture.frames
         place = np.searchsorted(known, numbers)
-        around = [known[np.clip(place + step, 0, len(known) - 1)].tolist() for step in (-_TURN_FRAMES, _TURN_FRAMES)]
+        around = [
+            known[np.clip(place + step, 0, len(known) - 1)].tolist()
+            for step in (-_TURN_FRAMES, _TURN_FRAMES)
+        ]
         frames = enumerate(zip(numbers, *around, strict=True))
-        return tuple(CaptureFrame(light, capture.sensors, i, n, (before, after)) for i, (n, before, after) in frames)
+        return tuple(
+            CaptureFrame(light, capture.sensors, i, n, (before, after))
+            for i, (n, before, after) in frames
+        )
 
     def _count_points(self, source_frame: int) -> int:
         return len(self.capture.read(0, source_frame).scan)
@@ -127,7 +161,8 @@ class CaptureSequence(SequenceInput):
         except (FormatError, MissingDataError) as error:
             error.advice = "the first frame's pose is the origin of poses.txt: fix it, or start with a later frame"
             raise
-        # NaN where a pose cannot be read: reading that frame raises the same error, and that one is reported
+        # NaN where a pose cannot be read: reading that frame raises the same error, and that one is
+        # reported
         poses = self.capture.read_poses(0, [frame.source_frame for frame in self.frames])
         return relative_to(world_T_first, poses)
 
@@ -143,14 +178,27 @@ class CaptureSequence(SequenceInput):
     def record(self) -> dict[str, Any]:
         """Return the frames and the number of sensors.
 
-        An open end of the range stays open, so that a later run continues after the capture has grown.
+        An open end of the range stays open, so that a later run continues after the capture has
+        grown.
         """
-        asked, first, last = self.plan.frames, self.frames[0].source_frame, self.frames[-1].source_frame
-        frames = f"{first}:" if asked.stop is None else f"{first}:{last + 1}" if asked.only is None else str(asked)
+        asked, first, last = (
+            self.plan.frames,
+            self.frames[0].source_frame,
+            self.frames[-1].source_frame,
+        )
+        frames = (
+            f"{first}:"
+            if asked.stop is None
+            else f"{first}:{last + 1}"
+            if asked.only is None
+            else str(asked)
+        )
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
 
 
-def capture_sequences(source: str | os.PathLike[str] | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
+def capture_sequences(
+    source: str | os.PathLike[str] | Source | Capture, plan: GridPlan
+) -> list[SequenceInput]:
     """Find the captures in or below a folder.
 
     Raises:

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
     """Make a coarser grid from a finer one.
 
-    A fine cell belongs to the coarse voxel that contains its centre. Each voxel takes the most frequent class of its known cells (ties go
-    to the lowest id), and the sum of their counts.
+    A fine cell belongs to the coarse voxel that contains its centre. Each voxel takes the most
+    frequent class of its known cells (ties go to the lowest id), and the sum of their counts.
 
     Args:
         grid: the finer grid.
@@ -48,7 +48,8 @@ def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
         The coarse grid. Voxels without a known cell are unknown.
 
     Raises:
-        ArgumentError: `spec` is finer than `grid` on an axis, of other coordinates, or extends beyond it.
+        ArgumentError: `spec` is finer than `grid` on an axis, of other coordinates, or extends
+            beyond it.
     """
     check_coarser(grid.spec, spec)
     known = grid.known.reshape(-1)
@@ -67,7 +68,8 @@ def resample(grid: Grid, spec: GridSpec, classes: ClassTable) -> Grid:
 def _boxes(fine: Grid, spec: GridSpec) -> NDArray[np.uint8] | None:
     """Return the boxes around the occupied cells of a finer grid in each voxel of a coarser one."""
     corners = np.stack(list(np.ndindex(2, 2, 2))) - 0.5
-    corners *= (1 - 1e-3) * fine.spec.voxel_size  # a corner on a border would belong to the voxel beside it
+    # a corner on a border would belong to the voxel beside it
+    corners *= (1 - 1e-3) * fine.spec.voxel_size
     centers = fine.spec.centers()[fine.labels > 0]
     points = (centers[:, None] + corners).reshape(-1, 3).astype(np.float32)
     seen = Observation(points, np.ones(len(points), np.uint8), np.eye(4))
@@ -82,18 +84,25 @@ def check_coarser(fine: GridSpec, coarse: GridSpec) -> None:
     """
     if fine.coordinates != coarse.coordinates:
         raise ArgumentError(
-            "resampling", expected=f"a {fine.coordinates} grid like the finer one", found=f"a {coarse.coordinates} one"
+            "resampling",
+            expected=f"a {fine.coordinates} grid like the finer one",
+            found=f"a {coarse.coordinates} one",
         )
     if (coarse.voxel_size < fine.voxel_size * (1 - 1e-4)).any():
-        wanted, available = (" x ".join(f"{v:.4g}" for v in spec.voxel_size) for spec in (coarse, fine))
+        wanted, available = (
+            " x ".join(f"{v:.4g}" for v in spec.voxel_size) for spec in (coarse, fine)
+        )
         raise ArgumentError(
             "resampling",
             expected=f"voxels of at least {available}, the size of the finer grid's",
             found=wanted,
-            advice="smaller voxels need new measurements: make the grid from scans or from a capture",
+            advice="smaller voxels need new measurements: make the grid from scans or from a "
+            "capture",
         )
     slack = fine.voxel_size
-    if (np.array(coarse.lower) < fine.lower - slack).any() or (np.array(coarse.upper) > fine.upper + slack).any():
+    if (np.array(coarse.lower) < fine.lower - slack).any() or (
+        np.array(coarse.upper) > fine.upper + slack
+    ).any():
         raise ArgumentError(
             "resampling",
             expected=f"bounds within {fine.lower} .. {fine.upper}",
@@ -123,7 +132,9 @@ class ResampledFrame(FrameInput):
         fields = {name: self.sequence.read(name, self.number) for name in self.fields()}
         finer = self.sequence.grid(self.finer, self.number)
         boxes = _boxes(finer, plan.spec) if plan.voting.keep_seen else None
-        return FrameData(fields, resample(finer, plan.spec, self.sequence.metadata.classes), None, boxes=boxes)
+        return FrameData(
+            fields, resample(finer, plan.spec, self.sequence.metadata.classes), None, boxes=boxes
+        )
 
 
 class ResampledSequence(StoredSequence):
@@ -156,7 +167,9 @@ def resampled_sequences(
         ArgumentError: the grid is not finer, or votes are to be kept.
     """
     if plan.voting.keep:
-        raise ArgumentError("keep", expected="False for resampled grids, which have no votes", found="True")
+        raise ArgumentError(
+            "keep", expected="False for resampled grids, which have no votes", found="True"
+        )
     found: list[SequenceInput] = []
     for sequence in as_source(source).sequences().values():
         grids = {
@@ -171,6 +184,9 @@ def resampled_sequences(
     if not found:
         wanted = f"the grid {observe.name}" if observe.name else f"a {plan.spec.coordinates} grid"
         raise MissingDataError(
-            source, expected=f"{wanted} to resample", found="none", advice="make one from scans or a capture first"
+            source,
+            expected=f"{wanted} to resample",
+            found="none",
+            advice="make one from scans or a capture first",
         )
     return found

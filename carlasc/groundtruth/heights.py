@@ -1,4 +1,6 @@
-"""The height of the sensor above the ground, and grids that are moved to the ground for sensors higher than CarlaSC's."""
+"""The height of the sensor above the ground, and grids that are moved to the ground for sensors
+higher than CarlaSC's.
+"""
 
 from __future__ import annotations
 
@@ -41,12 +43,16 @@ def ground_of(
         labels: (N,) class ids, or None.
         ground: ids of the ground classes; without any, heights decide.
     """
-    found = ground_points(points) if labels is None or not ground else np.isin(labels, sorted(ground))
+    found = (
+        ground_points(points) if labels is None or not ground else np.isin(labels, sorted(ground))
+    )
     return points[found]
 
 
 def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float = _REACH_M) -> Ground | None:
-    """Return the ground in some scans, (N, 3) or (N, 4), within a horizontal distance of the sensor; None if there is none."""
+    """Return the ground in some scans, (N, 3) or (N, 4), within a horizontal distance of the
+    sensor; None if there is none.
+    """
     heights: list[NDArray[np.float32]] = []
     near: list[float] = []
     for points in scans:
@@ -61,7 +67,10 @@ def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float = _REACH_M)
 
 
 def joined(grounds: Sequence[Ground]) -> Ground:
-    """Return the ground in the scans of one or more drives. Each drive has the same weight, for any number of points."""
+    """Return the ground in the scans of one or more drives.
+
+    Each drive has the same weight, for any number of points.
+    """
     if len(grounds) == 1:
         return grounds[0]
     shares = np.linspace(0, 1, _OF_EACH)
@@ -75,7 +84,9 @@ def share_below(ground: Ground, spec: GridSpec) -> float:
 
 
 def fit_to_ground(spec: GridSpec, ground: Ground) -> GridSpec:
-    """Return a grid moved up or down by whole voxels so that the ground is in its lowest layers; unchanged if it already is."""
+    """Return a grid moved up or down by whole voxels so that the ground is in its lowest layers;
+    unchanged if it already is.
+    """
     size = float(spec.voxel_size[2])
     low = float(np.quantile(ground.heights_m, _LOW))
     if share_below(ground, spec) <= _BELOW and low - spec.lower[2] < max(_SLACK_M, 2 * size):
@@ -84,5 +95,6 @@ def fit_to_ground(spec: GridSpec, ground: Ground) -> GridSpec:
     if not layers:
         return spec
     (x0, y0, z0), (x1, y1, z1) = spec.lower, spec.upper
-    low, high = (float(np.float32(z + layers * size)) for z in (z0, z1))  # params.json has float32 bounds
+    # params.json has float32 bounds
+    low, high = (float(np.float32(z + layers * size)) for z in (z0, z1))
     return replace(spec, lower=(x0, y0, low), upper=(x1, y1, high))

@@ -1,7 +1,8 @@
-"""The inputs of a run: sequences and their frames, and the plan that they share, for every source of grids.
+"""The inputs of a run: sequences and their frames, and the plan that they share, for every source
+of grids.
 
-A sequence has its frames, and the data that exist once per sequence. A frame is a small object that pickles into a worker process and is
-read there.
+A sequence has its frames, and the data that exist once per sequence. A frame is a small object that
+pickles into a worker process and is read there.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ class GridPlan:
         frames: frame numbers of the source.
 
     Raises:
-        ArgumentError: `observe` has another type, or does not provide the certainty or the actors of voxels that `voting` requires.
+        ArgumentError: `observe` has another type, or does not provide the certainty or the actors
+            of voxels that `voting` requires.
     """
 
     spec: GridSpec
@@ -75,8 +77,11 @@ class GridPlan:
         if self.voting.keep_actors and (isinstance(self.observe, FromGrid) or dynamic != "align"):
             raise ArgumentError(
                 "keep_actors",
-                expected='grids from a capture, or from scans with dynamic "align", which know the bodies of actors',
-                found=f'dynamic "{dynamic}"' if isinstance(self.observe, FromScans) else "a finer grid",
+                expected='grids from a capture, or from scans with dynamic "align", which know '
+                "the bodies of actors",
+                found=f'dynamic "{dynamic}"'
+                if isinstance(self.observe, FromScans)
+                else "a finer grid",
                 advice="make the grid from scans, or leave out `keep_actors`",
             )
 
@@ -96,7 +101,10 @@ class GridPlan:
         evidence = layout.EVIDENCE_FIELDS if self.voting.keep_evidence else ()
         actors = layout.ACTOR_FIELDS if self.voting.keep_actors else ()
         seen = ("seen",) if self.voting.keep_seen else ()
-        return tuple(f"{self.grid}/{part}" for part in ("labels", "counts", *votes, *evidence, *actors, *seen))
+        return tuple(
+            f"{self.grid}/{part}"
+            for part in ("labels", "counts", *votes, *evidence, *actors, *seen)
+        )
 
 
 @dataclass(frozen=True)
@@ -107,9 +115,11 @@ class FrameData:
         fields: the scan fields that are written beside the grid, by name.
         grid: the grid.
         votes: the votes that decided the grid; None for a resampled grid.
-        evidence: the certainty of each voxel; None unless the plan needs it (`GridPlan.needs_evidence`).
+        evidence: the certainty of each voxel; None unless the plan needs it
+            (`GridPlan.needs_evidence`).
         actors: the actor of each voxel; None unless the plan needs it.
-        boxes: (V, 6) uint8 boxes around the points in each voxel; None unless the plan keeps the cameras that see each voxel.
+        boxes: (V, 6) uint8 boxes around the points in each voxel; None unless the plan keeps the
+            cameras that see each voxel.
     """
 
     fields: Mapping[str, NDArray[Any]]
@@ -145,15 +155,21 @@ class FrameInput(ABC):
         """
 
     def views(self) -> Views:
-        """Return the cameras of the sequence, each with its pose when it took its image of the frame."""
+        """Return the cameras of the sequence, each with its pose when it took its image of the
+        frame.
+        """
         return ()
 
     def thinned(self, plan: GridPlan) -> Grid | None:
-        """Return the grid without a tenth of the scans of other frames; None if it is not made from scans of other frames."""
+        """Return the grid without a tenth of the scans of other frames; None if it is not made from
+        scans of other frames.
+        """
         return None
 
     def residuals(self) -> Mapping[int, Residual]:
-        """Return how well the observations of the moving actors in the frame align with the next ones, by number of the actor."""
+        """Return how well the observations of the moving actors in the frame align with the next
+        ones, by number of the actor.
+        """
         return {}
 
 
@@ -186,7 +202,9 @@ class SequenceInput(ABC):
 
     @abstractmethod
     def poses(self) -> NDArray[np.float64] | None:
-        """Return (F, 4, 4) first_T_sensor by output frame, NaN where a pose cannot be read; None if there are no poses."""
+        """Return (F, 4, 4) first_T_sensor by output frame, NaN where a pose cannot be read; None if
+        there are no poses.
+        """
 
     @abstractmethod
     def times(self) -> NDArray[np.float64] | None:
@@ -198,12 +216,21 @@ class SequenceInput(ABC):
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Return the record of the source in params.json. A run with another record does not continue the grid."""
+        """Return the record of the source in params.json.
+
+        A run with another record does not continue the grid.
+        """
 
     def most_points(self) -> int | None:
-        """Return the largest number of points of some scans, for stores that reserve space; None if no scan can be read."""
+        """Return the largest number of points of some scans, for stores that reserve space; None if
+        no scan can be read.
+        """
         frames = self.frames
-        chosen = {frames[0].source_frame, frames[len(frames) // 2].source_frame, frames[-1].source_frame}
+        chosen = {
+            frames[0].source_frame,
+            frames[len(frames) // 2].source_frame,
+            frames[-1].source_frame,
+        }
         found = []
         for frame in sorted(chosen):
             try:
@@ -233,7 +260,9 @@ class SequenceInput(ABC):
         return 0
 
     def frame(self, number: int) -> FrameInput | None:
-        """Return a frame of the output, also one that only an earlier run chose; None if it is unknown."""
+        """Return a frame of the output, also one that only an earlier run chose; None if it is
+        unknown.
+        """
         return next((frame for frame in self.frames if frame.number == number), None)
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
@@ -259,7 +288,11 @@ class StoredSequence(SequenceInput):
 
     def _count_points(self, source_frame: int) -> int:
         sequence = self.sequence
-        return len(sequence.read("points", source_frame)) if source_frame in sequence.frames("points") else 0
+        return (
+            len(sequence.read("points", source_frame))
+            if source_frame in sequence.frames("points")
+            else 0
+        )
 
     def poses(self) -> NDArray[np.float64] | None:
         """Return the sequence's poses, one per line of poses.txt; None if it has none."""
@@ -292,12 +325,18 @@ def choose_frames(frames: FrameRange, available: NDArray[np.int64], where: str) 
 def scan_fields(sequence: Sequence, frame: int) -> tuple[str, ...]:
     """Return the names of the scan fields that a frame has."""
     present = sequence.fields()
-    return tuple(name for name in layout.SCAN_FIELDS if name in present and frame in sequence.frames(name))
+    return tuple(
+        name for name in layout.SCAN_FIELDS if name in present and frame in sequence.frames(name)
+    )
 
 
 def stored_views(sequence: Sequence, frame: int) -> Views:
-    """Return the cameras of a sequence of the layout, each with its pose when it took its image of a frame."""
-    return [(camera, scan_T_camera(sequence, camera, frame)) for camera in cameras_of(sequence).values()]
+    """Return the cameras of a sequence of the layout, each with its pose when it took its image of
+    a frame.
+    """
+    return [
+        (camera, scan_T_camera(sequence, camera, frame)) for camera in cameras_of(sequence).values()
+    ]
 
 
 def parent_path(sequence: Sequence) -> str:
@@ -307,8 +346,12 @@ def parent_path(sequence: Sequence) -> str:
 
 
 def without_caches(sequence: Sequence) -> Sequence:
-    """Return a copy of a sequence without its cached properties, which is small enough to send to a worker with each frame."""
+    """Return a copy of a sequence without its cached properties, which is small enough to send to a
+    worker with each frame.
+    """
     light = copy.copy(sequence)
-    for name in [n for n in vars(light) if isinstance(getattr(type(light), n, None), cached_property)]:
+    for name in [
+        n for n in vars(light) if isinstance(getattr(type(light), n, None), cached_property)
+    ]:
         del vars(light)[name]
     return light

@@ -26,7 +26,12 @@ from carlasc.motion.tracks import MovingActors, Track
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence, sequences_with_scans
+from carlasc.storage.derived_copies import (
+    CopyResult,
+    DerivedCopy,
+    DerivedSequence,
+    sequences_with_scans,
+)
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
@@ -55,13 +60,17 @@ def label_motion(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> MotionResult:
-    """Write a copy of a data set whose scans have the actor and the velocity of each point. The source is not changed.
+    """Write a copy of a data set whose scans have the actor and the velocity of each point.
 
-    The fields `instances` and `flow` are made from the bodies of moving actors, which are found as `observe` says: by default from the best
-    field that exists, and from free space. An actor has one number in the whole sequence: its number in the data, if it has one. Points of
-    static actors keep the numbers of the data. Points of moving actors get moving classes, if the class table has any, as SemanticKITTI's.
-    Grids are left out. Files that do not change are hard links to those of the source, where both are folders of one file system: do not edit
-    such files in place. An interrupted run leaves `<out>.part`; the same call again finishes it.
+    The source is not changed.
+
+    The fields `instances` and `flow` are made from the bodies of moving actors, which are found as
+    `observe` says: by default from the best field that exists, and from free space. An actor has
+    one number in the whole sequence: its number in the data, if it has one. Points of static actors
+    keep the numbers of the data. Points of moving actors get moving classes, if the class table has
+    any, as SemanticKITTI's. Grids are left out. Files that do not change are hard links to those of
+    the source, where both are folders of one file system: do not edit such files in place. An
+    interrupted run leaves `<out>.part`; the same call again finishes it.
 
     Args:
         source: the data set with the points: anything that `carlasc.open` takes, or a source.
@@ -75,7 +84,8 @@ def label_motion(
 
     Raises:
         ArgumentError: `observe` does not find actors.
-        ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted run had other options.
+        ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted
+            run had other options.
         MissingDataError: there are no scans, or not the field that `observe` asks for.
         FormatError: poses or times are not valid.
         StorageError: the files cannot be written.
@@ -83,10 +93,14 @@ def label_motion(
     began = time.perf_counter()
     if observe.dynamic != "align" or observe.motion.source == "none":
         found = f'dynamic="{observe.dynamic}", motion "{observe.motion.source}"'
-        raise ArgumentError("observe", expected='dynamic="align", and something that shows motion', found=found)
+        raise ArgumentError(
+            "observe", expected='dynamic="align", and something that shows motion', found=found
+        )
     source = as_source(source)
     given = sequences_with_scans(source)
-    plan = GridPlan(GridSpec.published(), layout.EVALUATION, observe, Voting(keep_actors=True), FrameRange())
+    plan = GridPlan(
+        GridSpec.published(), layout.EVALUATION, observe, Voting(keep_actors=True), FrameRange()
+    )
     inputs = {path: ScanSequence(one, plan, observe) for path, one in given.items()}
     for one in inputs.values():
         _ = one.feed.motion  # raises errors before anything is written
@@ -105,15 +119,23 @@ def label_motion(
         for one in given.values()
         for name in {name for name in one.fields() if "/" not in name} | set(_WRITTEN)
     )
-    step, moving, notes = StepCounter(run.progress, scans + files), dict[str, _MovingSequence](), list[str]()
+    step, moving, notes = (
+        StepCounter(run.progress, scans + files),
+        dict[str, _MovingSequence](),
+        list[str](),
+    )
     with one_pool(run) as pool:
         for path, one in inputs.items():
             find_moving(one, copy.writer(path), pool, step)
             moving[path] = _MovingSequence(given[path], one.feed, one.actors)
             notes += [note for note in one.notes() if "grids" not in note]
-        tables = {one.metadata.classes.name for one in given.values() if not one.metadata.classes.standing}
+        tables = {
+            one.metadata.classes.name for one in given.values() if not one.metadata.classes.standing
+        }
         if tables and any("labels" in one.fields() for one in given.values()):
-            found = f"the classes {', '.join(sorted(tables))} do not separate moving and static actors"
+            found = (
+                f"the classes {', '.join(sorted(tables))} do not separate moving and static actors"
+            )
             notes.append(f"{found}: labels do not change; instances and flow show motion")
         after = replace(pool, progress=step.stage(files))
         copied = copy.write(moving, after)
@@ -124,7 +146,9 @@ def label_motion(
     )
 
 
-def find_moving(inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]) -> None:
+def find_moving(
+    inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]
+) -> None:
     """Find the actors of a sequence, or read the result that an interrupted run kept with `writer`."""
     if writer is not None:
         inputs.prepare(writer, run, step)
@@ -137,7 +161,10 @@ class _MovingSequence(DerivedSequence):
     """A sequence with the instances and the flow of the actors that were found."""
 
     def __init__(self, whole: Sequence, feed: ScanFeed, actors: MovingActors) -> None:
-        extra = {**whole.metadata.extra, "motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}"}
+        extra = {
+            **whole.metadata.extra,
+            "motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}",
+        }
         made = dict.fromkeys(_WRITTEN, whole.frames("points"))
         if whole.metadata.classes.standing and "labels" in whole.fields():
             made["labels"] = whole.frames("labels")
@@ -173,7 +200,11 @@ def points_of_actors(
     fields = {"labels", "instances"} & feed.sequence.fields()
     scan, pose = feed.sequence.scan(frame, tuple(sorted(fields))), feed.pose(frame)
     moving = {track.instance for track in actors.tracks.values()}
-    numbers = np.zeros(len(scan), np.uint32) if scan.instances is None else scan.instances.astype(np.uint32)
+    numbers = (
+        np.zeros(len(scan), np.uint32)
+        if scan.instances is None
+        else scan.instances.astype(np.uint32)
+    )
     numbers[np.isin(numbers, list(moving))] = 0  # points of moving actors get the numbers of tracks
     flow, world = np.zeros((len(scan), 3)), transform_points(pose, scan.points)
     classes = feed.classes
@@ -201,7 +232,9 @@ def points_of_actors(
 
 
 class _Rows:
-    """Finds points of a scan by their coordinates, after merging left out some points and sorted others."""
+    """Finds points of a scan by their coordinates, after merging left out some points and sorted
+    others.
+    """
 
     def __init__(self, points: NDArray[np.float32]) -> None:
         keys = _keys(points)
@@ -212,7 +245,9 @@ class _Rows:
         """Return the indices of all points of the scan with the coordinates of (M, 3) points."""
         keys = np.unique(_keys(points))
         first, last = (np.searchsorted(self._sorted, keys, side) for side in ("left", "right"))
-        found = [self._order[begin:end] for begin, end in zip(first.tolist(), last.tolist(), strict=True)]
+        found = [
+            self._order[begin:end] for begin, end in zip(first.tolist(), last.tolist(), strict=True)
+        ]
         return np.concatenate([np.empty(0, np.int64), *found])
 
 
@@ -224,7 +259,9 @@ def _keys(points: NDArray[np.float32]) -> NDArray[Any]:
 def _inside(track: Track, frame: int, world: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return (N,) bool: which (N, 3) positions, metres, world, are in the body of a track."""
     pose = track.world_T_actor[frame - track.first]
-    near = (np.abs(world - pose[:3, 3]) <= np.linalg.norm(np.maximum(-track.lower, track.upper))).all(axis=1)
+    near = (
+        np.abs(world - pose[:3, 3]) <= np.linalg.norm(np.maximum(-track.lower, track.upper))
+    ).all(axis=1)
     local = transform_points(invert(pose), world[near])
     near[near] = ((local >= track.lower) & (local <= track.upper)).all(axis=1)
     return near

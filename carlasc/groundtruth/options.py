@@ -1,4 +1,7 @@
-"""The options of `regrid`: what observes the scene, and how its votes are counted. Each is checked when it is made."""
+"""The options of `regrid`: what observes the scene, and how its votes are counted.
+
+Each is checked when it is made.
+"""
 
 from __future__ import annotations
 
@@ -24,23 +27,28 @@ class FromScans:
     """Grids from the scans of one sensor, merged over time.
 
     Attributes:
-        window: first and last scan that are merged into a frame, relative to it, in frames; the range contains 0.
-        window_m: use only those scans of the window that lie within this driven distance, in metres, and skip scans from
-            nearly the same place; None for no limit.
+        window: first and last scan that are merged into a frame, relative to it, in frames; the
+            range contains 0.
+        window_m: use only those scans of the window that lie within this driven distance, in
+            metres, and skip scans from nearly the same place; None for no limit.
         stride: use every N-th scan of the window, counted from the frame itself.
-        dynamic: what happens to moving points. "align": each moving actor is completed from all scans, at its position in the
-            frame; "current": only the frame's own moving points are used; "drop": none; "tube": all points stay where they
-            were seen, as in SemanticKITTI, and moving actors leave ghost trails.
-        complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown; "mirror": an unseen side of a vehicle
-            is taken from its other side; "body": all other unseen parts are taken from similar vehicles of the same drive, or from the
-            usual shape of vehicles. These voxels are marked as inferred.
+        dynamic: what happens to moving points. "align": each moving actor is completed from all
+            scans, at its position in the frame; "current": only the frame's own moving points are
+            used; "drop": none; "tube": all points stay where they were seen, as in SemanticKITTI,
+            and moving actors leave ghost trails.
+        complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown;
+            "mirror": an unseen side of a vehicle is taken from its other side; "body": all other
+            unseen parts are taken from similar vehicles of the same drive, or from the usual shape
+            of vehicles. These voxels are marked as inferred.
         own_path: count the space that the recording vehicle drove through as free.
         motion: how moving points are found.
-        poses: where poses come from. Missing poses are estimated from the scans, unless `PoseOptions("file")` is given.
-        rays: which rays of other frames' scans vote. "all"; "enough": near the sensor, where rays are dense, one of up to four votes, with
-            their weight. With the rule "ray" only.
+        poses: where poses come from. Missing poses are estimated from the scans, unless
+            `PoseOptions("file")` is given.
+        rays: which rays of other frames' scans vote. "all"; "enough": near the sensor, where rays
+            are dense, one of up to four votes, with their weight. With the rule "ray" only.
         min_range_m: leave out nearer points, in metres; None for the value of carlasc.json, or 0.
-        max_range_m: leave out farther points, in metres; None for the value of carlasc.json, or no limit.
+        max_range_m: leave out farther points, in metres; None for the value of carlasc.json, or no
+            limit.
 
     Raises:
         ArgumentError: a value is out of its range.
@@ -61,11 +69,17 @@ class FromScans:
     def __post_init__(self) -> None:
         first, last = self.window
         if first > 0 or last < 0:
-            raise ArgumentError("window", expected="a range that contains 0, such as -30:30", found=f"{first}:{last}")
+            raise ArgumentError(
+                "window",
+                expected="a range that contains 0, such as -30:30",
+                found=f"{first}:{last}",
+            )
         if self.stride < 1:
             raise ArgumentError("stride", expected="at least 1", found=str(self.stride))
         if self.window_m is not None and not self.window_m > 0:
-            raise ArgumentError("window_m", expected="a positive number of metres", found=str(self.window_m))
+            raise ArgumentError(
+                "window_m", expected="a positive number of metres", found=str(self.window_m)
+            )
         check_choice("dynamic", self.dynamic, Dynamic)
         check_choice("complete", self.complete, Complete)
         check_choice("rays", self.rays, Rays)
@@ -74,9 +88,14 @@ class FromScans:
                 raise ArgumentError(name, expected=f"{options.__name__}(...)", found=repr(value))
         if self.dynamic == "tube" and self.motion.source != "auto":
             raise ArgumentError(
-                "motion", expected='none with dynamic "tube", which ignores motion', found=repr(self.motion.source)
+                "motion",
+                expected='none with dynamic "tube", which ignores motion',
+                found=repr(self.motion.source),
             )
-        low, high = self.min_range_m or 0.0, math.inf if self.max_range_m is None else self.max_range_m
+        low, high = (
+            self.min_range_m or 0.0,
+            math.inf if self.max_range_m is None else self.max_range_m,
+        )
         if not 0 <= low < high:
             raise ArgumentError(
                 "min_range_m",
@@ -87,7 +106,8 @@ class FromScans:
 
 @dataclass(frozen=True)
 class FromGrid:
-    """Grids from a finer grid of the same frames: each voxel takes the class of most of the known cells in it.
+    """Grids from a finer grid of the same frames: each voxel takes the class of most of the known
+    cells in it.
 
     Attributes:
         name: folder of the finer grid; None for the finest one of the same coordinates.
@@ -105,20 +125,24 @@ class Voting:
     """How votes are counted.
 
     Attributes:
-        rule: "sensor": at most one vote per sensor (scan), voxel and class, as in the published files; "sample": every sample
-            counts; "ray": a voxel is occupied where enough of the rays that enter it end in it. None: "ray" for scans, otherwise "sensor".
+        rule: "sensor": at most one vote per sensor (scan), voxel and class, as in the published
+            files; "sample": every sample counts; "ray": a voxel is occupied where enough of the
+            rays that enter it end in it. None: "ray" for scans, otherwise "sensor".
         free_step_m: distance between two free samples on a ray, in metres.
         keep: also write the votes of every class.
-        keep_evidence: also write the certainty of each voxel: the fields `occupied`, `classes`, `flags` and `views` of the grid. For scans
-            with the rule "ray" only.
-        keep_actors: also write the actor and the velocity of each voxel: the fields `instance` and `velocity` of the grid. Not for grids
-            from a finer grid; for scans with `dynamic="align"` only.
-        min_confidence: voxels that are neither free nor occupied with at least this probability become unknown; 0 to 0.5 keeps all.
-            For scans with the rule "ray" only.
-        keep_seen: also write which cameras see each voxel: the field `seen` of the grid. For Cartesian grids and up to eight cameras.
+        keep_evidence: also write the certainty of each voxel: the fields `occupied`, `classes`,
+            `flags` and `views` of the grid. For scans with the rule "ray" only.
+        keep_actors: also write the actor and the velocity of each voxel: the fields `instance` and
+            `velocity` of the grid. Not for grids from a finer grid; for scans with
+            `dynamic="align"` only.
+        min_confidence: voxels that are neither free nor occupied with at least this probability
+            become unknown; 0 to 0.5 keeps all. For scans with the rule "ray" only.
+        keep_seen: also write which cameras see each voxel: the field `seen` of the grid. For
+            Cartesian grids and up to eight cameras.
 
     Raises:
-        ArgumentError: an unknown rule, a distance that is not positive, or a confidence outside of 0 <= c < 1.
+        ArgumentError: an unknown rule, a distance that is not positive, or a confidence outside of
+            0 <= c < 1.
     """
 
     rule: VoteRule | None = None
@@ -133,7 +157,9 @@ class Voting:
         check_rule(self.rule or "sensor", self.free_step_m)
         if not 0 <= self.min_confidence < 1:
             raise ArgumentError(
-                "min_confidence", expected="a probability from 0 to below 1", found=str(self.min_confidence)
+                "min_confidence",
+                expected="a probability from 0 to below 1",
+                found=str(self.min_confidence),
             )
 
 
@@ -145,8 +171,8 @@ class GridOptions:
         spec: geometry of the grids; None takes the published coarse one.
         observe: what observes the scene; None takes a capture if there is one, otherwise scans.
         voting: how votes are counted; None takes the default of `observe`.
-        follow_ground: in a conversion, move the grid up or down by whole voxels where the ground is below it, or far above its lower
-            bound; False keeps the bounds of `spec`.
+        follow_ground: in a conversion, move the grid up or down by whole voxels where the ground is
+            below it, or far above its lower bound; False keeps the bounds of `spec`.
     """
 
     spec: GridSpec | None = None

@@ -1,4 +1,6 @@
-"""A copy of a data set with refined poses: poses.txt is new, and all other files are hard links to those of the source."""
+"""A copy of a data set with refined poses: poses.txt is new, and all other files are hard links to
+those of the source.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,16 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import invert, multiply
 from carlasc.errors import ArgumentError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.motion_pass import pose_notes, refine_sequence, with_refined_poses
-from carlasc.groundtruth.from_scans.sequences import check_trajectory, must_estimate, with_estimated_poses
+from carlasc.groundtruth.from_scans.motion_pass import (
+    pose_notes,
+    refine_sequence,
+    with_refined_poses,
+)
+from carlasc.groundtruth.from_scans.sequences import (
+    check_trajectory,
+    must_estimate,
+    with_estimated_poses,
+)
 from carlasc.groundtruth.options import FromScans
 from carlasc.motion.mounting import Mounting, find_mounting
 from carlasc.motion.options import PoseOptions
@@ -23,13 +33,23 @@ from carlasc.motion.refinement import RefinedPoses
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence, sequences_with_scans
+from carlasc.storage.derived_copies import (
+    CopyResult,
+    DerivedCopy,
+    DerivedSequence,
+    sequences_with_scans,
+)
 from carlasc.storage.metadata import Metadata
 from carlasc.storage.protocol import Sequence, Source
 from carlasc.storage.sinks import SequenceWriter
 
 _RUN = 60  # number of scans in a run, for the mounting of the sensor
-_ESTIMATED, _REFINED, _LEFT = "kiss-icp", "refined", "left as given"  # words for poses in carlasc.json
+# words for poses in carlasc.json
+_ESTIMATED, _REFINED, _LEFT = (
+    "kiss-icp",
+    "refined",
+    "left as given",
+)
 
 
 @dataclass
@@ -55,26 +75,33 @@ def refine(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> RefineResult:
-    """Write a copy of a data set with poses that are changed so that neighbouring scans agree. The source is not changed.
+    """Write a copy of a data set with poses that are changed so that neighbouring scans agree.
 
-    Good poses do not change. Poses of another point of the vehicle, and late poses, are corrected first, as far as the drive determines the
-    correction. Sequences without scans are left out. Grids are left out too, because they were made with other poses. Files that do not change
-    are hard links to those of the source, where both are folders of one file system: do not edit such files in place (carlasc never does). An
-    interrupted run leaves `<out>.part`; the same call again finishes it.
+    The source is not changed.
+
+    Good poses do not change. Poses of another point of the vehicle, and late poses, are corrected
+    first, as far as the drive determines the correction. Sequences without scans are left out.
+    Grids are left out too, because they were made with other poses. Files that do not change are
+    hard links to those of the source, where both are folders of one file system: do not edit such
+    files in place (carlasc never does). An interrupted run leaves `<out>.part`; the same call again
+    finishes it.
 
     Args:
         source: the data set with the points: anything that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
-        poses: where poses come from, and when they are refined. Estimated poses, of sequences that have none, are refined too.
+        poses: where poses come from, and when they are refined. Estimated poses, of sequences that
+            have none, are refined too.
         overwrite: replace a data set at `out` that `refine` has made.
-        run: how the work is spread. Steps of progress are scans, then files. Each part refines the poses of all sequences.
+        run: how the work is spread. Steps of progress are scans, then files. Each part refines the
+            poses of all sequences.
 
     Returns:
         The files that were written, and what was done to the poses of each sequence.
 
     Raises:
         ArgumentError: `poses.refine` is "never".
-        ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted run had other options.
+        ConflictError: something exists at `out`, or `out` lies inside `source`, or an interrupted
+            run had other options.
         MissingDataError: there are no scans, or no poses and `poses.source` is "file".
         FormatError: poses or times are not valid.
         DependencyError: poses have to be estimated, and kiss-icp is not installed.
@@ -98,7 +125,9 @@ def refine(
         run=run,
     )
     scans = sum(len(one.frames("points")) for one in given.values())
-    files = sum(len(one.frames(name)) for one in given.values() for name in one.fields() if "/" not in name)
+    files = sum(
+        len(one.frames(name)) for one in given.values() for name in one.fields() if "/" not in name
+    )
     step, refined = StepCounter(run.progress, scans + files), dict[str, _RefinedSequence]()
     with one_pool(run) as pool:
         for path, one in given.items():
@@ -121,17 +150,24 @@ class _RefinedSequence(DerivedSequence):
         note: what was done to the poses, in a line.
     """
 
-    def __init__(self, whole: Sequence, posed: Sequence, change: RefinedPoses, corrected: str = "") -> None:
+    def __init__(
+        self, whole: Sequence, posed: Sequence, change: RefinedPoses, corrected: str = ""
+    ) -> None:
         estimated = posed is not whole and not corrected
         self.scans = len(change.refined) if corrected else int(change.refined.sum())
         self.note = next(pose_notes(change, whole.frames("points")), None) or _left(change)
         self.note = f"{corrected}; {self.note}" if corrected else self.note
         said = whole.metadata.extra.get("poses")
         if estimated:
-            said, self.note = _ESTIMATED, f"poses were estimated from the scans ({_ESTIMATED}); {self.note}"
+            said, self.note = (
+                _ESTIMATED,
+                f"poses were estimated from the scans ({_ESTIMATED}); {self.note}",
+            )
         words = [] if said is None else [word for word in str(said).split(", ") if word != _LEFT]
         words += [] if _REFINED in words else [_REFINED if self.scans else _LEFT]
-        metadata = replace(whole.metadata, extra={**whole.metadata.extra, "poses": ", ".join(words)})
+        metadata = replace(
+            whole.metadata, extra={**whole.metadata.extra, "poses": ", ".join(words)}
+        )
         texts = {layout.METADATA: metadata.to_json()}
         if self.scans or estimated or corrected:
             texts[layout.POSES] = layout.encode_poses(_poses(posed, change))
@@ -139,20 +175,29 @@ class _RefinedSequence(DerivedSequence):
 
 
 def _refine(
-    sequence: Sequence, options: FromScans, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]
+    sequence: Sequence,
+    options: FromScans,
+    writer: SequenceWriter | None,
+    run: Run,
+    step: Callable[[int], None],
 ) -> _RefinedSequence:
-    """Refine the poses of a sequence, or read the result that an interrupted run kept with `writer`."""
+    """Refine the poses of a sequence, or read the result that an interrupted run kept with
+    `writer`.
+    """
     posed = sequence
     if estimated := must_estimate(sequence, options):
         posed = with_estimated_poses(sequence)
         check_trajectory(posed, options)
     feed = ScanFeed(posed, options)
     change = refine_sequence(feed, writer, run, step)
-    mounting = None if estimated else _mounting(feed, change)  # estimated poses are poses of the sensor
+    # estimated poses are poses of the sensor
+    mounting = None if estimated else _mounting(feed, change)
     if mounting is None or not mounting.wrong.any():
         return _RefinedSequence(sequence, posed, change)
     seconds = np.array(list(feed.times.values()))
-    mounted = replace(change, poses=mounting.correct(change.given, seconds), refined=np.ones_like(change.refined))
+    mounted = replace(
+        change, poses=mounting.correct(change.given, seconds), refined=np.ones_like(change.refined)
+    )
     corrected = with_refined_poses(posed, feed.frames, mounted)
     change = refine_sequence(feed.under(corrected), writer, run)
     wrong = [
@@ -161,12 +206,17 @@ def _refine(
         if is_wrong
     ]
     return _RefinedSequence(
-        sequence, corrected, change, f"poses were corrected for the sensor in their frame: {', '.join(wrong)}"
+        sequence,
+        corrected,
+        change,
+        f"poses were corrected for the sensor in their frame: {', '.join(wrong)}",
     )
 
 
 def _mounting(feed: ScanFeed, change: RefinedPoses) -> Mounting | None:
-    """Return the mounting of the sensor in the frame of the given poses; None if it cannot be estimated."""
+    """Return the mounting of the sensor in the frame of the given poses; None if it cannot be
+    estimated.
+    """
     runs = [
         (row, change.poses[row : min(row + _RUN, last + 1)])
         for first, last, refined in change.stretches()
@@ -177,7 +227,10 @@ def _mounting(feed: ScanFeed, change: RefinedPoses) -> Mounting | None:
 
 
 def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:
-    """Return the lines of poses.txt. The pose of the first scan stays: it is the origin of the others."""
+    """Return the lines of poses.txt.
+
+    The pose of the first scan stays: it is the origin of the others.
+    """
     if not change.refined.any():
         return posed.poses
     frames = posed.frames("points")
@@ -204,5 +257,9 @@ def _digest(sequences: Mapping[str, Sequence]) -> str:
     digest = blake2b(digest_size=16)
     for path, one in sequences.items():
         for name in sorted(name for name in one.documents() if "/" not in name):
-            digest.update(f"{path}/{name}\0".encode(errors="surrogateescape") + one.read_document(name) + b"\0")
+            digest.update(
+                f"{path}/{name}\0".encode(errors="surrogateescape")
+                + one.read_document(name)
+                + b"\0"
+            )
     return digest.hexdigest()

@@ -1,4 +1,6 @@
-"""The run over a data set: it makes the grid of every frame, in parallel, and continues an unfinished earlier run."""
+"""The run over a data set: it makes the grid of every frame, in parallel, and continues an
+unfinished earlier run.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,10 @@ from carlasc.storage.transport.targets import check_shared
 from carlasc.storage.transport.trees import is_url
 
 RULES = {"capture": 1, "scans": 3, "grid": 1}
-"""Version of the rule that makes grids, by what observes the scene. It changes only when the same input gives other grids."""
+"""Version of the rule that makes grids, by what observes the scene.
+
+It changes only when the same input gives other grids.
+"""
 
 
 @dataclass(frozen=True)
@@ -77,27 +82,32 @@ def regrid(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> RegridResult:
-    """Make the ground-truth grid of every frame, and write it with its scans, flow, poses and times, and a report of each grid.
+    """Make the ground-truth grid of every frame, and write it with its scans, flow, poses and
+    times, and a report of each grid.
 
-    Frames that exist already are skipped. If they were made with other settings, the run stops before it writes anything. A frame that
-    cannot be read is reported in the result, and the other frames are made. The work is done in processes that import the main
-    module again: call this under `if __name__ == "__main__":` in scripts, or with `run=Run(workers=1)`.
+    Frames that exist already are skipped. If they were made with other settings, the run stops
+    before it writes anything. A frame that cannot be read is reported in the result, and the other
+    frames are made. The work is done in processes that import the main module again: call this
+    under `if __name__ == "__main__":` in scripts, or with `run=Run(workers=1)`.
 
     Args:
-        source: a sequence's folder, a folder of several sequences, or, unless it holds captures, anything that `carlasc.open` takes; or a
-            `carlasc.captures.Capture`, such as a `SimulatedCapture`, which is on no disk.
+        source: a sequence's folder, a folder of several sequences, or, unless it holds captures,
+            anything that `carlasc.open` takes; or a `carlasc.captures.Capture`, such as a
+            `SimulatedCapture`, which is on no disk.
         spec: geometry of the grid.
-        out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or any Sink. Each
-            sequence is written to its path below `source`, then `<coordinates>/`. None writes into `source`.
-        observe: what observes the scene: `FromCapture()`: every sensor of a raw capture; `FromScans(...)`: one sensor's scans,
-            merged over time; `FromGrid(...)`: an existing finer grid. None: `FromCapture()` if there is a capture, otherwise
-            `FromScans()`.
+        out: where to write: a folder or a `.zarr` store, on this machine or in an object store; or
+            any Sink. Each sequence is written to its path below `source`, then `<coordinates>/`.
+            None writes into `source`.
+        observe: what observes the scene: `FromCapture()`: every sensor of a raw capture;
+            `FromScans(...)`: one sensor's scans, merged over time; `FromGrid(...)`: an existing
+            finer grid. None: `FromCapture()` if there is a capture, otherwise `FromScans()`.
         voting: how votes are counted.
-        frames: range of the source's frame numbers; None for all. A capture's frames are renumbered from 0.
+        frames: range of the source's frame numbers; None for all. A capture's frames are renumbered
+            from 0.
         name: name of the grid's folder; None for a name by its size.
         overwrite: replace a grid that `regrid` made with other settings.
-        run: how the work is spread, whether this is only a part of it, and what shows its progress. The last part to finish writes the
-            report, and finishes a packed store.
+        run: how the work is spread, whether this is only a part of it, and what shows its progress.
+            The last part to finish writes the report, and finishes a packed store.
 
     Returns:
         The frames that were made, that existed already, and that failed.
@@ -105,8 +115,10 @@ def regrid(
     Raises:
         ArgumentError: an argument is not valid.
         MissingDataError: there is no sequence, or no frame.
-        ConflictError: the output is published data, or has other settings or other scans. Nothing in it is changed.
-        StorageError: the disk is full or the output cannot be written to. Files that were written are complete.
+        ConflictError: the output is published data, or has other settings or other scans. Nothing
+            in it is changed.
+        StorageError: the disk is full or the output cannot be written to. Files that were written
+            are complete.
     """
     start = time.perf_counter()
     run.part.refuse(overwrite)
@@ -114,8 +126,12 @@ def regrid(
     sink = as_sink(_folder_of(source) if out is None else out, part=run.part)
     for place in (sink.location, str(source)):
         check_shared(place, run)
-    plan = GridPlan(spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames))
-    jobs = [_prepare(inputs, sink, plan, overwrite=overwrite) for inputs in _sequences(source, plan)]
+    plan = GridPlan(
+        spec, grid, _choose(source) if observe is None else observe, voting, FrameRange.of(frames)
+    )
+    jobs = [
+        _prepare(inputs, sink, plan, overwrite=overwrite) for inputs in _sequences(source, plan)
+    ]
 
     with ExitStack() as open_things:
         pool = open_things.enter_context(one_pool(run))
@@ -125,7 +141,8 @@ def regrid(
             open_things.enter_context(job.writer)
         work = Work(jobs, plan, pool)
         failures = work.run()
-    if sink is not out and (work.has_written or not sink.is_finished):  # the caller may write more into its own sink
+    # the caller may write more into its own sink
+    if sink is not out and (work.has_written or not sink.is_finished):
         if run.part.count == 1:
             sink.finish(incomplete=True)  # missing frames could not be made, and are reported
         elif not any(job.missing() for job in jobs):
@@ -134,7 +151,9 @@ def regrid(
     grids = tuple(sink.place(f"{job.path}/{grid}") for job in jobs)
     notes = tuple(note for job in jobs for note in job.inputs.notes())
     made = work.wanted - len(failures)
-    return RegridResult(grids, spec, made, work.skipped, tuple(failures), time.perf_counter() - start, notes)
+    return RegridResult(
+        grids, spec, made, work.skipped, tuple(failures), time.perf_counter() - start, notes
+    )
 
 
 def _choose(source: str | os.PathLike[str] | Source | Capture) -> Observe:
@@ -158,14 +177,17 @@ def _choose(source: str | os.PathLike[str] | Source | Capture) -> Observe:
     except MissingDataError as error:
         raise MissingDataError(
             source,
-            expected="a capture (a folder raw/ with velodyne0/, labels0/, ...) or sequences with scans (velodyne/, poses.txt, ...)",
+            expected="a capture (a folder raw/ with velodyne0/, labels0/, ...) or sequences with "
+            "scans (velodyne/, poses.txt, ...)",
             found="neither",
             advice="give a sequence's folder, or a folder of sequences",
         ) from error
     return FromScans()
 
 
-def _sequences(source: str | os.PathLike[str] | Source | Capture, plan: GridPlan) -> list[SequenceInput]:
+def _sequences(
+    source: str | os.PathLike[str] | Source | Capture, plan: GridPlan
+) -> list[SequenceInput]:
     """Return the sequences of a source.
 
     Raises:
@@ -175,7 +197,9 @@ def _sequences(source: str | os.PathLike[str] | Source | Capture, plan: GridPlan
     if isinstance(plan.observe, FromCapture):
         return capture_sequences(source, plan)
     if isinstance(source, Capture):
-        raise ArgumentError("observe", expected="FromCapture() with a capture", found=repr(plan.observe))
+        raise ArgumentError(
+            "observe", expected="FromCapture() with a capture", found=repr(plan.observe)
+        )
     if isinstance(plan.observe, FromScans):
         return scan_sequences(source, plan, plan.observe)
     return resampled_sequences(source, plan, plan.observe)
@@ -188,22 +212,30 @@ def _folder_of(source: str | os.PathLike[str] | Source | Capture) -> str | Path:
         ArgumentError: the source is not a folder.
     """
     if isinstance(source, Source | Capture):
-        raise ArgumentError("out", expected="where to write, as the source is not a folder", found="None")
+        raise ArgumentError(
+            "out", expected="where to write, as the source is not a folder", found="None"
+        )
     if is_url(source):
         above, _, name = str(source).rstrip("/").rpartition("/")
         return above if name in (RAW, *layout.COORDINATES) else str(source)
     folder = Path(source)
     if not folder.is_dir() and folder.exists():
         raise ArgumentError("out", expected=f"where to write, as {source} is a file", found="None")
-    return folder.resolve().parent if folder.resolve().name in (RAW, *layout.COORDINATES) else folder
+    return (
+        folder.resolve().parent if folder.resolve().name in (RAW, *layout.COORDINATES) else folder
+    )
 
 
 def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bool) -> SequenceJob:
-    """Compare the existing output with the plan of this run; if they differ, stop before anything is written."""
+    """Compare the existing output with the plan of this run; if they differ, stop before anything
+    is written.
+    """
     path = "/".join(part for part in (inputs.path, plan.spec.coordinates) if part)
     writer = sink.sequence(path)
     how = {"free_step_m": float(plan.voting.free_step_m), "voting": plan.rule}
-    how |= {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
+    how |= (
+        {"min_confidence": float(plan.voting.min_confidence)} if plan.voting.min_confidence else {}
+    )
     made_from = inputs.record()
     record = {"format": RECORD_FORMAT, "rule": RULES[made_from["observe"]], **made_from, **how}
     cameras = inputs.cameras()
@@ -226,7 +258,8 @@ def _prepare(inputs: SequenceInput, sink: Sink, plan: GridPlan, *, overwrite: bo
 
 
 def _begin(job: SequenceJob) -> None:
-    """Write the documents of a sequence, the settings of its grid first: a run with other settings that began at the same time finds them.
+    """Write the documents of a sequence, the settings of its grid first: a run with other settings
+    that began at the same time finds them.
 
     Raises:
         ConflictError: such a run wrote its settings first.

@@ -1,8 +1,10 @@
 """Which voxels of a grid each camera sees: the field `seen`, one bit per camera.
 
-A camera sees a voxel if no occupied voxel stops the ray from the centre of the camera to the centre of the voxel. This is the rule of Occ3D,
-with one deviation: where the points in a voxel are known, only the box around them stops rays (`carlasc.groundtruth.voting.filled`), because a
-pole or a kerb fills a small part of its voxels. An occupied voxel is also seen if a ray reaches the middle of its box. Unknown voxels stop no ray.
+A camera sees a voxel if no occupied voxel stops the ray from the centre of the camera to the centre
+of the voxel. This is the rule of Occ3D, with one deviation: where the points in a voxel are known,
+only the box around them stops rays (`carlasc.groundtruth.voting.filled`), because a pole or a kerb
+fills a small part of its voxels. An occupied voxel is also seen if a ray reaches the middle of its
+box. Unknown voxels stop no ray.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ class _Solid(NamedTuple):
     Attributes:
         size: (3,) numbers of voxels.
         occupied: (V,) bool, voxels that stop rays.
-        boxes: (V, 6) uint8, the part of each voxel that stops rays, in 1/256 from first to last; (0, 6): whole voxels.
+        boxes: (V, 6) uint8, the part of each voxel that stops rays, in 1/256 from first to last;
+            (0, 6): whole voxels.
         beyond: (3,) margin of the boxes.
     """
 
@@ -46,11 +49,17 @@ class _Solid(NamedTuple):
     beyond: NDArray[np.float64]
 
     @classmethod
-    def of(cls, occupied: NDArray[np.bool_], spec: GridSpec, boxes: NDArray[np.uint8] | None = None) -> _Solid:
-        """Return the obstacles of a grid: its occupied voxels, or the boxes around their points where these are known."""
+    def of(
+        cls, occupied: NDArray[np.bool_], spec: GridSpec, boxes: NDArray[np.uint8] | None = None
+    ) -> _Solid:
+        """Return the obstacles of a grid: its occupied voxels, or the boxes around their points
+        where these are known.
+        """
         blocks = np.ascontiguousarray(occupied, np.bool_).reshape(-1)
         filled = np.empty((0, 6), np.uint8) if boxes is None else boxes
-        return cls(np.array(spec.size), blocks, filled, _BEYOND_M / np.array(spec.voxel_size, np.float64))
+        return cls(
+            np.array(spec.size), blocks, filled, _BEYOND_M / np.array(spec.voxel_size, np.float64)
+        )
 
 
 def check_views(spec: GridSpec, views: Views, where: str) -> None:
@@ -60,18 +69,25 @@ def check_views(spec: GridSpec, views: Views, where: str) -> None:
         ArgumentError: the grid is not Cartesian, or there are no cameras, or more than eight.
     """
     if spec.coordinates != "cartesian":
-        raise ArgumentError("keep_seen", expected="a Cartesian grid", found=f"a {spec.coordinates} one")
+        raise ArgumentError(
+            "keep_seen", expected="a Cartesian grid", found=f"a {spec.coordinates} one"
+        )
     if not 0 < len(views) <= MOST_CAMERAS:
         raise ArgumentError(
             "keep_seen",
             expected=f"1 to {MOST_CAMERAS} cameras",
             found=f"{len(views)} in {where}",
-            advice="" if views else "convert or simulate with cameras: `carlasc simulate --cameras front`",
+            advice=""
+            if views
+            else "convert or simulate with cameras: `carlasc simulate --cameras front`",
         )
 
 
 def see_voxels(
-    occupied: NDArray[np.bool_], spec: GridSpec, views: Views, boxes: NDArray[np.uint8] | None = None
+    occupied: NDArray[np.bool_],
+    spec: GridSpec,
+    views: Views,
+    boxes: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
     """Return the cameras that see each voxel.
 
@@ -79,7 +95,8 @@ def see_voxels(
         occupied: (X, Y, Z) voxels that stop rays.
         spec: the grid, which is Cartesian.
         views: at most eight cameras, with their poses.
-        boxes: (V, 6) the boxes around the points in each voxel; None: voxels stop rays as a whole, as in Occ3D.
+        boxes: (V, 6) the boxes around the points in each voxel; None: voxels stop rays as a whole,
+            as in Occ3D.
 
     Returns:
         (X, Y, Z) uint8: bit i is set where camera i sees the voxel. Its centre is in the image.
@@ -98,7 +115,9 @@ def see_voxels(
     return seen.reshape(spec.size)
 
 
-def _in_front(centers: NDArray[np.float64], camera_T_scan: Transform, is_wide: bool) -> NDArray[np.bool_]:
+def _in_front(
+    centers: NDArray[np.float64], camera_T_scan: Transform, is_wide: bool
+) -> NDArray[np.bool_]:
     depth = centers @ camera_T_scan[2, :3] + camera_T_scan[2, 3]
     return np.asarray(depth > (-np.inf if is_wide else 0))
 
@@ -110,21 +129,33 @@ def _mark_seen(voxels, eye, solid, bit, seen):  # type: ignore[no-untyped-def]
     for voxel in voxels:
         cell = voxel // (size[2] * size[1]), (voxel // size[2]) % size[1], voxel % size[2]
         reached = _reaches((cell[0] + 0.5, cell[1] + 0.5, cell[2] + 0.5), eye, cell, solid)
-        if not reached and solid.occupied[voxel] and len(boxes) and boxes[voxel, 0] <= boxes[voxel, 3]:
+        if (
+            not reached
+            and solid.occupied[voxel]
+            and len(boxes)
+            and boxes[voxel, 0] <= boxes[voxel, 3]
+        ):
             for axis in range(3):
-                middle[axis] = cell[axis] + (1.0 + boxes[voxel, axis] + boxes[voxel, 3 + axis]) / (2 * STEPS)
+                middle[axis] = cell[axis] + (1.0 + boxes[voxel, axis] + boxes[voxel, 3 + axis]) / (
+                    2 * STEPS
+                )
             reached = _reaches((middle[0], middle[1], middle[2]), eye, cell, solid)
         if reached:
             seen[voxel] |= bit
 
 
 def see_points(
-    points: NDArray[np.floating], occupied: NDArray[np.bool_], spec: GridSpec, eye: NDArray[np.float64]
+    points: NDArray[np.floating],
+    occupied: NDArray[np.bool_],
+    spec: GridSpec,
+    eye: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Return (N,) bool: which points are visible from an eye, because no voxel of a grid hides them. Space outside of the grid hides nothing.
+    """Return (N,) bool: which points are visible from an eye, because no voxel of a grid hides
+    them. Space outside of the grid hides nothing.
 
-    The voxel of a point and its neighbours do not hide it: they hold the surface of the point. Rays meet the ground at a grazing angle, and its
-    own voxels would hide it. A second ray therefore starts one voxel above the point.
+    The voxel of a point and its neighbours do not hide it: they hold the surface of the point. Rays
+    meet the ground at a grazing angle, and its own voxels would hide it. A second ray therefore
+    starts one voxel above the point.
 
     Args:
         points: (N, 3) metres, in the frame of the grid.
@@ -149,8 +180,13 @@ def _reach_points(points, eye, solid, reached):  # type: ignore[no-untyped-def]
             at_x, at_y, at_z = points[n, 0], points[n, 1], points[n, 2] + raised
             ray_x, ray_y, ray_z = eye[0] - at_x, eye[1] - at_y, eye[2] - at_z
             far = max(abs(ray_x), abs(ray_y), abs(ray_z))
-            first = 1.0 if far <= _BESIDE else _BESIDE / far  # from this share of the ray on, voxels hide the point
-            for at, ray, last in ((at_x, ray_x, size[0]), (at_y, ray_y, size[1]), (at_z, ray_z, size[2])):
+            # from this share of the ray on, voxels hide the point
+            first = 1.0 if far <= _BESIDE else _BESIDE / far
+            for at, ray, last in (
+                (at_x, ray_x, size[0]),
+                (at_y, ray_y, size[1]),
+                (at_z, ray_z, size[2]),
+            ):
                 if at < 0 or at >= last:  # where the ray enters the grid
                     edge = 1e-9 if at < 0 else last - 1e-9
                     share = (edge - at) / ray if ray != 0 else 2.0
@@ -173,7 +209,11 @@ def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
     """Return whether no obstacle lies between a position in a voxel and the eye."""
     size, (x, y, z) = solid.size, cell
     ray = ray_x, ray_y, ray_z = eye[0] - at[0], eye[1] - at[1], eye[2] - at[2]
-    step_x, step_y, step_z = (1 if ray_x > 0 else -1), (1 if ray_y > 0 else -1), (1 if ray_z > 0 else -1)
+    step_x, step_y, step_z = (
+        (1 if ray_x > 0 else -1),
+        (1 if ray_y > 0 else -1),
+        (1 if ray_z > 0 else -1),
+    )
     each_x = abs(1.0 / ray_x) if ray_x != 0 else np.inf
     each_y = abs(1.0 / ray_y) if ray_y != 0 else np.inf
     each_z = abs(1.0 / ray_z) if ray_z != 0 else np.inf
@@ -204,7 +244,8 @@ def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
                 return True
         voxel = (x * size[1] + y) * size[2] + z
         if solid.occupied[voxel]:
-            if next_x >= 1.0 and next_y >= 1.0 and next_z >= 1.0:  # the voxel of the eye itself stops no ray
+            # the voxel of the eye itself stops no ray
+            if next_x >= 1.0 and next_y >= 1.0 and next_z >= 1.0:
                 return True
             if _is_stopped(at, ray, (x, y, z), voxel, solid):
                 return False
@@ -212,7 +253,9 @@ def _reaches(at, eye, cell, solid):  # type: ignore[no-untyped-def]
 
 @jit
 def _is_stopped(at, ray, cell, voxel, solid):  # type: ignore[no-untyped-def]
-    """Return whether an occupied voxel, or the box around its points if they are known, stops a ray through the voxel."""
+    """Return whether an occupied voxel, or the box around its points if they are known, stops a ray
+    through the voxel.
+    """
     boxes, first, last = solid.boxes, 0.0, 1.0
     if not len(boxes) or boxes[voxel, 0] > boxes[voxel, 3]:
         return True

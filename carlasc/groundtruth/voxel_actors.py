@@ -19,7 +19,9 @@ from carlasc.motion.segments import MIN_SPEED_M_S
 from carlasc.motion.tracks import FIRST_FOUND, Track
 from carlasc.storage.field_files import VELOCITY_DTYPE
 
-_POINTS_DTYPE = np.dtype([("voxel", np.int32), ("label", np.uint16), ("actor", np.uint32), ("points", np.int64)])
+_POINTS_DTYPE = np.dtype(
+    [("voxel", np.int32), ("label", np.uint16), ("actor", np.uint32), ("points", np.int64)]
+)
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,10 @@ class VoxelActors:
     """The actors in the voxels of a grid, and their velocities.
 
     Attributes:
-        instance: (X, Y, Z) uint32, number of the actor of each voxel in the whole sequence; 0 for none.
-        velocity: (M,) `field_files.VELOCITY_DTYPE`, sorted by voxel: the moving voxels, m/s, axes of the frame's sensor, ego motion removed.
+        instance: (X, Y, Z) uint32, number of the actor of each voxel in the whole sequence; 0 for
+            none.
+        velocity: (M,) `field_files.VELOCITY_DTYPE`, sorted by voxel: the moving voxels, m/s, axes
+            of the frame's sensor, ego motion removed.
     """
 
     instance: NDArray[np.uint32]
@@ -36,7 +40,11 @@ class VoxelActors:
 
     @classmethod
     def of(
-        cls, spec: GridSpec, instance: NDArray[np.uint32], voxels: NDArray[np.int64], velocity: NDArray[np.floating]
+        cls,
+        spec: GridSpec,
+        instance: NDArray[np.uint32],
+        voxels: NDArray[np.int64],
+        velocity: NDArray[np.floating],
     ) -> Self:
         """Return the actors of a grid.
 
@@ -59,7 +67,8 @@ class VoxelActors:
 
 
 class ActorPoints:
-    """Counts the points of each actor in each voxel; memory does not grow with the number of sensors.
+    """Counts the points of each actor in each voxel; memory does not grow with the number of
+    sensors.
 
     Attributes:
         spec: the grid.
@@ -67,13 +76,14 @@ class ActorPoints:
         deformable: classes of actors that do not turn as a whole.
     """
 
-    def __init__(self, spec: GridSpec, turns: Mapping[int, float], deformable: Collection[int]) -> None:
+    def __init__(
+        self, spec: GridSpec, turns: Mapping[int, float], deformable: Collection[int]
+    ) -> None:
         self.spec, self.turns, self.deformable = spec, turns, deformable
         self._counts = np.empty(0, _POINTS_DTYPE)
         self._velocity: dict[int, NDArray[np.float64]] = {}
-        self._extent: dict[
-            int, tuple[NDArray[np.float64], NDArray[np.float64]]
-        ] = {}  # bounds in x, y of turning actors
+        # bounds in x, y of turning actors
+        self._extent: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     def add(self, recording: SensorRecording, grid_T_sensor: Transform) -> None:
         """Add the points of a recording; numbers of actors are those of the whole recording."""
@@ -84,19 +94,30 @@ class ActorPoints:
         voxels = self.spec.flat_index(points)
         used = (voxels >= 0) & (scan.labels > 0)
         rows = np.empty(np.count_nonzero(used), _POINTS_DTYPE)
-        rows["voxel"], rows["label"], rows["actor"] = voxels[used], scan.labels[used], scan.instances[used]
+        rows["voxel"], rows["label"], rows["actor"] = (
+            voxels[used],
+            scan.labels[used],
+            scan.instances[used],
+        )
         rows["points"] = 1
         self._counts = _sum(np.concatenate([self._counts, _sum(rows)]))
         velocity = rotate_vectors(grid_T_sensor, recording.velocities[:, 1:])
-        for actor, own in zip(recording.velocities[:, 0].astype(np.int64).tolist(), velocity, strict=True):
+        for actor, own in zip(
+            recording.velocities[:, 0].astype(np.int64).tolist(), velocity, strict=True
+        ):
             self._velocity.setdefault(actor, own)
             places = points[scan.instances == actor, :2]
             if self.turns.get(actor) and len(places):
                 lower, upper = self._extent.get(actor, (places[0], places[0]))
-                self._extent[actor] = np.minimum(lower, places.min(axis=0)), np.maximum(upper, places.max(axis=0))
+                self._extent[actor] = (
+                    np.minimum(lower, places.min(axis=0)),
+                    np.maximum(upper, places.max(axis=0)),
+                )
 
     def of(self, labels: NDArray[np.unsignedinteger]) -> VoxelActors:
-        """Return the actors of a grid with (X, Y, Z) labels: the most frequent number of the points of a voxel's class; ties go to the lowest."""
+        """Return the actors of a grid with (X, Y, Z) labels: the most frequent number of the points
+        of a voxel's class; ties go to the lowest.
+        """
         counts = self._counts
         counts = counts[counts["label"] == labels.reshape(-1)[counts["voxel"]]]
         best = counts[np.lexsort((counts["actor"], -counts["points"], counts["voxel"]))]
@@ -104,14 +125,20 @@ class ActorPoints:
         instance = np.zeros(self.spec.num_voxels, np.uint32)
         instance[best["voxel"]] = best["actor"]
         known = best[np.isin(best["actor"], list(self._velocity)) & (best["actor"] > 0)]
-        velocity = np.array([self._velocity[actor] for actor in known["actor"].tolist()]).reshape(-1, 3)
+        velocity = np.array([self._velocity[actor] for actor in known["actor"].tolist()]).reshape(
+            -1, 3
+        )
         self._turn(known, velocity)
         return VoxelActors.of(self.spec, instance, known["voxel"].astype(np.int64), velocity)
 
     def _turn(self, rows: NDArray[np.void], velocity: NDArray[np.float64]) -> None:
-        """Add to the velocity of each voxel the turn of its actor about the middle of the points of the actor."""
+        """Add to the velocity of each voxel the turn of its actor about the middle of the points of
+        the actor.
+        """
         for actor, (lower, upper) in self._extent.items():
-            own = np.flatnonzero((rows["actor"] == actor) & ~np.isin(rows["label"], list(self.deformable)))
+            own = np.flatnonzero(
+                (rows["actor"] == actor) & ~np.isin(rows["label"], list(self.deformable))
+            )
             arm = centers_of(self.spec, rows["voxel"][own])[:, :2] - (lower + upper) / 2
             velocity[own, :2] += self.turns[actor] * np.column_stack([-arm[:, 1], arm[:, 0]])
 
@@ -119,14 +146,18 @@ class ActorPoints:
 def centers_of(spec: GridSpec, voxels: NDArray[np.integer]) -> NDArray[np.float64]:
     """Return the (N, 3) centres of voxels, metres, grid frame, from their (N,) flat indices."""
     index = np.stack(np.unravel_index(voxels, spec.size), axis=-1)
-    return spec.from_axes(np.asarray(spec.lower) + (index + 0.5) * np.asarray(spec.voxel_size)).astype(np.float64)
+    return spec.from_axes(
+        np.asarray(spec.lower) + (index + 0.5) * np.asarray(spec.voxel_size)
+    ).astype(np.float64)
 
 
 def _sum(rows: NDArray[np.void]) -> NDArray[np.void]:
     """Return one row for each voxel, class and actor, with the sum of its points."""
     order = np.lexsort((rows["actor"], rows["label"], rows["voxel"]))
     rows = rows[order]
-    keys = np.stack([rows["voxel"].astype(np.int64), rows["label"].astype(np.int64) << 32 | rows["actor"]])
+    keys = np.stack(
+        [rows["voxel"].astype(np.int64), rows["label"].astype(np.int64) << 32 | rows["actor"]]
+    )
     first = np.flatnonzero((np.diff(keys, axis=1, prepend=-1) != 0).any(axis=0))
     found = rows[first]
     found["points"] = np.add.reduceat(rows["points"], first) if len(first) else 0
@@ -141,8 +172,9 @@ _INSIDE = 0.7  # least share of these frames with one actor in the body of the o
 def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, int]:
     """Return the number of the actor of each track, by the number of the track.
 
-    Numbers of the data are kept. Other tracks get higher numbers, in the order of their first frames. Two tracks belong to one actor if they
-    have the same class, at most one of them has a number, and the middle of the visible part of the smaller one is mostly in the body of the
+    Numbers of the data are kept. Other tracks get higher numbers, in the order of their first
+    frames. Two tracks belong to one actor if they have the same class, at most one of them has a
+    number, and the middle of the visible part of the smaller one is mostly in the body of the
     larger one; tracks of people only if no scan shows both.
 
     Args:
@@ -176,7 +208,8 @@ def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, in
         if own in found or own not in numbers:
             continue
         members = {f for n in order if root(n) == own for f in tracks[n].members}
-        if not members & seen.get(numbers[own], set()):  # at two places at once, the longer track has the number
+        # at two places at once, the longer track has the number
+        if not members & seen.get(numbers[own], set()):
             seen.setdefault(numbers[own], set()).update(members)
             found[own] = numbers[own]
     for number in order:
@@ -188,16 +221,21 @@ def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, in
 
 def _are_one(one: Track, other: Track) -> bool:
     """Return whether two tracks belong to one actor."""
-    if one.label != other.label or ((not one.rigid or not other.rigid) and set(one.members) & set(other.members)):
+    if one.label != other.label or (
+        (not one.rigid or not other.rigid) and set(one.members) & set(other.members)
+    ):
         return False
     small, large = sorted((one, other), key=lambda track: float(np.prod(track.size)))
     begin = max(one.first, other.first)
     end = min(one.first + len(one.world_T_actor), other.first + len(other.world_T_actor))
     if end - begin < _FEWEST_COMMON:
         return False
-    poses = (track.world_T_actor[begin - track.first : end - track.first] for track in (large, small))
+    poses = (
+        track.world_T_actor[begin - track.first : end - track.first] for track in (large, small)
+    )
     large_T_world, world_T_small = invert(next(poses)), next(poses)
-    seen = (small.extent.lower + small.extent.upper) / 2  # not of the completed body, whose position is uncertain
+    # not of the completed body, whose position is uncertain
+    seen = (small.extent.lower + small.extent.upper) / 2
     middle = multiply(large_T_world, world_T_small, np.append(seen, 1.0)[:, None])[:, :3, 0]
     inside = ((middle > large.lower - _AROUND_M) & (middle < large.upper + _AROUND_M)).all(axis=1)
     return bool(inside.mean() >= _INSIDE)

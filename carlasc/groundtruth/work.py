@@ -1,4 +1,5 @@
-"""The work of a run: the frames of all sequences are made in parallel, and each complete sequence gets a report.
+"""The work of a run: the frames of all sequences are made in parallel, and each complete sequence
+gets a report.
 
 A `FrameTask` pickles into a worker, where a frame is made, or an existing frame is measured.
 """
@@ -83,16 +84,23 @@ class MakeFrame(FrameTask):
         """Make the frame. The arrays are returned, and not written yet."""
         plan, number = self.plan, self.number
         try:
-            thinned = self.frame.thinned(plan) if self.sampled else None  # first, while no outputs take memory
+            # first, while no outputs take memory
+            thinned = self.frame.thinned(plan) if self.sampled else None
             data = self.frame.make(plan)
             outputs, grid = _outputs_of(data, plan, number)
             if plan.voting.keep_seen:
-                outputs[f"{plan.grid}/seen"] = see_voxels(grid.labels > 0, plan.spec, self.frame.views(), data.boxes)
+                outputs[f"{plan.grid}/seen"] = see_voxels(
+                    grid.labels > 0, plan.spec, self.frame.views(), data.boxes
+                )
             changes = None if thinned is None else Changes.between(grid, thinned)
-            facts = FrameFacts.of(number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals())
+            facts = FrameFacts.of(
+                number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals()
+            )
         except MemoryError as error:
             raise CarlascError(
-                str(plan.spec), problem="out of memory", advice="use a coarser grid, or fewer processes (`workers`)"
+                str(plan.spec),
+                problem="out of memory",
+                advice="use a coarser grid, or fewer processes (`workers`)",
             ) from error
         except (CarlascError, OSError) as error:
             return FrameResult(self, error=str(error))
@@ -114,15 +122,28 @@ class MeasureFrame(FrameTask):
         plan = self.plan
         names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
         try:
-            found = {name: self.writer.read(name, self.number) for name in names if self.writer.has(name, self.number)}
+            found = {
+                name: self.writer.read(name, self.number)
+                for name in names
+                if self.writer.has(name, self.number)
+            }
             arrays = {name: array for name, array in found.items() if array is not None}
             if not {f"{plan.grid}/labels", f"{plan.grid}/counts"} <= arrays.keys():
                 return FrameResult(self)
-            labels, counts = (arrays[f"{plan.grid}/{part}"].reshape(plan.spec.size) for part in ("labels", "counts"))
+            labels, counts = (
+                arrays[f"{plan.grid}/{part}"].reshape(plan.spec.size)
+                for part in ("labels", "counts")
+            )
             thinned = self.frame.thinned(plan) if self.sampled and self.frame is not None else None
-            changes = None if thinned is None else Changes.between(Grid(plan.spec, labels, counts), thinned)
+            changes = (
+                None
+                if thinned is None
+                else Changes.between(Grid(plan.spec, labels, counts), thinned)
+            )
             residuals = None if self.frame is None else self.frame.residuals()
-            facts = FrameFacts.of(self.number, arrays, plan.grid, plan.spec, self.classes, changes, residuals)
+            facts = FrameFacts.of(
+                self.number, arrays, plan.grid, plan.spec, self.classes, changes, residuals
+            )
         except (CarlascError, OSError, ValueError):
             return FrameResult(self)
         return FrameResult(self, facts=facts)
@@ -130,7 +151,8 @@ class MeasureFrame(FrameTask):
 
 @dataclass(frozen=True)
 class Batch:
-    """Tasks that a worker runs one after another: the frames that are stored together, or the measurement of one frame.
+    """Tasks that a worker runs one after another: the frames that are stored together, or the
+    measurement of one frame.
 
     Attributes:
         writer: where the frames are written.
@@ -191,11 +213,14 @@ def _outputs_of(data: FrameData, plan: GridPlan, frame: int) -> tuple[Outputs, G
     """Return all arrays to write for a frame, the grid last, and the grid.
 
     Raises:
-        MissingDataError: the plan needs the certainty of each voxel, and the frame does not have it.
+        MissingDataError: the plan needs the certainty of each voxel, and the frame does not have
+            it.
     """
     labels, counts, evidence = data.grid.labels, data.grid.counts, data.evidence
     if plan.needs_evidence and evidence is None:
-        raise MissingDataError(f"frame {frame}", expected="how certain each voxel is", found="nothing")
+        raise MissingDataError(
+            f"frame {frame}", expected="how certain each voxel is", found="nothing"
+        )
     if plan.voting.min_confidence and counts is not None and evidence is not None:
         confident = is_confident(evidence.occupied, plan.voting.min_confidence)
         labels, counts = labels * confident, counts * confident
@@ -204,7 +229,9 @@ def _outputs_of(data: FrameData, plan: GridPlan, frame: int) -> tuple[Outputs, G
     if plan.voting.keep and data.votes is not None:
         outputs[f"{plan.grid}/votes"] = data.votes.to_sparse()
     if plan.voting.keep_evidence and evidence is not None:
-        outputs |= {f"{plan.grid}/{part}": getattr(evidence, part) for part in layout.EVIDENCE_FIELDS}
+        outputs |= {
+            f"{plan.grid}/{part}": getattr(evidence, part) for part in layout.EVIDENCE_FIELDS
+        }
     if plan.voting.keep_actors and data.actors is not None:
         actors = data.actors.within(labels > 0)  # confidence may have made voxels unknown
         outputs |= {f"{plan.grid}/{part}": getattr(actors, part) for part in layout.ACTOR_FIELDS}
@@ -257,12 +284,16 @@ class SequenceJob:
         self.writer.expect(frames, {"points": points} if points else None)
 
     def missing(self) -> set[int]:
-        """Return the frames that lack a file at this moment: other commands may write at the same time."""
+        """Return the frames that lack a file at this moment: other commands may write at the same
+        time.
+        """
         self.writer.refresh()
         has, grid = self.writer.has, self.plan.fields()
         frames = self.inputs.frames
         return {
-            frame.number for frame in frames if not all(has(name, frame.number) for name in (*frame.fields(), *grid))
+            frame.number
+            for frame in frames
+            if not all(has(name, frame.number) for name in (*frame.fields(), *grid))
         }
 
     def report(self) -> Report | None:
@@ -291,13 +322,22 @@ class SequenceJob:
         """Return a task for each of some missing frames."""
         sampled, classes = set(sample_frames(sorted(self.reported))), self.inputs.metadata.classes
         frames = [frame for frame in self.inputs.frames if frame.number in missing]
-        return [MakeFrame(frame.number, frame, self.plan, classes, frame.number in sampled) for frame in frames]
+        return [
+            MakeFrame(frame.number, frame, self.plan, classes, frame.number in sampled)
+            for frame in frames
+        ]
 
     def measure(self, made: Set[int]) -> list[FrameTask]:
         """Return a task for each frame that the report needs and this run did not make."""
-        sampled, inputs, classes = set(sample_frames(sorted(self.reported))), self.inputs, self.inputs.metadata.classes
+        sampled, inputs, classes = (
+            set(sample_frames(sorted(self.reported))),
+            self.inputs,
+            self.inputs.metadata.classes,
+        )
         return [
-            MeasureFrame(number, inputs.frame(number), self.plan, classes, number in sampled, self.writer)
+            MeasureFrame(
+                number, inputs.frame(number), self.plan, classes, number in sampled, self.writer
+            )
             for number in sorted(self.reported - made)
         ]
 
@@ -310,8 +350,14 @@ class SequenceJob:
         documents = {name: data for name, data in found.items() if data is not None}
         if facts:
             inputs = self.inputs
-            classes, actors, poses = inputs.metadata.classes, inputs.summaries(), inputs.pose_facts()
-            report = Report.make(grid, facts, self.params, classes, documents, actors=actors, poses=poses)
+            classes, actors, poses = (
+                inputs.metadata.classes,
+                inputs.summaries(),
+                inputs.pose_facts(),
+            )
+            report = Report.make(
+                grid, facts, self.params, classes, documents, actors=actors, poses=poses
+            )
             writer.write_document(layout.report_file(grid), report.to_json())
 
 
@@ -340,13 +386,16 @@ class Work:
     def run(self) -> list[FrameFailure]:
         """Make the missing frames, and return the frames that could not be made.
 
-        Sequences follow each other without a pause: the next sequence is prepared while the last frames of one are made.
+        Sequences follow each other without a pause: the next sequence is prepared while the last
+        frames of one are made.
         """
         dealt = self._deal()
         ours = [job.missing() & numbers for job, numbers in zip(self.jobs, dealt, strict=True)]
         self.wanted = sum(map(len, ours))
         self.skipped = sum(map(len, dealt)) - self.wanted
-        passes = sum(job.inputs.steps_before for job, missing in zip(self.jobs, ours, strict=True) if missing)
+        passes = sum(
+            job.inputs.steps_before for job, missing in zip(self.jobs, ours, strict=True) if missing
+        )
         steps = StepCounter(self.spread.progress, self.skipped + self.wanted + passes, self.skipped)
         steps(0)
         under_way: deque[SequenceJob] = deque()  # the job of each batch, in order
@@ -364,7 +413,8 @@ class Work:
             for job, missing in zip(self.jobs, ours, strict=True):
                 while len(made[id(job)]) < len(missing):
                     done = next(results)
-                    write_frames(under_way.popleft().writer, done)  # frames of a writer that does not work in workers
+                    # frames of a writer that does not work in workers
+                    write_frames(under_way.popleft().writer, done)
                     made[id(job)] += [replace(result, outputs={}) for result in done]
                     steps(len(done))
                 self._finish(job, made.pop(id(job)), steps)
@@ -372,23 +422,34 @@ class Work:
 
     def _deal(self) -> list[set[int]]:
         """Return the frames of each sequence that belong to the part."""
-        blocks = sorted({(n, job.block_of(number)) for n, job in enumerate(self.jobs) for number in job.numbers})
+        blocks = sorted(
+            {(n, job.block_of(number)) for n, job in enumerate(self.jobs) for number in job.numbers}
+        )
         dealt = set(self.spread.part.take(blocks))
-        return [{i for i in job.numbers if (n, job.block_of(i)) in dealt} for n, job in enumerate(self.jobs)]
+        return [
+            {i for i in job.numbers if (n, job.block_of(i)) in dealt}
+            for n, job in enumerate(self.jobs)
+        ]
 
     def _finish(self, job: SequenceJob, made: list[FrameResult], steps: StepCounter) -> None:
-        """Note the failures, and write the report; if other parts make frames of the sequence, the last part writes it."""
+        """Note the failures, and write the report; if other parts make frames of the sequence, the
+        last part writes it.
+        """
         self.has_written |= bool(made)
         for done in made:
             if isinstance(done.task, MakeFrame) and done.error is not None:
-                self.failures.append(FrameFailure(job.inputs.location, done.task.frame.source_frame, done.error))
+                self.failures.append(
+                    FrameFailure(job.inputs.location, done.task.frame.source_frame, done.error)
+                )
         if (not made and job.is_reported) or (self.spread.part.count > 1 and job.missing()):
             return
         if not made:
             job.inputs.prepare(job.writer, self.spread, StepCounter(None))
         self.has_written = True
         tried = {done.task.number for done in made}
-        with closing(run_all(run_batch, _batches(job, job.measure(tried)), self.spread, lost=fail_batch)) as results:
+        with closing(
+            run_all(run_batch, _batches(job, job.measure(tried)), self.spread, lost=fail_batch)
+        ) as results:
             job.write_report([*made, *(done for batch in results for done in batch)])
 
 

@@ -1,4 +1,7 @@
-"""Inspecting data: contents (`info`), counts of classes (`stats`), checks (`validate`, `audit`, `holdout`), reports of grids (`report`), cards for publication (`card`), and the installation (`doctor`)."""
+"""Inspecting data: contents (`info`), counts of classes (`stats`), checks (`validate`, `audit`,
+`holdout`), reports of grids (`report`), cards for publication (`card`), and the installation
+(`doctor`).
+"""
 
 import lazy_loader
 

@@ -1,9 +1,11 @@
-"""The agreement of poses with scans: how well scans overlap under the poses, and which known mistake explains a poor overlap.
+"""The agreement of poses with scans: how well scans overlap under the poses, and which known
+mistake explains a poor overlap.
 
-The structure of a scan, moved by the poses, must overlap the structure of an earlier scan. The share of its points that do is measured for
-the poses as they are, and for the poses with each known mistake corrected. The correction with the highest mean over all pairs of scans is
-reported, if it raises the share by more than chance could, and on most of the pairs that it changes: a mirrored y axis, for instance,
-changes nothing on a straight road.
+The structure of a scan, moved by the poses, must overlap the structure of an earlier scan. The
+share of its points that do is measured for the poses as they are, and for the poses with each known
+mistake corrected. The correction with the highest mean over all pairs of scans is reported, if it
+raises the share by more than chance could, and on most of the pairs that it changes: a mirrored y
+axis, for instance, changes nothing on a straight road.
 """
 
 from __future__ import annotations
@@ -30,10 +32,12 @@ _MIN_POINTS = 150
 _MAX_POINTS = 6000
 _OFFSET_POINTS = 1500
 _OFFSET_PAIRS = 12
-_OFFSET_SHARE = 0.3  # share of the pairs that must have an offset: the sensor may be at rest for most of a drive
+# share of the pairs that must have an offset: the sensor may be at rest for most of a drive
+_OFFSET_SHARE = 0.3
 _GOOD = 0.75  # no offset is searched for poses with this share of overlap
 _STRIDE_M = 2.0  # the scans of a pair are this far apart, or
-_STRIDE_RAD = np.deg2rad(10.0)  # turned by this angle: it shows a mistake, and the scans still overlap
+# turned by this angle: it shows a mistake, and the scans still overlap
+_STRIDE_RAD = np.deg2rad(10.0)
 _REACH = 10  # the scans of a pair are at most this number of frames apart
 _GAIN = 0.02  # a correction must raise the mean share of overlap by this,
 _CERTAIN = 4.0  # and by this number of standard errors
@@ -42,8 +46,9 @@ _JUDGED_M = 0.05  # where the two motions differ by more than this
 _COMMON_AXES = 5  # the choices of axes that are listed first
 _SAME_M = 0.002  # motions that are nearer than this are the same
 _EXPLAINED = 0.2  # and the mean share must be at least this then
-# Vehicles that drive as fast as the ego vehicle look like scans that are all in one frame. In dense traffic, without labels, the share grows
-# by a factor of 1.4; it grows by at least 1.8 if the scans really are in one frame.
+# Vehicles that drive as fast as the ego vehicle look like scans that are all in one frame. In dense
+# traffic, without labels, the share grows by a factor of 1.4; it grows by at least 1.8 if the scans
+# really are in one frame.
 _STANDING = 1.6
 _RARE = 0.02  # a rare mistake must raise the mean by this more than a common one
 _CLEAR_OFFSET = 0.1  # an offset must raise the share by this
@@ -58,7 +63,8 @@ class Correction:
         advice: how to correct the file.
         undo: maps (F, 4, 4) poses with the mistake to the poses without it.
         rare: whether it is one of the unusual choices of axes.
-        factor: the correction must raise the share of overlap by this factor, also compared with other corrections.
+        factor: the correction must raise the share of overlap by this factor, also compared with
+            other corrections.
     """
 
     name: str
@@ -73,14 +79,16 @@ class PoseDiagnosis:
     """The agreement of poses with scans.
 
     Attributes:
-        share: mean share of a scan's structure that falls on the structure of an earlier scan under the poses as they are.
+        share: mean share of a scan's structure that falls on the structure of an earlier scan under
+            the poses as they are.
         pairs: number of pairs of scans with enough structure; with 0 there is no result.
         correction: the mistake whose correction clearly raises the share; None without one.
         corrected_share: the share after the correction, over the pairs that it changes.
         share_there: the share of the poses as they are, over the same pairs.
-        quality: how well neighbouring scans agree, and whether a lever arm or a delay explains the disagreement; None if there is a known
-            mistake.
-        offset_m: (x, y, z) median distance of scans from the position where they fit, if nothing else explains the overlap; otherwise None.
+        quality: how well neighbouring scans agree, and whether a lever arm or a delay explains the
+            disagreement; None if there is a known mistake.
+        offset_m: (x, y, z) median distance of scans from the position where they fit, if nothing
+            else explains the overlap; otherwise None.
     """
 
     share: float
@@ -100,12 +108,15 @@ def diagnose_poses(
     seconds: NDArray[np.float64] | None = None,
     max_pairs: int = 24,
 ) -> PoseDiagnosis:
-    """Measure the overlap of scans under their poses, and under the poses with each known mistake corrected.
+    """Measure the overlap of scans under their poses, and under the poses with each known mistake
+    corrected.
 
     Args:
-        structure: returns the (M, 3) structure of the i-th scan, metres, in the frame of the sensor (see `static_structure`).
+        structure: returns the (M, 3) structure of the i-th scan, metres, in the frame of the sensor
+            (see `static_structure`).
         poses: (F, 4, 4) float64 first_T_sensor of each scan, in order of time; rigid.
-        points: returns (N, 3) all points of the i-th scan on static things; None takes its structure.
+        points: returns (N, 3) all points of the i-th scan on static things; None takes its
+            structure.
         seconds: (F,) times of the scans, increasing; None for frames at 10 Hz.
         max_pairs: largest number of pairs of scans that are compared.
     """
@@ -145,15 +156,21 @@ def diagnose_poses(
     explained = quality.mounting is not None and bool(quality.mounting.wrong.any())
     search = not explained and own < _GOOD
     overlaps = [(target, few, way) for (target, _, few), way in zip(scans, ways, strict=True)]
-    return PoseDiagnosis(own, len(pairs), quality=quality, offset_m=_common_offset(overlaps) if search else None)
+    return PoseDiagnosis(
+        own, len(pairs), quality=quality, offset_m=_common_offset(overlaps) if search else None
+    )
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
-    """Choose pairs of scans some metres apart: half of them spread over the drive, half where the sensor turns most."""
+    """Choose pairs of scans some metres apart: half of them spread over the drive, half where the
+    sensor turns most.
+    """
     if len(poses) < 2:
         return []
     candidates = [(first, _partner(poses, first)) for first in range(len(poses) - 1)]
-    spread = {candidates[i] for i in np.linspace(0, len(candidates) - 1, (max_pairs + 1) // 2).astype(int)}
+    spread = {
+        candidates[i] for i in np.linspace(0, len(candidates) - 1, (max_pairs + 1) // 2).astype(int)
+    }
     turns = [_angle(relative(poses, first, second)) for first, second in candidates]
     turning = [candidates[i] for i in np.argsort(turns)[::-1] if candidates[i] not in spread]
     # neighbouring pairs are in the same turn, so only every third of the sharpest is taken
@@ -161,10 +178,13 @@ def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
 
 
 def known_corrections() -> tuple[Correction, ...]:
-    """Return the known mistakes, common ones first: if several fit equally well, the first is reported."""
+    """Return the known mistakes, common ones first: if several fit equally well, the first is
+    reported.
+    """
     mistakes = enumerate(_axes_mistakes())
     axes = [
-        Correction(name, advice, _in_axes(matrix), rank >= _COMMON_AXES) for rank, (name, advice, matrix) in mistakes
+        Correction(name, advice, _in_axes(matrix), rank >= _COMMON_AXES)
+        for rank, (name, advice, matrix) in mistakes
     ]
     others = [
         Correction(
@@ -198,20 +218,26 @@ def _best_correction(
     """Choose the correction with the best overlap over all pairs.
 
     Args:
-        shares: (P, 1 + C) share of overlap of each pair, in column 0 for the poses as they are, then for each correction.
+        shares: (P, 1 + C) share of overlap of each pair, in column 0 for the poses as they are,
+            then for each correction.
         judged: (P, 1 + C) whether the motion of the pair differs from that of column 0.
         corrections: those of the other columns.
 
     Returns:
-        The column of the best correction, and the mean shares without and with it on the pairs on which it makes a difference; None if
-        none is clearly better than the poses as they are.
+        The column of the best correction, and the mean shares without and with it on the pairs on
+        which it makes a difference; None if none is clearly better than the poses as they are.
     """
     gains, mean = shares - shares[:, :1], shares.mean(axis=0)
     gain, error = gains.mean(axis=0), gains.std(axis=0) / np.sqrt(len(gains))
     factors = np.array([1.0, *(correction.factor for correction in corrections)])
     rare = np.array([False, *(correction.rare for correction in corrections)])
     wins = ((gains > 0) & judged).sum(axis=0) >= _WINS * judged.sum(axis=0)
-    clear = wins & (gain >= _GAIN) & (gain >= _CERTAIN * error) & (mean >= np.maximum(_EXPLAINED, mean[0] * factors))
+    clear = (
+        wins
+        & (gain >= _GAIN)
+        & (gain >= _CERTAIN * error)
+        & (mean >= np.maximum(_EXPLAINED, mean[0] * factors))
+    )
     if not clear.any():
         return None
     best = int(np.where(clear, mean / factors - _RARE * rare, -np.inf).argmax())
@@ -222,10 +248,12 @@ def _best_correction(
 def _common_offset(
     overlaps: list[tuple[NDArray[np.float64], NDArray[np.float64], Transform]],
 ) -> tuple[float, float, float] | None:
-    """Return the median of the offsets at which the later scans of pairs overlap best; None if few pairs have a clear one.
+    """Return the median of the offsets at which the later scans of pairs overlap best; None if few
+    pairs have a clear one.
 
     Args:
-        overlaps: (M, 3) structure of the earlier scan and (N, 3) some of the later one of each pair, and earlier_T_later.
+        overlaps: (M, 3) structure of the earlier scan and (N, 3) some of the later one of each
+            pair, and earlier_T_later.
     """
     steps = np.array(list(itertools.product(range(-6, 7), range(-6, 7), (-1, 0, 1)))) * VOXEL_M
     offsets, chosen = [], overlaps[:: max(1, len(overlaps) // _OFFSET_PAIRS)]
@@ -247,10 +275,13 @@ def _common_offset(
 
 
 def _partner(poses: Poses, first: int) -> int:
-    """Return the next scan that is far enough away, or the last within reach; one of the next scans if the poses do not move."""
+    """Return the next scan that is far enough away, or the last within reach; one of the next scans
+    if the poses do not move.
+    """
     last = min(first + _REACH, len(poses) - 1)
     if _distance(poses[first], poses[last]) < _DIFFERENT_M:
-        # the sensor may have moved nevertheless: one frame apart shows a fast motion, four frames apart a slow one
+        # the sensor may have moved nevertheless: one frame apart shows a fast motion, four frames
+        # apart a slow one
         return min(first + (1, 4)[first % 2], last)
     for second in range(first + 1, last):
         motion = relative(poses, first, second)
@@ -308,14 +339,18 @@ def _transpose(poses: Poses) -> Poses:
 
 
 def _in_axes(stored_T_sensor: NDArray[np.float64]) -> Callable[[Poses], Poses]:
-    """Return the correction of a change of axes: `stored_T_sensor` (3, 3) maps the axes of the sensor to those of the stored poses."""
+    """Return the correction of a change of axes: `stored_T_sensor` (3, 3) maps the axes of the
+    sensor to those of the stored poses.
+    """
     change = np.eye(4)
     change[:3, :3] = stored_T_sensor
     return lambda poses: change.T @ poses @ change
 
 
 def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
-    """Return all 47 other choices of axes and their signs: (description, advice, matrix); well-known ones first."""
+    """Return all 47 other choices of axes and their signs: (description, advice, matrix);
+    well-known ones first.
+    """
     mirrored = np.diag([1.0, -1.0, 1.0])
     # x right, y down, z forward, from x forward, y left, z up
     camera_of_kitti = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -323,13 +358,22 @@ def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
     mistakes = [
         (
             "poses with y mirrored against the scans",
-            "give scans and poses the same handedness: mirror y in both (S @ P @ S with S = diag(1, -1, 1, 1)) or in neither",
+            "give scans and poses the same handedness: mirror y in both (S @ P @ S with S = "
+            "diag(1, -1, 1, 1)) or in neither",
             mirrored,
         ),
         ("camera-frame poses (x right, y down, z forward)", camera_advice, camera_of_kitti),
-        ("camera-frame poses (x right, y down, z forward)", camera_advice, camera_of_kitti @ mirrored),
+        (
+            "camera-frame poses (x right, y down, z forward)",
+            camera_advice,
+            camera_of_kitti @ mirrored,
+        ),
         ("camera-frame poses with y mirrored", camera_advice, mirrored @ camera_of_kitti),
-        ("camera-frame poses with y mirrored", camera_advice, mirrored @ camera_of_kitti @ mirrored),
+        (
+            "camera-frame poses with y mirrored",
+            camera_advice,
+            mirrored @ camera_of_kitti @ mirrored,
+        ),
     ]
     known = [np.eye(3), *(matrix for _, _, matrix in mistakes)]
     for names, matrix in choices_of_axes():

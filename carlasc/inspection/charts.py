@@ -35,13 +35,16 @@ def check_plot(plot: Path) -> ModuleType:
     """
     if plot.suffix.lower() not in _SUFFIXES:
         raise ArgumentError(
-            "plot", expected=f"a file that ends in {', '.join(_SUFFIXES)}", found=plot.suffix or "no ending"
+            "plot",
+            expected=f"a file that ends in {', '.join(_SUFFIXES)}",
+            found=plot.suffix or "no ending",
         )
     return import_extra("matplotlib.figure", "plots")
 
 
 def draw_histograms(statistics: Statistics, plot: Path) -> None:
-    """Draw the share of each class, points beside voxels, one bar per split, on a logarithmic scale.
+    """Draw the share of each class, points beside voxels, one bar per split, on a logarithmic
+    scale.
 
     Args:
         statistics: as `stats` returns them.
@@ -54,7 +57,11 @@ def draw_histograms(statistics: Statistics, plot: Path) -> None:
     figures = check_plot(plot)
     splits = statistics.by_split()
     names, colors = statistics.classes.names, statistics.classes.palette / 255
-    ids = [i for i in names if any(histogram.of(kind)[i] for histogram in splits.values() for kind in KINDS)]
+    ids = [
+        i
+        for i in names
+        if any(histogram.of(kind)[i] for histogram in splits.values() for kind in KINDS)
+    ]
     figure = figures.Figure(figsize=(11, 0.9 + 0.32 * max(6, len(ids))), layout="constrained")
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), KINDS, strict=True):
         for row, (split, histogram) in enumerate(splits.items()):
@@ -101,7 +108,9 @@ def draw_frame_scores(evaluation: Evaluation, plot: Path) -> None:
     figures = check_plot(plot)
     sequences = list(evaluation.sequences)
     figure = figures.Figure(figsize=(11, 1 + 2.2 * len(sequences)), layout="constrained")
-    for axes, path in zip(figure.subplots(len(sequences), 1, squeeze=False)[:, 0], sequences, strict=True):
+    for axes, path in zip(
+        figure.subplots(len(sequences), 1, squeeze=False)[:, 0], sequences, strict=True
+    ):
         scores = [frame for frame in evaluation.frame_scores if frame.sequence == path]
         numbers = [int(s.frame) if s.frame.isdigit() else place for place, s in enumerate(scores)]
         for name, color, values in (
@@ -123,8 +132,12 @@ def draw_frame_scores(evaluation: Evaluation, plot: Path) -> None:
 
 
 def _write(figure: Any, plot: Path) -> None:
-    """Write a chart that needs no installed fonts: PDF files contain TrueType fonts, SVG files the outlines of the letters."""
+    """Write a chart that needs no installed fonts: PDF files contain TrueType fonts, SVG files the
+    outlines of the letters.
+    """
     buffer = io.BytesIO()
-    with import_extra("matplotlib", "plots").rc_context({"pdf.fonttype": 42, "svg.fonttype": "path"}):
+    with import_extra("matplotlib", "plots").rc_context(
+        {"pdf.fonttype": 42, "svg.fonttype": "path"}
+    ):
         figure.savefig(buffer, format=plot.suffix[1:].lower(), dpi=150)
     write_output(plot, buffer.getvalue())

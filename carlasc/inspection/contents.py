@@ -1,4 +1,6 @@
-"""Checks of the files of a sequence, each alone and against each other: sizes, numbers of frames, values, and the evidence of grids."""
+"""Checks of the files of a sequence, each alone and against each other: sizes, numbers of frames,
+values, and the evidence of grids.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,11 @@ _ADVICE = "make the grid again with `carlasc regrid --keep-{}`"
 
 
 def check_evidence(
-    sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]], classes: ClassTable | None
+    sequence: Sequence,
+    grid: str,
+    frame: int,
+    arrays: Mapping[str, NDArray[Any]],
+    classes: ClassTable | None,
 ) -> Iterator[Finding]:
     """Check the values of the fields of evidence and actors of a grid.
 
@@ -37,16 +43,37 @@ def check_evidence(
         name = f"{grid}/{part}"
         if name not in arrays:
             continue
-        check, kept = ("evidence", "evidence") if part in layout.EVIDENCE_FIELDS else (part, "actors")
-        where, advice = f"{sequence.location}/{layout.field_named(name).file(frame)}", _ADVICE.format(kept)
-        for expected, found in _mistakes(part, arrays[name], sequence.grids[grid].num_voxels, classes):
+        check, kept = (
+            ("evidence", "evidence") if part in layout.EVIDENCE_FIELDS else (part, "actors")
+        )
+        where, advice = (
+            f"{sequence.location}/{layout.field_named(name).file(frame)}",
+            _ADVICE.format(kept),
+        )
+        for expected, found in _mistakes(
+            part, arrays[name], sequence.grids[grid].num_voxels, classes
+        ):
             yield Finding("error", check, sequence.path, where, expected, found, advice)
         labels = arrays.get(f"{grid}/labels")
-        if part == "instance" and labels is not None and (lost := np.count_nonzero((labels == 0) & (arrays[name] > 0))):
-            yield Finding("error", check, sequence.path, where, "actors in occupied voxels", f"{lost} others", advice)
+        if (
+            part == "instance"
+            and labels is not None
+            and (lost := np.count_nonzero((labels == 0) & (arrays[name] > 0)))
+        ):
+            yield Finding(
+                "error",
+                check,
+                sequence.path,
+                where,
+                "actors in occupied voxels",
+                f"{lost} others",
+                advice,
+            )
 
 
-def _mistakes(part: str, array: NDArray[Any], num_voxels: int, classes: ClassTable | None) -> Iterator[tuple[str, str]]:
+def _mistakes(
+    part: str, array: NDArray[Any], num_voxels: int, classes: ClassTable | None
+) -> Iterator[tuple[str, str]]:
     """Yield what was expected and what was found, for each kind of mistake."""
     if part == "occupied":
         wrong = array[~((array >= 0) & (array <= 1))]  # NaN is wrong too
@@ -55,7 +82,10 @@ def _mistakes(part: str, array: NDArray[Any], num_voxels: int, classes: ClassTab
     elif part == "flags":
         wrong = array[array > sum(VoxelFlag)]
         if wrong.size:
-            yield f"flags of 0 to {sum(VoxelFlag)}", f"{wrong[0]}, and {wrong.size - 1} other such values"
+            yield (
+                f"flags of 0 to {sum(VoxelFlag)}",
+                f"{wrong[0]}, and {wrong.size - 1} other such values",
+            )
     elif part == "classes":
         yield from _mistakes_of_classes(array, num_voxels, classes)
     elif part == "velocity":
@@ -64,13 +94,17 @@ def _mistakes(part: str, array: NDArray[Any], num_voxels: int, classes: ClassTab
 
 def _mistakes_of_velocity(table: NDArray[Any], num_voxels: int) -> Iterator[tuple[str, str]]:
     voxels, finite = table["voxel"].astype(np.int64), np.isfinite(table["velocity"]).all(axis=1)
-    if len(voxels) and not (voxels[0] >= 0 and voxels[-1] < num_voxels and (np.diff(voxels) > 0).all()):
+    if len(voxels) and not (
+        voxels[0] >= 0 and voxels[-1] < num_voxels and (np.diff(voxels) > 0).all()
+    ):
         yield f"rising voxels from 0 to {num_voxels - 1}", "others"
     if not finite.all():
         yield "finite velocities", f"NaN or infinity in {np.count_nonzero(~finite)} voxels"
 
 
-def _mistakes_of_classes(table: NDArray[Any], num_voxels: int, classes: ClassTable | None) -> Iterator[tuple[str, str]]:
+def _mistakes_of_classes(
+    table: NDArray[Any], num_voxels: int, classes: ClassTable | None
+) -> Iterator[tuple[str, str]]:
     inside = (table["voxel"] >= 0) & (table["voxel"] < num_voxels)
     if not inside.all():
         yield (
@@ -84,9 +118,10 @@ def _mistakes_of_classes(table: NDArray[Any], num_voxels: int, classes: ClassTab
             yield f"class ids of {classes.name} other than 0", found
     voxels, place = np.unique(table["voxel"][inside], return_inverse=True)
     sums = np.bincount(place, table["votes"][inside], len(voxels))
+    # each is rounded
     too_large = np.flatnonzero(
         sums > layout.CERTAIN + 0.5 * np.bincount(place, minlength=len(voxels))
-    )  # each is rounded
+    )
     if len(too_large):
         first = too_large[0]
         found = f"{sums[first]:.0f} in voxel {voxels[first]}, and {len(too_large) - 1} other such voxels"
@@ -112,11 +147,15 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
         yield Finding.from_error("params", sequence.path, where, error)
         return
     if not sequence.fields():
-        advice = "copy the sequence again, because it is empty or not complete, or give another folder"
+        advice = (
+            "copy the sequence again, because it is empty or not complete, or give another folder"
+        )
         yield Finding("error", "empty", sequence.path, where, "scans or grids", "none", advice)
     elif not grids:
         advice = "make grids with `carlasc regrid`, or read those of eval_*.zip with `grids_source`"
-        yield Finding("note", "no-grids", sequence.path, where, "a folder of grids", "scans only", advice)
+        yield Finding(
+            "note", "no-grids", sequence.path, where, "a folder of grids", "scans only", advice
+        )
     if isinstance(sequence, FolderSequence):
         yield from _check_grid_folders(sequence, set(grids))
     for name, spec in grids.items():
@@ -128,23 +167,52 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
         except CarlascError as error:
             if described:  # otherwise it is the same error
                 yield Finding.from_error("params", sequence.path, file, error)
-        if not isinstance(channels, int | float) or (classes is not None and channels < max(classes.names) + 1):
-            expected = f"num_channels of at least {max(classes.names) + 1}" if classes else "a number in num_channels"
+        if not isinstance(channels, int | float) or (
+            classes is not None and channels < max(classes.names) + 1
+        ):
+            expected = (
+                f"num_channels of at least {max(classes.names) + 1}"
+                if classes
+                else "a number in num_channels"
+            )
             yield Finding("warning", "params", sequence.path, file, expected, repr(channels))
-        if sequence.path.split("/")[-1] in layout.COORDINATES and spec.coordinates != sequence.coordinates:
+        if (
+            sequence.path.split("/")[-1] in layout.COORDINATES
+            and spec.coordinates != sequence.coordinates
+        ):
             expected = f"a {sequence.coordinates} grid, as the folder says"
-            yield Finding("warning", "params", sequence.path, file, expected, f"a {spec.coordinates} one")
+            yield Finding(
+                "warning", "params", sequence.path, file, expected, f"a {spec.coordinates} one"
+            )
         if f"{name}/counts" not in sequence.fields() and sequence.predicted_by(name) is None:
-            folder, advice = f"{where}/{name}", "copy the counts too; without them, all voxels are taken as known"
-            yield Finding("warning", "frame-counts", sequence.path, folder, "counts beside the labels", "none", advice)
+            folder, advice = (
+                f"{where}/{name}",
+                "copy the counts too; without them, all voxels are taken as known",
+            )
+            yield Finding(
+                "warning",
+                "frame-counts",
+                sequence.path,
+                folder,
+                "counts beside the labels",
+                "none",
+                advice,
+            )
 
 
 def _check_grid_folders(sequence: FolderSequence, grids: set[str]) -> Iterator[Finding]:
-    """Check that each folder of grids has its params.json: a sequence does not list a folder without it."""
+    """Check that each folder of grids has its params.json: a sequence does not list a folder
+    without it.
+    """
     for folder in sorted(Path(sequence.location).glob(f"{layout.EVALUATION}*/")):
         if folder.name not in grids and folder.is_dir():
-            file, advice = str(folder / layout.PARAMS), "copy the file: the grid is ignored without it"
-            yield Finding("error", "params", sequence.path, file, "the grid's geometry", "no file", advice)
+            file, advice = (
+                str(folder / layout.PARAMS),
+                "copy the file: the grid is ignored without it",
+            )
+            yield Finding(
+                "error", "params", sequence.path, file, "the grid's geometry", "no file", advice
+            )
 
 
 def check_frames(sequence: Sequence) -> Iterator[Finding]:
@@ -156,45 +224,72 @@ def check_frames(sequence: Sequence) -> Iterator[Finding]:
         first, then = int(frames[gaps[0]]), int(frames[gaps[0] + 1])
         found = f"{len(gaps)} gaps, {missing} frames missing; the first gap is between {first} and {then}"
         advice = "copy the frames again, unless they were left out on purpose: histories of scans do not cross a gap"
-        # grids are often made for every fifth frame only, but gaps between scans are rarely intended
+        # grids are often made for every fifth frame only, but gaps between scans are rarely
+        # intended
         severity: Severity = "warning" if "points" in fields else "note"
         yield Finding(
-            severity, "frame-gaps", sequence.path, sequence.location, "consecutive frame numbers", found, advice
+            severity,
+            "frame-gaps",
+            sequence.path,
+            sequence.location,
+            "consecutive frame numbers",
+            found,
+            advice,
         )
     if "points" in fields:
         for name, field in layout.SCAN_FIELDS.items():
             if name in fields and name != "points":
                 incomplete: Severity | None = {"point": "error", "box": None}.get(field.per, "note")
-                yield from _compare_frames(sequence, name, "points", incomplete, incomplete or "warning")
+                yield from _compare_frames(
+                    sequence, name, "points", incomplete, incomplete or "warning"
+                )
     for grid in sorted({name.rpartition("/")[0] for name in fields if "/" in name}):
         parts = [part for part in layout.GRID_FIELDS if f"{grid}/{part}" in fields]
         if "labels" not in parts:
             where = f"{sequence.location}/{grid}"
             yield Finding(
-                "error", "frame-counts", sequence.path, where, "labels of the grid", f"only {', '.join(parts)}"
+                "error",
+                "frame-counts",
+                sequence.path,
+                where,
+                "labels of the grid",
+                f"only {', '.join(parts)}",
             )
             continue
         for part in parts[1:]:
-            yield from _compare_frames(sequence, f"{grid}/{part}", f"{grid}/labels", "error", "error")
+            yield from _compare_frames(
+                sequence, f"{grid}/{part}", f"{grid}/labels", "error", "error"
+            )
         if "points" in fields:
             yield from _compare_frames(sequence, f"{grid}/labels", "points", "note", "warning")
 
 
 def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Iterator[Finding]:
-    """Check that the size of each file of a frame fits params.json and the other files. Values are not checked."""
-    fields = [name for name in sequence.fields() if _has(sequence, name, frame) and (with_grids or "/" not in name)]
+    """Check that the size of each file of a frame fits params.json and the other files.
+
+    Values are not checked.
+    """
+    fields = [
+        name
+        for name in sequence.fields()
+        if _has(sequence, name, frame) and (with_grids or "/" not in name)
+    ]
     count: int | None = None
     for name in sorted(fields, key=lambda name: (name != "points", name)):
         where = _file(sequence, name, frame)
         try:
             array = sequence.read(name, frame)
         except CarlascError as error:
-            yield Finding.from_error("file-size", sequence.path, where, error, "copy the file again, or make it again")
+            yield Finding.from_error(
+                "file-size", sequence.path, where, error, "copy the file again, or make it again"
+            )
             continue
         if name == "points":
             count = len(array)
             if count == 0:
-                yield Finding("warning", "empty-scan", sequence.path, where, "points", "an empty scan")
+                yield Finding(
+                    "warning", "empty-scan", sequence.path, where, "points", "an empty scan"
+                )
         elif layout.field_named(name).per == "point" and count is not None and len(array) != count:
             expected = f"{count} rows, one per point of {_file(sequence, 'points', frame)}"
             yield Finding(
@@ -209,7 +304,10 @@ def check_shapes(sequence: Sequence, frame: int, with_grids: bool = True) -> Ite
 
 
 def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
-    """Check the values in the files of a frame. Files that cannot be read are skipped: `check_shapes` reports them."""
+    """Check the values in the files of a frame.
+
+    Files that cannot be read are skipped: `check_shapes` reports them.
+    """
     arrays = _read_all(sequence, frame)
     for name in sorted(layout.SCAN_FIELDS.keys() & arrays.keys()):
         kind, where = layout.SCAN_FIELDS[name].kind, _file(sequence, name, frame)
@@ -218,7 +316,9 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
         elif kind == "class":
             yield from _check_classes(sequence, arrays[name], sequence.metadata.classes, where)
         elif kind == "pairs":
-            yield from _check_classes(sequence, arrays[name][:, ::2], sequence.metadata.classes, where)
+            yield from _check_classes(
+                sequence, arrays[name][:, ::2], sequence.metadata.classes, where
+            )
         elif kind == "boxes":
             yield from _check_boxes(sequence, arrays[name], where)
         elif kind == "picture" and arrays[name][:2].tobytes() != b"\xff\xd8":
@@ -229,7 +329,9 @@ def check_values(sequence: Sequence, frame: int) -> Iterator[Finding]:
         yield from check_evidence(sequence, grid, frame, arrays, _classes_of(sequence, grid))
 
 
-def _check_numbers(sequence: Sequence, name: str, array: NDArray[Any], where: str) -> Iterator[Finding]:
+def _check_numbers(
+    sequence: Sequence, name: str, array: NDArray[Any], where: str
+) -> Iterator[Finding]:
     finite = np.isfinite(array)
     if not finite.all():
         rows = finite.all(axis=tuple(range(1, array.ndim)))
@@ -237,7 +339,14 @@ def _check_numbers(sequence: Sequence, name: str, array: NDArray[Any], where: st
         yield Finding("error", "not-finite", sequence.path, where, "finite numbers", found)
     elif name == "flow" and len(array) and float(np.abs(array).max()) > _FASTEST_M_S:
         found = f"{float(np.abs(array).max()):.0f} m/s"
-        yield Finding("warning", "flow", sequence.path, where, f"velocities below {_FASTEST_M_S:.0f} m/s", found)
+        yield Finding(
+            "warning",
+            "flow",
+            sequence.path,
+            where,
+            f"velocities below {_FASTEST_M_S:.0f} m/s",
+            found,
+        )
 
 
 def _check_boxes(sequence: Sequence, table: NDArray[Any], where: str) -> Iterator[Finding]:
@@ -251,10 +360,20 @@ def _check_boxes(sequence: Sequence, table: NDArray[Any], where: str) -> Iterato
     if len(far):
         found = f"track {boxes.tracks[far[0]]} at {boxes.centers[far[0]].round(1).tolist()}, and {len(far) - 1} others"
         advice = "write boxes in the frame of the sensor, not of the world"
-        yield Finding("warning", "boxes", sequence.path, where, f"boxes within {_FARTHEST_M:.0f} m", found, advice)
+        yield Finding(
+            "warning",
+            "boxes",
+            sequence.path,
+            where,
+            f"boxes within {_FARTHEST_M:.0f} m",
+            found,
+            advice,
+        )
 
 
-def _check_grid(sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
+def _check_grid(
+    sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, NDArray[Any]]
+) -> Iterator[Finding]:
     labels, where = arrays[f"{grid}/labels"], _file(sequence, f"{grid}/labels", frame)
     classes = _classes_of(sequence, grid)
     if classes is not None:
@@ -265,18 +384,32 @@ def _check_grid(sequence: Sequence, grid: str, frame: int, arrays: Mapping[str, 
     whole = (counts >= 0) & (counts == np.floor(counts)) & np.isfinite(counts)
     if not whole.all():
         found = f"{counts[~whole][0]:g}, and {int((~whole).sum()) - 1} other such values"
-        yield Finding("error", "counts", sequence.path, file, "whole numbers of votes, 0 or more", found)
+        yield Finding(
+            "error", "counts", sequence.path, file, "whole numbers of votes, 0 or more", found
+        )
     without_vote = int(np.count_nonzero((labels != 0) & ~(counts > 0)))
     if without_vote:
         found = f"{without_vote} voxels with a label but no vote"
         advice = "make the grid again: labels and counts are from different frames or runs"
-        yield Finding("error", "counts", sequence.path, file, "a vote in each voxel with a label", found, advice)
+        yield Finding(
+            "error",
+            "counts",
+            sequence.path,
+            file,
+            "a vote in each voxel with a label",
+            found,
+            advice,
+        )
     if not (counts > 0).any():
-        yield Finding("warning", "counts", sequence.path, file, "known voxels", "no vote in the whole grid")
+        yield Finding(
+            "warning", "counts", sequence.path, file, "known voxels", "no vote in the whole grid"
+        )
 
 
 def _classes_of(sequence: Sequence, grid: str) -> ClassTable | None:
-    """Return the class table of a grid's labels; None if params.json names an unknown one, which `check_documents` reports."""
+    """Return the class table of a grid's labels; None if params.json names an unknown one, which
+    `check_documents` reports.
+    """
     try:
         return sequence.classes_of(grid)
     except CarlascError:
@@ -292,10 +425,16 @@ def _check_classes(
     if inside.all() and known[labels].all():
         return
     ids, counts = np.unique(labels, return_counts=True)
-    unknown = [(int(i), int(n)) for i, n in zip(ids, counts, strict=True) if int(i) not in classes.names]
-    found = ", ".join(f"{i} ({n} times)" for i, n in unknown[:5]) + (" and more" if len(unknown) > 5 else "")
+    unknown = [
+        (int(i), int(n)) for i, n in zip(ids, counts, strict=True) if int(i) not in classes.names
+    ]
+    found = ", ".join(f"{i} ({n} times)" for i, n in unknown[:5]) + (
+        " and more" if len(unknown) > 5 else ""
+    )
     advice = f"correct the file, or the classes in {layout.METADATA}"
-    yield Finding("error", "class-ids", sequence.path, where, f"class ids of {classes.name}", found, advice)
+    yield Finding(
+        "error", "class-ids", sequence.path, where, f"class ids of {classes.name}", found, advice
+    )
 
 
 def _compare_frames(
@@ -303,18 +442,28 @@ def _compare_frames(
 ) -> Iterator[Finding]:
     """Compare the frames of a field with those of the field that it belongs to.
 
-    Missing frames are findings of severity `incomplete`, and no findings if it is None (a frame without boxes was not annotated).
-    Frames that the other field lacks are findings of severity `orphans`.
+    Missing frames are findings of severity `incomplete`, and no findings if it is None (a frame
+    without boxes was not annotated). Frames that the other field lacks are findings of severity
+    `orphans`.
     """
     have, wanted = _frame_set(sequence, field), _frame_set(sequence, reference)
     missing, extra = sorted(wanted - have), sorted(have - wanted)
     where = f"{sequence.location}/{layout.field_named(field).folder}"
     if missing and incomplete is not None:
         expected = f"{field} for each of the {len(wanted)} frames of {reference}"
-        yield Finding(incomplete, "frame-counts", sequence.path, where, expected, f"none for {_first_of(missing)}")
+        yield Finding(
+            incomplete,
+            "frame-counts",
+            sequence.path,
+            where,
+            expected,
+            f"none for {_first_of(missing)}",
+        )
     if extra:
         found = f"{len(extra)} more: {_first_of(extra)}"
-        yield Finding(orphans, "frame-counts", sequence.path, where, f"only the frames of {reference}", found)
+        yield Finding(
+            orphans, "frame-counts", sequence.path, where, f"only the frames of {reference}", found
+        )
 
 
 def _first_of(frames: list[int]) -> str:

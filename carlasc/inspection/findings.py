@@ -17,8 +17,10 @@ class Finding:
     """One fault.
 
     Attributes:
-        severity: "error": reading fails or gives wrong values; "warning": probably a mistake; "note": no fault, for information.
-        check: short name of the check that found it, such as "file-size"; findings are grouped by it.
+        severity: "error": reading fails or gives wrong values; "warning": probably a mistake;
+            "note": no fault, for information.
+        check: short name of the check that found it, such as "file-size"; findings are grouped by
+            it.
         sequence: path of the sequence in its Source.
         location: the file or the folder.
         expected: the content that the file should have.
@@ -35,7 +37,9 @@ class Finding:
     advice: str = ""
 
     @classmethod
-    def from_error(cls, check: str, sequence: str, location: str, error: CarlascError, advice: str = "") -> Finding:
+    def from_error(
+        cls, check: str, sequence: str, location: str, error: CarlascError, advice: str = ""
+    ) -> Finding:
         """Turn an error of the library into a finding of severity "error".
 
         Args:
@@ -50,7 +54,15 @@ class Finding:
             found = f"{error.problem}: {error.found}" if error.problem else error.found
             return cls("error", check, sequence, error.where, error.expected, found, advice)
         if error.problem:
-            return cls("error", check, sequence, error.where, "data that can be read", error.problem, advice)
+            return cls(
+                "error",
+                check,
+                sequence,
+                error.where,
+                "data that can be read",
+                error.problem,
+                advice,
+            )
         return cls("error", check, sequence, location, "data that can be read", error.where, advice)
 
     def __str__(self) -> str:
@@ -66,15 +78,19 @@ class SequenceReport:
         path: the sequence's path in its Source.
         frames: number of frames.
         sampled: number of frames whose contents were read.
-        voxel_share: by grid, the mean share of the points in known voxels whose voxel has their class (any class but free if the points
-            have no labels). A grid for which it could not be measured is left out.
-        pose_share: mean share of a scan's structure that falls on the structure of an earlier scan under the poses; None if it could not
-            be measured.
-        disagreement_m: distance of scans from the surfaces that their neighbours saw, under the poses, metres; None if it is undetermined.
+        voxel_share: by grid, the mean share of the points in known voxels whose voxel has their
+            class (any class but free if the points have no labels). A grid for which it could not
+            be measured is left out.
+        pose_share: mean share of a scan's structure that falls on the structure of an earlier scan
+            under the poses; None if it could not be measured.
+        disagreement_m: distance of scans from the surfaces that their neighbours saw, under the
+            poses, metres; None if it is undetermined.
         refined_m: the same distance under refined poses.
-        mounting: x, y, z, roll, pitch and yaw of the sensor in the frame of the poses, and the delay of the poses, each with its standard
-            error, or "undetermined"; empty if none could be measured.
-        images: by camera, the shift of its images against the scans, in pixels, and their delay, or "undetermined"; empty without images.
+        mounting: x, y, z, roll, pitch and yaw of the sensor in the frame of the poses, and the
+            delay of the poses, each with its standard error, or "undetermined"; empty if none could
+            be measured.
+        images: by camera, the shift of its images against the scans, in pixels, and their delay, or
+            "undetermined"; empty without images.
     """
 
     path: str

@@ -1,4 +1,6 @@
-"""Held-out rays, a score without a reference: scans are left out and compared with the grids that are made from the other scans."""
+"""Held-out rays, a score without a reference: scans are left out and compared with the grids that
+are made from the other scans.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ from carlasc.storage.protocol import Sequence, Source
 
 EVERY = 10
 """Default of `every`: every tenth scan is left out."""
-_NEARLY_WHOLE = 0.8  # a frame is measured if its window has this share of the scans of a whole window
+_NEARLY_WHOLE = (
+    0.8  # a frame is measured if its window has this share of the scans of a whole window
+)
 
 
 @dataclass(frozen=True)
@@ -102,15 +106,18 @@ def holdout(
     frames: Frames = None,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> HoldoutResult:
-    """Leave out every N-th scan, make the grids at these frames from the other scans, and follow the rays of the left-out scans through them.
+    """Leave out every N-th scan, make the grids at these frames from the other scans, and follow
+    the rays of the left-out scans through them.
 
-    A left-out scan does not vote in any grid and is not used to track actors; it is used only to refine poses. If poses are refined, the
-    same frames are also measured under the given poses. Frames at the ends of a drive are not measured if their window has less than
-    80 % of the scans of a whole window, unless all windows are like that. A frame that cannot be read is reported in the result.
-    Nothing is written.
+    A left-out scan does not vote in any grid and is not used to track actors; it is used only to
+    refine poses. If poses are refined, the same frames are also measured under the given poses.
+    Frames at the ends of a drive are not measured if their window has less than 80 % of the scans
+    of a whole window, unless all windows are like that. A frame that cannot be read is reported in
+    the result. Nothing is written.
 
     Args:
-        source: anything that `carlasc.open` takes; its sequences have scans and poses, labels or not.
+        source: anything that `carlasc.open` takes; its sequences have scans and poses, labels or
+            not.
         spec: geometry of the grids, Cartesian; None for the published one.
         observe: how scans are merged.
         voting: how votes are counted.
@@ -127,9 +134,15 @@ def holdout(
     if every < 2:
         raise ArgumentError("every", expected="2 or more", found=str(every))
     if spec.coordinates != "cartesian":
-        raise ArgumentError("grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates)
+        raise ArgumentError(
+            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
+        )
     plan = GridPlan(spec, layout.grid_folder(spec), observe, voting, FrameRange.of(frames))
-    inputs = [sequence for sequence in scan_sequences(source, plan, observe) if isinstance(sequence, ScanSequence)]
+    inputs = [
+        sequence
+        for sequence in scan_sequences(source, plan, observe)
+        if isinstance(sequence, ScanSequence)
+    ]
     drives = [_HeldOutDrive.of(sequence, every) for sequence in inputs]
     refining = sum(len(sequence.feed.frames) for sequence in inputs if sequence.refines)
     steps = StepCounter(run.progress, refining + sum(drive.steps for drive in drives))
@@ -149,14 +162,18 @@ def holdout(
         for task, outcome in zip(tasks, results, strict=True):
             found = scores if task.is_used else before
             if not isinstance(outcome, str):
-                found[task.path] = found[task.path].merge(outcome) if task.path in found else outcome
+                found[task.path] = (
+                    found[task.path].merge(outcome) if task.path in found else outcome
+                )
             elif task.is_used:
                 failures.append(FrameFailure(task.whole.location, task.frame, outcome))
             steps(1)
     for sequence in inputs:
         scores.setdefault(sequence.path, HeldOutScores.empty(sequence.metadata.classes))
     location = source.location if isinstance(source, Source) else str(source)
-    return HoldoutResult(location, spec, every, scores, tuple(failures), time.perf_counter() - start, before)
+    return HoldoutResult(
+        location, spec, every, scores, tuple(failures), time.perf_counter() - start, before
+    )
 
 
 @dataclass(frozen=True)
@@ -176,8 +193,13 @@ class _HeldOutDrive:
         enough = _NEARLY_WHOLE * max(len(whole.window_of(int(frame))) for frame in whole.frames)
         chosen = [frame for frame in hidden if frame in inputs.plan.frames]
         if not chosen:
-            expected, advice = f"frames to leave out in {inputs.plan.frames}", "choose a smaller `every`"
-            raise MissingDataError(inputs.location, expected=expected, found=f"only {hidden}", advice=advice)
+            expected, advice = (
+                f"frames to leave out in {inputs.plan.frames}",
+                "choose a smaller `every`",
+            )
+            raise MissingDataError(
+                inputs.location, expected=expected, found=f"only {hidden}", advice=advice
+            )
         measured = [frame for frame in chosen if len(whole.window_of(frame)) >= enough] or chosen
         return cls(inputs, whole.without(hidden), tuple(measured))
 
@@ -195,7 +217,9 @@ class _HeldOutDrive:
         first, last = feed.options.window
         path, whole, plan = inputs.path, inputs.feed.sequence, inputs.plan
         return [
-            _HeldOutFrame(path, feed, actors.between(f + first, f + last), whole, f, plan, self.is_used)
+            _HeldOutFrame(
+                path, feed, actors.between(f + first, f + last), whole, f, plan, self.is_used
+            )
             for f in self.frames
         ]
 
@@ -225,12 +249,16 @@ def _measure(task: _HeldOutFrame) -> HeldOutScores:
         )
     scan = task.whole.scan(task.frame, ("labels", "origins"))
     origins = scan.others.get("origins")
-    distance = np.linalg.norm((scan.points if origins is None else scan.points - origins).astype(np.float64), axis=1)
+    distance = np.linalg.norm(
+        (scan.points if origins is None else scan.points - origins).astype(np.float64), axis=1
+    )
     keep = (distance >= feed.min_range_m) & (distance <= feed.max_range_m)
     if scan.labels is not None:
         feed.classes.check(scan.labels, f"{task.whole.location}: labels of frame {task.frame}")
         keep &= scan.labels > 0
-    grid = merge_frame(task.plan, feed, task.actors, task.frame, feed.reaching(task.frame, task.plan.spec)).grid
+    grid = merge_frame(
+        task.plan, feed, task.actors, task.frame, feed.reaching(task.frame, task.plan.spec)
+    ).grid
     here = invert(feed.pose(task.frame))
     others = [here @ feed.pose(other) for other in window]
     labels = None if scan.labels is None else scan.labels[keep]

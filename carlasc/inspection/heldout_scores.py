@@ -1,4 +1,6 @@
-"""How well grids predict scans that did not take part in them: counts of rays by class and distance, and shares of these."""
+"""How well grids predict scans that did not take part in them: counts of rays by class and
+distance, and shares of these.
+"""
 
 from __future__ import annotations
 
@@ -19,29 +21,36 @@ from carlasc.metrics.casting import follow_rays
 BANDS_M = (0.0, 10.0, 20.0, 30.0, np.inf)
 """Bounds of the distance bands, metres."""
 VEHICLE_M = ((-2.2, -0.75, -1.2), (2.2, 0.75, 0.0))
-"""Lower and upper corner of a box that is inside of the recording vehicle, in the frame of its sensor (x forward), metres."""
+"""Lower and upper corner of a box that is inside of the recording vehicle, in the frame of its
+sensor (x forward), metres.
+"""
 
 _RETURNS, _FREE, _UNKNOWN, _PASSED, _PASSED_OBJECT, _MISSED = range(6)
 _SOLID, _OBJECT = 1, 2  # bits of a voxel: it is occupied; its class is not ground
-_STEP_M, _STEPS = 0.02, 500  # histogram of the errors of the first hit; the last bin holds all larger ones
+# histogram of the errors of the first hit; the last bin holds all larger ones
+_STEP_M, _STEPS = (
+    0.02,
+    500,
+)
 
 
 @dataclass(frozen=True)
 class RayShares:
-    """Shares of some held-out rays, of the returns inside the grid; None if nothing could be measured.
+    """Shares of some held-out rays, of the returns inside the grid; None if nothing could be
+    measured.
 
     Attributes:
         returns: number of returns.
         free: share of returns that lie in a voxel called free.
         unknown: share of returns that lie in an unknown voxel.
         occupied: share of returns that lie in an occupied voxel.
-        passed: share of rays that pass through an occupied voxel before their return; the voxel of the return and its 26 neighbours
-            do not count.
-        passed_object: the same for voxels of classes other than ground. Without labels, the lowest occupied voxel of each column and the
-            one above it are taken as ground.
+        passed: share of rays that pass through an occupied voxel before their return; the voxel of
+            the return and its 26 neighbours do not count.
+        passed_object: the same for voxels of classes other than ground. Without labels, the lowest
+            occupied voxel of each column and the one above it are taken as ground.
         missed: share of rays without an occupied voxel, both before and behind their return.
-        error_median_m: median over the other rays of |first hit - measured range|, metres; the first hit is in the middle of the ray's
-            path through its first occupied voxel.
+        error_median_m: median over the other rays of |first hit - measured range|, metres; the
+            first hit is in the middle of the ray's path through its first occupied voxel.
         error_90_m: 90 % of these errors are at most this large, metres.
     """
 
@@ -64,9 +73,11 @@ class HeldOutScores:
         classes: class table of the scans.
         labelled: whether the scans have labels.
         frames: number of frames that were left out and measured.
-        counts: (K, B, 6) int64 rays by class and band: returns, in free voxels, in unknown ones, passed, passed an object, missed.
+        counts: (K, B, 6) int64 rays by class and band: returns, in free voxels, in unknown ones,
+            passed, passed an object, missed.
         errors: (K, B, E) int64 histogram of the errors of the first hit.
-        swept_voxels: number of voxels that the vehicle itself drove through in the other frames of the windows.
+        swept_voxels: number of voxels that the vehicle itself drove through in the other frames of
+            the windows.
         swept_known: how many of them are known.
         swept_occupied: how many of them are occupied.
     """
@@ -84,7 +95,13 @@ class HeldOutScores:
     def empty(cls, classes: ClassTable, *, labelled: bool = True) -> HeldOutScores:
         """Return the scores of no frame."""
         shape = (classes.num_channels, len(BANDS_M) - 1)
-        return cls(classes, labelled, 0, np.zeros((*shape, 6), np.int64), np.zeros((*shape, _STEPS + 1), np.int64))
+        return cls(
+            classes,
+            labelled,
+            0,
+            np.zeros((*shape, 6), np.int64),
+            np.zeros((*shape, _STEPS + 1), np.int64),
+        )
 
     @classmethod
     def of(
@@ -99,18 +116,25 @@ class HeldOutScores:
         """Measure one frame.
 
         Args:
-            grid: the grid at the frame, made without its scan; Cartesian, in the sensor frame of the scan.
+            grid: the grid at the frame, made without its scan; Cartesian, in the sensor frame of
+                the scan.
             classes: class table of grid and labels.
             points: (N, 3) metres, the scan, sensor frame.
             labels: (N,) class ids; None if the scan has no labels.
-            grid_T_vehicles: (4, 4) poses of the sensor in the other frames of the window, in the frame of the grid.
-            origins: (N, 3) metres, where the ray of each point began, sensor frame; None: at the sensor.
+            grid_T_vehicles: (4, 4) poses of the sensor in the other frames of the window, in the
+                frame of the grid.
+            origins: (N, 3) metres, where the ray of each point began, sensor frame; None: at the
+                sensor.
 
         Raises:
             ArgumentError: the grid is cylindrical.
         """
         spec, occupied = grid.spec, grid.known & (grid.labels != 0)
-        ground = lowest_of_columns(occupied) if labels is None else np.isin(grid.labels, sorted(classes.ground))
+        ground = (
+            lowest_of_columns(occupied)
+            if labels is None
+            else np.isin(grid.labels, sorted(classes.ground))
+        )
         solid = np.where(occupied, np.where(ground, _SOLID, _SOLID | _OBJECT), 0).astype(np.uint8)
         voxels = spec.flat_index(points)
         inside = (voxels >= 0) & np.any(points != 0, axis=1)
@@ -118,12 +142,20 @@ class HeldOutScores:
         begun: NDArray[np.float64] = (
             np.zeros_like(points) if origins is None else np.asarray(origins[inside], np.float64)
         )
-        kind = np.full(len(points), classes.geometry_id) if labels is None else labels[inside].astype(np.int64)
+        kind = (
+            np.full(len(points), classes.geometry_id)
+            if labels is None
+            else labels[inside].astype(np.int64)
+        )
         first, passed = _follow(solid, spec, begun, points)
         ranges = np.linalg.norm(points - begun, axis=1)
         known, hit = grid.known.reshape(-1)[voxels], occupied.reshape(-1)[voxels]
         properties = np.zeros((len(points), 6), np.bool_)
-        properties[:, _RETURNS], properties[:, _FREE], properties[:, _UNKNOWN] = True, known & ~hit, ~known
+        properties[:, _RETURNS], properties[:, _FREE], properties[:, _UNKNOWN] = (
+            True,
+            known & ~hit,
+            ~known,
+        )
         properties[:, _PASSED], properties[:, _PASSED_OBJECT] = passed != 0, passed & _OBJECT != 0
         properties[:, _MISSED] = missed = np.isinf(first)
         scores = cls.empty(classes, labelled=labels is not None)
@@ -136,7 +168,11 @@ class HeldOutScores:
         swept = swept_voxels(spec, grid_T_vehicles)
         known_swept, hit_swept = int((swept & grid.known).sum()), int((swept & occupied).sum())
         return replace(
-            scores, frames=1, swept_voxels=int(swept.sum()), swept_known=known_swept, swept_occupied=hit_swept
+            scores,
+            frames=1,
+            swept_voxels=int(swept.sum()),
+            swept_known=known_swept,
+            swept_occupied=hit_swept,
         )
 
     def merge(self, other: HeldOutScores) -> HeldOutScores:
@@ -154,7 +190,9 @@ class HeldOutScores:
 
     @property
     def swept_share(self) -> float | None:
-        """Share of the voxels that the vehicle itself drove through in the other frames that are occupied; None if there are none."""
+        """Share of the voxels that the vehicle itself drove through in the other frames that are
+        occupied; None if there are none.
+        """
         return self.swept_occupied / self.swept_voxels if self.swept_voxels else None
 
     @property
@@ -163,11 +201,19 @@ class HeldOutScores:
         return self._shares(self.counts.sum(axis=(0, 1)), self.errors.sum(axis=(0, 1)))
 
     def by_class(self) -> dict[str, RayShares]:
-        """Return the rays of each class that occurs, by its name; empty if the scans have no labels."""
+        """Return the rays of each class that occurs, by its name; empty if the scans have no
+        labels.
+        """
         if not self.labelled:
             return {}
-        rows = {self.classes.names.get(i, str(i)): i for i in np.flatnonzero(self.counts[:, :, 0].any(axis=1)).tolist()}
-        return {name: self._shares(self.counts[i].sum(axis=0), self.errors[i].sum(axis=0)) for name, i in rows.items()}
+        rows = {
+            self.classes.names.get(i, str(i)): i
+            for i in np.flatnonzero(self.counts[:, :, 0].any(axis=1)).tolist()
+        }
+        return {
+            name: self._shares(self.counts[i].sum(axis=0), self.errors[i].sum(axis=0))
+            for name, i in rows.items()
+        }
 
     def by_distance(self) -> dict[str, RayShares]:
         """Return the rays of each band of distances, by its name, such as "10-20 m"."""
@@ -212,7 +258,8 @@ class HeldOutScores:
 
 
 def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> NDArray[np.bool_]:
-    """Return (X, Y, Z) bool: the voxels whose centre lies in the space that the vehicle fills at any of some poses.
+    """Return (X, Y, Z) bool: the voxels whose centre lies in the space that the vehicle fills at
+    any of some poses.
 
     Args:
         spec: geometry of the grid, Cartesian.
@@ -225,7 +272,9 @@ def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> NDArra
         placed = (transform_points(pose, corners) - np.array(spec.lower)) / spec.voxel_size
         first = np.clip(np.floor(placed.min(axis=0)).astype(int), 0, spec.size)
         stop = np.clip(np.ceil(placed.max(axis=0)).astype(int), 0, spec.size)
-        cells = np.stack(np.meshgrid(*map(np.arange, first, stop), indexing="ij"), axis=-1).reshape(-1, 3)
+        cells = np.stack(np.meshgrid(*map(np.arange, first, stop), indexing="ij"), axis=-1).reshape(
+            -1, 3
+        )
         centers = np.array(spec.lower) + (cells + 0.5) * spec.voxel_size
         body = transform_points(invert(pose), centers)
         i, j, k = cells[((body > lower) & (body < upper)).all(axis=1)].T
@@ -242,7 +291,9 @@ def lowest_of_columns(occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _quantile(errors: NDArray[np.int64], share: float) -> float | None:
-    """Return a quantile of a histogram of errors, in metres, to the width of its bins; 10 m stands for all larger ones."""
+    """Return a quantile of a histogram of errors, in metres, to the width of its bins; 10 m stands
+    for all larger ones.
+    """
     total = int(errors.sum())
     if not total:
         return None
@@ -256,12 +307,19 @@ def _band_names() -> Iterator[str]:
 
 
 def _follow(
-    solid: NDArray[np.uint8], spec: GridSpec, origins: NDArray[np.floating], points: NDArray[np.floating]
+    solid: NDArray[np.uint8],
+    spec: GridSpec,
+    origins: NDArray[np.floating],
+    points: NDArray[np.floating],
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return what `follow_rays` returns, for (N, 3) rays that begin at (N, 3) origins, of which there are few different ones."""
+    """Return what `follow_rays` returns, for (N, 3) rays that begin at (N, 3) origins, of which
+    there are few different ones.
+    """
     order = sorted_by_origin(origins)
     first, passed = np.empty(len(points)), np.empty(len(points), np.uint8)
     for part, origin in runs_of_origins(origins[order], len(points)):
         rows = order[part]
-        first[rows], passed[rows] = follow_rays(solid, spec, origin.astype(np.float64), points[rows])
+        first[rows], passed[rows] = follow_rays(
+            solid, spec, origin.astype(np.float64), points[rows]
+        )
     return first, passed

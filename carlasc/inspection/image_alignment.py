@@ -1,8 +1,9 @@
-"""The alignment of images with LiDAR scans: a shift in pixels and a delay in seconds, from edges of depth and edges of the image.
+"""The alignment of images with LiDAR scans: a shift in pixels and a delay in seconds, from edges of
+depth and edges of the image.
 
-Where the depth of a scan jumps between neighbouring points, an object ends, and the image has an edge. At the right shift of the image, the
-contrast at these points is highest. The same holds for the right time if the vehicle moves, because an image of another time was taken
-at another place.
+Where the depth of a scan jumps between neighbouring points, an object ends, and the image has an
+edge. At the right shift of the image, the contrast at these points is highest. The same holds for
+the right time if the vehicle moves, because an image of another time was taken at another place.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ class ImageAgreement:
         return abs(self.shift_px or 0) > _WRONG_PX or abs(self.late_s or 0) > _WRONG_S
 
     def __str__(self) -> str:
-        shift = UNDETERMINED if self.shift_px is None else f"{self.shift_px:+.1f} pixels to the right"
+        shift = (
+            UNDETERMINED if self.shift_px is None else f"{self.shift_px:+.1f} pixels to the right"
+        )
         late = UNDETERMINED if self.late_s is None else f"{self.late_s:+.2f} s late"
         return f"{shift}, {late}"
 
@@ -69,21 +72,30 @@ def compare_images(sequence: Sequence) -> list[ImageAgreement]:
         cameras = cameras_of(sequence)
     except CarlascError:
         return []  # which is reported elsewhere
-    return [found for camera in cameras.values() if (found := _compare(sequence, camera)) is not None]
+    return [
+        found for camera in cameras.values() if (found := _compare(sequence, camera)) is not None
+    ]
 
 
 def judge_images(sequence: Sequence, images: list[ImageAgreement]) -> Iterator[Finding]:
     """Yield a finding for each camera whose calibration or times are probably wrong."""
-    where, expected = f"{sequence.location}/{layout.CAMERAS}", "images with edges where the scans have them"
+    where, expected = (
+        f"{sequence.location}/{layout.CAMERAS}",
+        "images with edges where the scans have them",
+    )
     advice = "check the calibration and the times of the camera, and draw a grid over it with `carlasc render --camera`"
     for agreement in images:
         if agreement.is_wrong:
             found = f"{agreement.camera}: {agreement}"
-            yield Finding("warning", "images-on-scans", sequence.path, where, expected, found, advice)
+            yield Finding(
+                "warning", "images-on-scans", sequence.path, where, expected, found, advice
+            )
 
 
 def _compare(sequence: Sequence, camera: CameraModel) -> ImageAgreement | None:
-    frames = [frame for frame in sequence.frames("points").tolist() if has_image(sequence, camera, frame)]
+    frames = [
+        frame for frame in sequence.frames("points").tolist() if has_image(sequence, camera, frame)
+    ]
     if not frames:
         return None
     views = []
@@ -93,7 +105,8 @@ def _compare(sequence: Sequence, camera: CameraModel) -> ImageAgreement | None:
         except CarlascError:
             continue  # which is reported elsewhere
         views += [] if view is None else [view]
-    # The contrast by view, time and shift. A maximum counts only if all thirds of the views have it.
+    # The contrast by view, time and shift. A maximum counts only if all thirds of the views have
+    # it.
     found = [view.contrast(camera) for view in views]
     thirds = [np.sum(part, axis=0) for part in (found[0::3], found[1::3], found[2::3]) if part]
     if len(thirds) < 3 or min(third.max() for third in thirds) < _LEAST:
@@ -112,7 +125,8 @@ class _View:
     Attributes:
         edges: (E, 3) points where the depth of the scan jumps, metres, sensor frame.
         contrast_of: (H, W) change of brightness from column to column, from 0 to 1.
-        places: (T, 4, 4) pose of the camera at each of `_TIMES_S` after the time of the image, in the frame of the scan.
+        places: (T, 4, 4) pose of the camera at each of `_TIMES_S` after the time of the image, in
+            the frame of the scan.
         moves: whether the vehicle moved in this time.
     """
 
@@ -135,29 +149,44 @@ class _View:
         contrast = np.abs(np.diff(bright, axis=1, append=bright[:, -1:]))
         contrast = np.minimum(contrast / max(float(np.percentile(contrast, 99)), 1.0), 1.0)
         points = sequence.scan(frame, ()).points.astype(np.float64)
-        edges = transform_points(place, _depth_edges(camera, transform_points(invert(place), points)))
+        edges = transform_points(
+            place, _depth_edges(camera, transform_points(invert(place), points))
+        )
         moved = np.tile(np.eye(4), (len(_TIMES_S), 1, 1))
-        if {layout.POSES, layout.TIMES} <= set(sequence.documents()) and len(sequence.times) == len(sequence.poses) > 1:
+        if {layout.POSES, layout.TIMES} <= set(sequence.documents()) and len(sequence.times) == len(
+            sequence.poses
+        ) > 1:
             times, now = sequence.times, sequence.read_time(frame)
             then = (now + _TIMES_S).clip(times[0], times[-1])
             moved = invert(sequence.read_pose(frame)) @ slerp(sequence.poses, times, then)
         apart = np.abs(moved[-1, :3] - moved[0, :3])
-        return cls(edges, contrast, moved @ place, bool(apart[:, 3].max() > _MOVED_M or apart[:, :3].max() > _TURNED))
+        return cls(
+            edges,
+            contrast,
+            moved @ place,
+            bool(apart[:, 3].max() > _MOVED_M or apart[:, :3].max() > _TURNED),
+        )
 
     def contrast(self, camera: CameraModel) -> NDArray[np.float64]:
-        """Return (T, S) the summed contrast of the image at the edges of depth, for each time and each shift."""
+        """Return (T, S) the summed contrast of the image at the edges of depth, for each time and
+        each shift.
+        """
         found = np.zeros((len(_TIMES_S), len(_SHIFTS_PX)))
         for row, place in enumerate(self.places):
             pixels = camera.project(transform_points(invert(place), self.edges))
             kept = camera.contains(pixels)
-            kept[kept] = (pixels[kept, 0] >= _SHIFTS_PX[-1]) & (pixels[kept, 0] < camera.width - 1 - _SHIFTS_PX[-1])
+            kept[kept] = (pixels[kept, 0] >= _SHIFTS_PX[-1]) & (
+                pixels[kept, 0] < camera.width - 1 - _SHIFTS_PX[-1]
+            )
             column, line = np.rint(pixels[kept]).astype(np.int64).T
             found[row] = self.contrast_of[line[:, None], column[:, None] + _SHIFTS_PX].sum(axis=0)
         return found
 
 
 def _depth_edges(camera: CameraModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (E, 3) points between neighbours in the image whose depths differ much, at the smaller depth, in the camera's frame."""
+    """Return (E, 3) points between neighbours in the image whose depths differ much, at the smaller
+    depth, in the camera's frame.
+    """
     pixels = camera.project(points)
     seen = camera.contains(pixels)
     pixels, depth = pixels[seen], points[seen, 2]
@@ -173,12 +202,19 @@ def _depth_edges(camera: CameraModel, points: NDArray[np.float64]) -> NDArray[np
     return looks * (near[edge] / looks[:, 2])[:, None]
 
 
-def _clearest(values: NDArray[Any], thirds: list[NDArray[np.float64]], apart: float) -> float | None:
-    """Return the value at which a curve is highest; None if its thirds disagree, or if the maximum is not clear."""
+def _clearest(
+    values: NDArray[Any], thirds: list[NDArray[np.float64]], apart: float
+) -> float | None:
+    """Return the value at which a curve is highest; None if its thirds disagree, or if the maximum
+    is not clear.
+    """
     total = np.sum(thirds, axis=0)
     best = int(total.argmax())
     elsewhere = np.abs(np.arange(len(values)) - best) > len(values) // 6
-    above, others = total[best] - total[elsewhere].mean(), total[elsewhere] - total[elsewhere].mean()
+    above, others = (
+        total[best] - total[elsewhere].mean(),
+        total[elsewhere] - total[elsewhere].mean(),
+    )
     agree = all(abs(values[int(third.argmax())] - values[best]) <= apart for third in thirds)
     is_clear = above > _CLEAR * float(others.std()) and above > _ALONE * float(others.max())
     return float(values[best]) if agree and is_clear and 0 < best < len(values) - 1 else None

@@ -1,4 +1,6 @@
-"""`doctor`: the installed packages and the properties of the machine, as a report to paste into an issue."""
+"""`doctor`: the installed packages and the properties of the machine, as a report to paste into an
+issue.
+"""
 
 from __future__ import annotations
 
@@ -32,11 +34,15 @@ from carlasc.running.pools import ONE_THREAD
 from carlasc.storage.files import is_durable
 
 FOR_DEVELOPERS = ("all", "dev", "docs", "faults", "study")
-"""Extras that are not listed: `all` consists of other extras, and the rest is for developers of the package."""
+"""Extras that are not listed: `all` consists of other extras, and the rest is for developers of the
+package.
+"""
 
 _PACKAGE = Path(__file__).parents[1]  # the folder of carlasc
 _FEATURES = "sse4.2 avx avx2 fma bmi2 avx512f avx512bw avx512vl neon asimd sve sve2".split()
-_REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[\w,-]*\])?(?:>=([\w.]+))?(?:\s*;\s*extra == ['\"]([\w-]+)['\"])?")
+_REQUIREMENT = re.compile(
+    r"([\w.-]+)(?:\[[\w,-]*\])?(?:>=([\w.]+))?(?:\s*;\s*extra == ['\"]([\w-]+)['\"])?"
+)
 _VARIABLES = re.compile("|".join([*ONE_THREAD, "NUMBA_.*", "CARLASC_.*"]))
 _MEGABYTE, _MEGABYTES, _SMALL_FILES = 1 << 20, 32, 8
 
@@ -85,7 +91,8 @@ class Extra:
     @property
     def command(self) -> str:
         """The command that installs it."""
-        return without_names(install_command(self.name)).replace("'~/", "~/'")  # shells expand ~ only outside quotes
+        # shells expand ~ only outside quotes
+        return without_names(install_command(self.name)).replace("'~/", "~/'")
 
 
 @dataclass(frozen=True)
@@ -134,7 +141,8 @@ class Disk:
         folder: the folder.
         free_bytes: free space, bytes.
         write_mb_s: speed of writing a file of 32 MB and syncing it, MB/s.
-        read_mb_s: speed of reading it again, MB/s; where the system allows it, from the disk and not from memory.
+        read_mb_s: speed of reading it again, MB/s; where the system allows it, from the disk and
+            not from memory.
         sync_ms: time for writing a file of 4 kB and syncing it, milliseconds.
     """
 
@@ -147,7 +155,9 @@ class Disk:
 
 @dataclass(frozen=True)
 class Installation:
-    """What `doctor` found. Paths begin with `~` instead of the home folder, and contain no user name.
+    """What `doctor` found.
+
+    Paths begin with `~` instead of the home folder, and contain no user name.
 
     Attributes:
         version: version of carlasc.
@@ -158,7 +168,8 @@ class Installation:
         extras: the optional packages.
         processor: the processor.
         compiled: where compiled code is kept; None if Numba does not work.
-        threads: the number of threads of Numba, and the variables of the environment that set threads, Numba and carlasc.
+        threads: the number of threads of Numba, and the variables of the environment that set
+            threads, Numba and carlasc.
         durable: whether files are synced before they are renamed to their final names.
         disk: how fast the measured folder is.
         problems: what is broken and needed; empty if carlasc works.
@@ -184,10 +195,13 @@ class Installation:
 
 
 def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
-    """Check the installed packages and the machine. This takes a few seconds; nothing is sent anywhere.
+    """Check the installed packages and the machine.
+
+    This takes a few seconds; nothing is sent anywhere.
 
     Args:
-        folder: folder whose disk speed is measured, in a temporary folder that is removed again; None: the folder for temporary files.
+        folder: folder whose disk speed is measured, in a temporary folder that is removed again;
+            None: the folder for temporary files.
 
     Returns:
         What was found.
@@ -199,17 +213,24 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
     needed, extras = _read_requirements()
     problems = [package.problem for package in needed if package.problem]
     if not needed:
-        problems.append("carlasc is on the path, but not installed, so its needs are not known: install it with pip")
+        problems.append(
+            "carlasc is on the path, but not installed, so its needs are not known: install it "
+            "with pip"
+        )
     for package in needed:
         if package.version is not None:
             problems += _problems_of_import(package.name)
-    numba_loads, compiled = not any("numba" in problem or "numpy" in problem for problem in problems), None
+    numba_loads, compiled = (
+        not any("numba" in problem or "numpy" in problem for problem in problems),
+        None,
+    )
     if numba_loads:
         try:
             compiled = _look_at_compiled_code()
         except (RuntimeError, OSError) as error:
             problems.append(
-                f"Numba cannot compile, or cannot keep compiled code ({describe(error)}): set NUMBA_CACHE_DIR to a folder that is writable"
+                f"Numba cannot compile, or cannot keep compiled code ({describe(error)}): set "
+                f"NUMBA_CACHE_DIR to a folder that is writable"
             )
     return Installation(
         version=carlasc_version(),
@@ -228,17 +249,22 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
 
 
 def without_names(text: str) -> str:
-    """Return a text with `~` instead of the home folder, and USER instead of the user's name where it is a whole word."""
+    """Return a text with `~` instead of the home folder, and USER instead of the user's name where
+    it is a whole word.
+    """
     home = str(Path.home())
     if len(home) > 1:
         text = re.sub(rf"{re.escape(home)}(?![\w-])", "~", text)
     with suppress(OSError, KeyError, ImportError):  # raised by getpass for a user without a name
-        text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(getpass.getuser())}(?![A-Za-z0-9])", "USER", text)
+        text = re.sub(
+            rf"(?<![A-Za-z0-9]){re.escape(getpass.getuser())}(?![A-Za-z0-9])", "USER", text
+        )
     return text
 
 
 def measure_disk(folder: str | os.PathLike[str] | None) -> Disk:
-    """Measure how fast files are written, synced and read in a temporary folder, which is removed again.
+    """Measure how fast files are written, synced and read in a temporary folder, which is removed
+    again.
 
     Args:
         folder: where to make it; None: the folder for temporary files.
@@ -252,13 +278,21 @@ def measure_disk(folder: str | os.PathLike[str] | None) -> Disk:
         raise ArgumentError("folder", expected="a folder", found=str(place))
     try:
         with tempfile.TemporaryDirectory(dir=place, prefix="carlasc-doctor-") as scratch:
-            large, noise = Path(scratch, "large"), os.urandom(_MEGABYTE)  # random: some file systems compress
+            # random: some file systems compress
+            large, noise = (
+                Path(scratch, "large"),
+                os.urandom(_MEGABYTE),
+            )
             write_s = _time_writing(large, noise, _MEGABYTES)
             read_s = _time_reading(large)
-            syncs_s = sorted(_time_writing(Path(scratch, str(n)), noise[:4096], 1) for n in range(_SMALL_FILES))
+            syncs_s = sorted(
+                _time_writing(Path(scratch, str(n)), noise[:4096], 1) for n in range(_SMALL_FILES)
+            )
             status = os.statvfs(scratch)
     except OSError as error:
-        raise StorageError(place, problem=f"files cannot be written: {error.strerror or error}") from error
+        raise StorageError(
+            place, problem=f"files cannot be written: {error.strerror or error}"
+        ) from error
     megabytes = _MEGABYTES * _MEGABYTE / 1e6
     return Disk(
         without_names(str(place.resolve())),
@@ -282,7 +316,8 @@ def _time_writing(path: Path, block: bytes, count: int) -> float:
 def _time_reading(path: Path) -> float:
     with path.open("rb") as file:
         if sys.platform == "linux":
-            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)  # drop the cached copy in memory
+            # drop the cached copy in memory
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         start = time.perf_counter()
         while file.read(_MEGABYTE):
             pass
@@ -290,7 +325,9 @@ def _time_reading(path: Path) -> float:
 
 
 def _read_requirements() -> tuple[tuple[Package, ...], tuple[Extra, ...]]:
-    """Return the packages that are always needed, and the extras, as the metadata of the installed package list them."""
+    """Return the packages that are always needed, and the extras, as the metadata of the installed
+    package list them.
+    """
     try:
         lines = metadata.requires("carlasc") or []
     except metadata.PackageNotFoundError:
@@ -313,7 +350,9 @@ def _version(name: str) -> str | None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the numbers of a version up to the first part that is no number, without trailing zeros: 2.0 is 2."""
+    """Return the numbers of a version up to the first part that is no number, without trailing
+    zeros: 2.0 is 2.
+    """
     numbers = [int(part) for part in re.match(r"[\d.]*", version)[0].split(".") if part]  # type: ignore[index]
     while numbers and not numbers[-1]:
         numbers.pop()
@@ -321,7 +360,10 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def _problems_of_import(name: str) -> Iterator[str]:
-    """Yield why a package that is always needed cannot be imported. The module has the name of the package, with underscores."""
+    """Yield why a package that is always needed cannot be imported.
+
+    The module has the name of the package, with underscores.
+    """
     try:
         import_extra(name.replace("-", "_"), "")
     except DependencyError as error:
@@ -336,7 +378,9 @@ def _look_at_processor(numba_loads: bool) -> Processor:
         found = binding.get_host_cpu_features()
         target = config.CPU_NAME or binding.get_host_cpu_name()
         features = tuple(
-            name for name in _FEATURES if found.get(name) and f"-{name}" not in (config.CPU_FEATURES or "")
+            name
+            for name in _FEATURES
+            if found.get(name) and f"-{name}" not in (config.CPU_FEATURES or "")
         )
     return Processor(_model(), os.cpu_count() or 1, count_cores(), target, features)
 
@@ -344,12 +388,16 @@ def _look_at_processor(numba_loads: bool) -> Processor:
 def _model() -> str:
     """Return the name of the processor."""
     with suppress(OSError):
-        if found := re.search(r"^(?:model name|Model)\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+        if found := re.search(
+            r"^(?:model name|Model)\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE
+        ):
             return found[1]
     if sys.platform == "darwin":
         with suppress(OSError, subprocess.SubprocessError):
             asked = ["sysctl", "-n", "machdep.cpu.brand_string"]
-            return subprocess.run(asked, capture_output=True, text=True, check=True, timeout=5).stdout.strip()
+            return subprocess.run(
+                asked, capture_output=True, text=True, check=True, timeout=5
+            ).stdout.strip()
     return platform.processor() or platform.machine()
 
 
@@ -357,7 +405,8 @@ def _look_at_compiled_code() -> CompiledCode:
     """Compile a loop of one line.
 
     Raises:
-        RuntimeError: Numba finds no folder for compiled code, so that no module with a compiled loop can be imported.
+        RuntimeError: Numba finds no folder for compiled code, so that no module with a compiled
+            loop can be imported.
         OSError: as RuntimeError, or the compiler does not work.
     """
     import numba
@@ -372,7 +421,9 @@ def _look_at_compiled_code() -> CompiledCode:
     root = _PACKAGE if folder.name == "__pycache__" else folder.parent
     sizes = [path.stat().st_size for path in root.rglob("*.nb[ic]")]
     nearest = next(parent for parent in (folder, *folder.parents) if parent.exists())
-    return CompiledCode(without_names(str(root)), os.access(nearest, os.W_OK), len(sizes), sum(sizes), compile_s)
+    return CompiledCode(
+        without_names(str(root)), os.access(nearest, os.W_OK), len(sizes), sum(sizes), compile_s
+    )
 
 
 def _next(number: int) -> int:
@@ -384,5 +435,7 @@ def _read_threads(numba_loads: bool) -> dict[str, str]:
     if numba_loads:
         found["numba"] = str(importlib.import_module("numba").config.NUMBA_NUM_THREADS)
     return found | {
-        name: without_names(value) for name, value in sorted(os.environ.items()) if _VARIABLES.fullmatch(name)
+        name: without_names(value)
+        for name, value in sorted(os.environ.items())
+        if _VARIABLES.fullmatch(name)
     }

@@ -1,4 +1,6 @@
-"""The contents of a data set: splits, sequences, frames, fields and grids, from listings and text files only."""
+"""The contents of a data set: splits, sequences, frames, fields and grids, from listings and text
+files only.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +99,9 @@ class SequenceOverview:
 
 @dataclass(frozen=True)
 class CaptureOverview:
-    """One raw capture: its path below the source, its number of sensors, and its frames as in SequenceOverview."""
+    """One raw capture: its path below the source, its number of sensors, and its frames as in
+    SequenceOverview.
+    """
 
     path: str
     sensors: int
@@ -113,8 +117,10 @@ class Overview:
 
     Attributes:
         location: the source.
-        level: kind of the source: "data set", "split", "sequences", "sequence", "coordinates" (one `<coordinates>` folder) or "capture".
-        store: how it is stored: "folder", "published" (a zip or a remote folder), or a kind of packed store.
+        level: kind of the source: "data set", "split", "sequences", "sequence", "coordinates" (one
+            `<coordinates>` folder) or "capture".
+        store: how it is stored: "folder", "published" (a zip or a remote folder), or a kind of
+            packed store.
         sequences: in sorted order.
         captures: in sorted order.
         bytes: size of the file, if the source is one file; None for folders.
@@ -136,14 +142,16 @@ class Overview:
         return found
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return a row per sequence, with the attributes of `SequenceOverview`; fields, documents and grids as their names.
+        """Return a row per sequence, with the attributes of `SequenceOverview`; fields, documents
+        and grids as their names.
 
         Raises:
             DependencyError: pandas is not installed.
         """
         return data_frame(
             (
-                vars(sequence) | {"fields": [*sequence.fields], "grids": [grid.name for grid in sequence.grids]}
+                vars(sequence)
+                | {"fields": [*sequence.fields], "grids": [grid.name for grid in sequence.grids]}
                 for sequence in self.sequences
             ),
             "path",
@@ -167,7 +175,9 @@ def info(source: str | os.PathLike[str] | Source) -> Overview:
     try:
         opened = as_source(source)
         # raw/ has a bev/ folder, like a sequence, but is a capture
-        sequences = {path: s for path, s in opened.sequences().items() if s.fields() or path not in captures}
+        sequences = {
+            path: s for path, s in opened.sequences().items() if s.fields() or path not in captures
+        }
     except MissingDataError:
         if not captures:
             raise
@@ -210,7 +220,9 @@ def _level(location: str, paths: list[str]) -> str:
 
 def _describe(sequence: Sequence) -> SequenceOverview:
     fields = {name: len(sequence.frames(name)) for name in sorted(sequence.fields())}
-    numbers = np.sort(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in fields)]))
+    numbers = np.sort(
+        np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in fields)])
+    )
     frames = numbers[np.diff(numbers, prepend=-1) > 0]  # np.unique would load numpy.ma
     metadata, problem = Metadata(), None
     grids: tuple[GridOverview, ...] = ()
@@ -258,7 +270,9 @@ def _describe_grid(sequence: Sequence, name: str, fields: Mapping[str, int]) -> 
 
 
 def _estimate_bytes(sequence: Sequence, fields: Mapping[str, int]) -> int | None:
-    """Return the size of a sequence, estimated from a few files of each field; None for stores other than folders."""
+    """Return the size of a sequence, estimated from a few files of each field; None for stores
+    other than folders.
+    """
     if not isinstance(sequence, FolderSequence):
         return None
     total = 0.0
@@ -272,7 +286,9 @@ def _estimate_bytes(sequence: Sequence, fields: Mapping[str, int]) -> int | None
 
 def _describe_capture(path: str, capture: Capture) -> CaptureOverview:
     frames = capture.frames
-    return CaptureOverview(path, len(capture.sensors), len(frames), int(frames[0]), int(frames[-1]), _gaps(frames))
+    return CaptureOverview(
+        path, len(capture.sensors), len(frames), int(frames[0]), int(frames[-1]), _gaps(frames)
+    )
 
 
 def _gaps(frames: NDArray[np.int64]) -> int:

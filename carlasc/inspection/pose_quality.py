@@ -1,7 +1,9 @@
-"""Checks of poses: whether they move like a vehicle, how well neighbouring scans agree under them, and whether they have a lever arm or a delay.
+"""Checks of poses: whether they move like a vehicle, how well neighbouring scans agree under them,
+and whether they have a lever arm or a delay.
 
-Some runs of scans are aligned with each other (`carlasc.motion.joint_alignment`) and compared with the given poses. The runs are in the middle
-of the drive, and where the sensor turns and accelerates most, because a lever arm and a delay have the largest effect there.
+Some runs of scans are aligned with each other (`carlasc.motion.joint_alignment`) and compared with
+the given poses. The runs are in the middle of the drive, and where the sensor turns and accelerates
+most, because a lever arm and a delay have the largest effect there.
 """
 
 from __future__ import annotations
@@ -22,13 +24,16 @@ from carlasc.storage import layout
 from carlasc.storage.protocol import Sequence
 
 POOR_M = 0.03
-"""If scans disagree by more than this, and agree better under other poses, the poses reduce the quality of grids."""
+"""If scans disagree by more than this, and agree better under other poses, the poses reduce the
+quality of grids.
+"""
 
 _RUN = 30  # scans of a run
+# frames by which poses are moved for another start, which must be better by this factor
 _SHIFTS, _BETTER = (
     (-2, 2),
     0.9,
-)  # frames by which poses are moved for another start, which must be better by this factor
+)
 _AGREE_M = 0.03  # scans that agree within this distance are aligned
 _LEVER_M = 15.0  # a turn counts by what it moves at this distance
 
@@ -38,9 +43,11 @@ class PoseQuality:
     """The quality of the poses of a drive, measured from some runs of scans.
 
     Attributes:
-        disagreement_m: distance of scans from the surfaces that their neighbours saw, under the given poses; None if it is undetermined.
+        disagreement_m: distance of scans from the surfaces that their neighbours saw, under the
+            given poses; None if it is undetermined.
         refined_m: the same distance under refined poses.
-        mounting: pose of the sensor in the frame of the poses, and the delay of the poses; None if they are undetermined.
+        mounting: pose of the sensor in the frame of the poses, and the delay of the poses; None if
+            they are undetermined.
     """
 
     disagreement_m: float | None
@@ -59,19 +66,26 @@ def measure_poses(
     poses: NDArray[np.float64],
     seconds: NDArray[np.float64] | None = None,
 ) -> PoseQuality:
-    """Measure how well scans agree under their poses, and whether a lever arm or a delay explains the disagreement.
+    """Measure how well scans agree under their poses, and whether a lever arm or a delay explains
+    the disagreement.
 
     Args:
-        points: returns (N, 3) points of the i-th scan on static things, metres, in the frame of the sensor.
+        points: returns (N, 3) points of the i-th scan on static things, metres, in the frame of the
+            sensor.
         poses: (F, 4, 4) first_T_sensor of each scan, in order of time; rigid.
         seconds: (F,) their times, increasing; None for frames at 10 Hz.
     """
-    times = np.asarray(layout.FRAME_PERIOD_S * np.arange(len(poses)) if seconds is None else seconds, np.float64)
+    times = np.asarray(
+        layout.FRAME_PERIOD_S * np.arange(len(poses)) if seconds is None else seconds, np.float64
+    )
     before, after, runs = list[float](), list[float](), list[tuple[int, NDArray[np.float64]]]()
     numbers = np.arange(len(poses), dtype=np.float64)
     for first in _choose_runs(poses, times):
         rows = slice(first, first + _RUN)
-        scans = [ThinnedScan.of(points(row).astype(np.float32), poses[row]) for row in range(len(poses))[rows]]
+        scans = [
+            ThinnedScan.of(points(row).astype(np.float32), poses[row])
+            for row in range(len(poses))[rows]
+        ]
         used, measured = [scan.used for scan in scans], [scan.measured for scan in scans]
         was = finite_mean(disagreement(measured, poses[rows]))
         found = align(used, poses[rows], poses[rows])
@@ -89,21 +103,31 @@ def measure_poses(
             runs.append((first, found))
     if not np.isfinite(before).any():
         return PoseQuality(None, None, None)
-    return PoseQuality(finite_mean(np.array(before)), finite_mean(np.array(after)), find_mounting(poses, times, runs))
+    return PoseQuality(
+        finite_mean(np.array(before)),
+        finite_mean(np.array(after)),
+        find_mounting(poses, times, runs),
+    )
 
 
 def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | None:
-    """Return a description of poses with this mounting and an advice, for a message; None if they need no correction."""
+    """Return a description of poses with this mounting and an advice, for a message; None if they
+    need no correction.
+    """
     wrong, values, errors = mounting.wrong, mounting.values, mounting.errors
     found, advice = [], "write corrected poses with `carlasc refine`"
     if wrong[:6].any():
         place = ", ".join(
             f"{axis} = {value:.2f} ± {error:.2f} m" if known else f"{axis} undetermined"
-            for axis, value, error, known in zip("xyz", values, errors, mounting.determined, strict=False)
+            for axis, value, error, known in zip(
+                "xyz", values, errors, mounting.determined, strict=False
+            )
         )
         turned = [
             f"{name} {np.rad2deg(value):.1f} degrees"
-            for name, value, is_wrong in zip(("roll", "pitch", "yaw"), values[3:6], wrong[3:6], strict=True)
+            for name, value, is_wrong in zip(
+                ("roll", "pitch", "yaw"), values[3:6], wrong[3:6], strict=True
+            )
             if is_wrong
         ]
         found.append(
@@ -114,20 +138,26 @@ def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | 
     if wrong[6]:
         when = "late" if values[6] > 0 else "early"
         frames = abs(values[6]) / period_s
-        found.append(f"poses that are {abs(values[6]):.2f} ± {errors[6]:.2f} s {when} ({frames:.1f} frames)")
+        found.append(
+            f"poses that are {abs(values[6]):.2f} ± {errors[6]:.2f} s {when} ({frames:.1f} frames)"
+        )
         advice += ", and compare the time stamps of both"
     return (" and ".join(found), advice) if found else None
 
 
 def _choose_runs(poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> list[int]:
-    """Return the first rows of up to three runs that do not overlap: the sharpest turn, the largest acceleration, the middle."""
+    """Return the first rows of up to three runs that do not overlap: the sharpest turn, the largest
+    acceleration, the middle.
+    """
     count = len(poses)
     if count <= _RUN:
         return [0] if count > 2 else []
     motions = multiply(invert(poses[:-1]), poses[1:])
     cosine = np.clip((motions[:, 0, 0] + motions[:, 1, 1] + motions[:, 2, 2] - 1) / 2, -1, 1)
     speed = np.sqrt(np.square(motions[:, :3, 3]).sum(axis=1)) / np.maximum(np.diff(seconds), 1e-3)
-    changes = np.abs(speed[_RUN // 3 :] - speed[: -(_RUN // 3)]) if count > _RUN // 3 + 1 else np.zeros(1)
+    changes = (
+        np.abs(speed[_RUN // 3 :] - speed[: -(_RUN // 3)]) if count > _RUN // 3 + 1 else np.zeros(1)
+    )
     chosen: list[int] = []
     for values in (_LEVER_M * np.arccos(cosine), changes, -np.abs(np.arange(count) - count / 2)):
         sums = np.convolve(values, np.ones(min(_RUN, len(values))), "valid")
@@ -140,18 +170,24 @@ def _choose_runs(poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> li
 
 
 _SPEED_M_S = 70.0  # 250 km/h
-_SPEED_CHANGE_M_S = 15.0  # between neighbouring steps; a collision in CARLA changes the speed as much
+_SPEED_CHANGE_M_S = (
+    15.0  # between neighbouring steps; a collision in CARLA changes the speed as much
+)
 _TURN_RAD_S = np.deg2rad(250.0)
 _TOLERANCE = 1e-3
 
 
 def check_poses(sequence: Sequence) -> Iterator[Finding]:
-    """Check that poses.txt exists, has a line for each frame, and holds rigid transforms that change smoothly."""
+    """Check that poses.txt exists, has a line for each frame, and holds rigid transforms that
+    change smoothly.
+    """
     where, frames = f"{sequence.location}/{layout.POSES}", sequence.scan_frames()
     if layout.POSES not in sequence.documents():
         if "points" in sequence.fields():
             advice = "copy the file, or estimate poses with KISS-ICP: scans cannot be merged without poses"
-            yield Finding("error", "poses", sequence.path, where, "a pose for each scan", "no file", advice)
+            yield Finding(
+                "error", "poses", sequence.path, where, "a pose for each scan", "no file", advice
+            )
         return
     try:
         poses = sequence.poses
@@ -174,7 +210,9 @@ def check_times(sequence: Sequence) -> Iterator[Finding]:
     if layout.TIMES not in sequence.documents():
         if "points" in sequence.fields():
             advice = "copy the file; without it, 10 Hz is assumed"
-            yield Finding("warning", "times", sequence.path, where, "a time for each scan", "no file", advice)
+            yield Finding(
+                "warning", "times", sequence.path, where, "a time for each scan", "no file", advice
+            )
         return
     try:
         times = sequence.times
@@ -186,7 +224,9 @@ def check_times(sequence: Sequence) -> Iterator[Finding]:
     if len(wrong):
         line = int(wrong[0]) + 1
         found = f"{times[line]:g} s in line {line + 1} after {times[line - 1]:g} s ({len(wrong)} such lines)"
-        yield Finding("error", "times", sequence.path, where, "seconds that increase from line to line", found)
+        yield Finding(
+            "error", "times", sequence.path, where, "seconds that increase from line to line", found
+        )
 
 
 def _check_lines(sequence: Sequence, document: str, lines: int) -> Iterator[Finding]:
@@ -202,9 +242,17 @@ def _check_lines(sequence: Sequence, document: str, lines: int) -> Iterator[Find
         advice = "lines are missing: copy the file again"
         yield Finding("error", kind, sequence.path, where, expected, f"{lines} lines", advice)
     elif lines > last + 1:
-        advice = "check whether scans are missing at the end, or the file belongs to another sequence"
+        advice = (
+            "check whether scans are missing at the end, or the file belongs to another sequence"
+        )
         yield Finding(
-            "warning", kind, sequence.path, where, f"{last + 1} lines, up to frame {last}", f"{lines} lines", advice
+            "warning",
+            kind,
+            sequence.path,
+            where,
+            f"{last + 1} lines, up to frame {last}",
+            f"{lines} lines",
+            advice,
         )
 
 
@@ -235,7 +283,9 @@ def _periods(sequence: Sequence, frames: NDArray[np.int64]) -> NDArray[np.float6
         times = np.zeros(1)
     periods = np.diff(times)
     return (
-        periods if len(periods) == len(frames) - 1 and (periods > 0).all() else np.diff(frames) * layout.FRAME_PERIOD_S
+        periods
+        if len(periods) == len(frames) - 1 and (periods > 0).all()
+        else np.diff(frames) * layout.FRAME_PERIOD_S
     )
 
 
@@ -244,8 +294,17 @@ def _check_steps(sequence: Sequence, frames: NDArray[np.int64], where: str) -> I
     poses = np.stack([sequence.read_pose(frame) for frame in frames.tolist()])
     if frames[0] == 0 and np.abs(poses[0] - np.eye(4)).max() > 1e-3:
         advice = "nothing to do: the poses are relative to another frame, and only relative poses are used"
-        yield Finding("note", "poses", sequence.path, where, "the identity as the first pose", "another pose", advice)
-    if len(frames) < 2 or not sequence.metadata.has_rays:  # frames of a cloud without a sensor have no order in time
+        yield Finding(
+            "note",
+            "poses",
+            sequence.path,
+            where,
+            "the identity as the first pose",
+            "another pose",
+            advice,
+        )
+    # frames of a cloud without a sensor have no order in time
+    if len(frames) < 2 or not sequence.metadata.has_rays:
         return
     steps = invert(poses[:-1]) @ poses[1:]
     period_s = _periods(sequence, frames)
@@ -253,12 +312,19 @@ def _check_steps(sequence: Sequence, frames: NDArray[np.int64], where: str) -> I
     cosine = (np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2
     turn = np.arccos(np.clip(cosine, -1, 1)) / period_s
     usual = np.array([np.median(speed[max(0, i - 3) : i + 4]) for i in range(len(speed))])
-    jumps = np.flatnonzero((speed > _SPEED_M_S) | (np.abs(speed - usual) > _SPEED_CHANGE_M_S) | (turn > _TURN_RAD_S))
+    jumps = np.flatnonzero(
+        (speed > _SPEED_M_S) | (np.abs(speed - usual) > _SPEED_CHANGE_M_S) | (turn > _TURN_RAD_S)
+    )
     if len(jumps):
         step = int(jumps[np.argmax(np.abs(speed - usual)[jumps] + turn[jumps])])
-        moved, turned = float(np.linalg.norm(steps[step, :3, 3])), float(np.rad2deg(turn[step] * period_s[step]))
+        moved, turned = (
+            float(np.linalg.norm(steps[step, :3, 3])),
+            float(np.rad2deg(turn[step] * period_s[step])),
+        )
         usually = float(usual[step] * period_s[step])
         found = f"{moved:.2f} m and {turned:.1f} degrees from frame {frames[step]} to {frames[step + 1]}, {usually:.2f} m between other frames"
         found += f" ({len(jumps)} such steps)" if len(jumps) > 1 else ""
         advice = "check whether frames are missing there, or sequences were joined"
-        yield Finding("error", "pose-jump", sequence.path, where, "poses without jumps", found, advice)
+        yield Finding(
+            "error", "pose-jump", sequence.path, where, "poses without jumps", found, advice
+        )

@@ -1,4 +1,6 @@
-"""Reports and audits as self-contained HTML pages, with charts in SVG and pictures of the worst frames."""
+"""Reports and audits as self-contained HTML pages, with charts in SVG and pictures of the worst
+frames.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +70,9 @@ def describe(report: Report) -> list[tuple[str, str]]:
     settings = report.settings.get(RECORD)
     if isinstance(settings, dict):
         rows.append(("settings", ", ".join(f"{name} {value}" for name, value in settings.items())))
-    rows.append(("versions", ", ".join(f"{name} {value}" for name, value in report.versions.items())))
+    rows.append(
+        ("versions", ", ".join(f"{name} {value}" for name, value in report.versions.items()))
+    )
     return rows
 
 
@@ -88,14 +92,17 @@ def _poses(facts: PoseFacts) -> str:
         return "as given: too few points to measure whether scans agree"
     if not any(facts.changed_m):
         return f"as given: neighbouring scans agree within {100 * facts.before_m:.1f} cm"
-    text = (
-        f"refined: neighbouring scans disagreed by {100 * facts.before_m:.1f} cm, now by {100 * facts.after_m:.1f} cm"
-    )
+    text = f"refined: neighbouring scans disagreed by {100 * facts.before_m:.1f} cm, now by {100 * facts.after_m:.1f} cm"
     moved, turned = (
         ", ".join(f"{scale * value:.{digits}f}" for value in values)
-        for scale, digits, values in ((100.0, 1, facts.changed_m), (180 / math.pi, 2, facts.changed_rad))
+        for scale, digits, values in (
+            (100.0, 1, facts.changed_m),
+            (180 / math.pi, 2, facts.changed_rad),
+        )
     )
-    text += f"; corrected by {moved} cm along x, y, z and {turned} degrees of roll, pitch, yaw per scan"
+    text += (
+        f"; corrected by {moved} cm along x, y, z and {turned} degrees of roll, pitch, yaw per scan"
+    )
     text += f"; the given height drifts by {100 * facts.height_drift_m:.0f} cm within 100 scans"
     left = ", ".join(f"{first} to {last}" for first, last in facts.left)
     return f"{text}; as given in frames {left}" if left else text
@@ -107,20 +114,32 @@ def _held_out(values: Mapping[str, Any]) -> str:
         return "none"
     text = f"{rays['returns']} returns: {rays['free']:.2%} in free voxels, {rays['unknown']:.2%} in unknown ones"
     text += f"; {rays['passed_object']:.2%} pass through an object before their return"
-    text += "" if swept is None else f"; {swept:.2%} of the voxels that the ego vehicle drove through are occupied"
+    text += (
+        ""
+        if swept is None
+        else f"; {swept:.2%} of the voxels that the ego vehicle drove through are occupied"
+    )
     given = values.get("given_poses")
     return (
         text
         if not given
-        else f"{text}; under the given poses {given['free']:.2%} are in free voxels, {given['unknown']:.2%} in unknown ones"
+        else f"{text}; under the given poses {given['free']:.2%} are in free voxels, "
+        f"{given['unknown']:.2%} in unknown ones"
     )
 
 
 def _section(name: str, report: Report) -> str:
     coverage, known = report.coverage, max(report.coverage.known, 1)
-    classes = sorted(((label, count / known) for label, count in coverage.classes.items()), key=lambda pair: -pair[1])
+    classes = sorted(
+        ((label, count / known) for label, count in coverage.classes.items()),
+        key=lambda pair: -pair[1],
+    )
     votes = [(_bin_name(power), count / known) for power, count in enumerate(coverage.votes)]
-    spec, held_out, actors = GridSpec.from_params(report.settings, name), report.holdout, report.actors
+    spec, held_out, actors = (
+        GridSpec.from_params(report.settings, name),
+        report.holdout,
+        report.actors,
+    )
     digests = [[field, digest.all] for field, digest in report.digests.items()]
     digests += [[field, digest.digest] for field, digest in report.documents.items()]
     return fill(
@@ -131,7 +150,9 @@ def _section(name: str, report: Report) -> str:
         figures=_table([], [[label, text] for label, text in describe(report)]),
         classes=_bars(classes),
         votes=_part("Known voxels by their number of votes", _bars(votes)) if votes else "",
-        held_out=_part("Held-out rays", _held_out_table(held_out)) if held_out and held_out["by_distance"] else "",
+        held_out=_part("Held-out rays", _held_out_table(held_out))
+        if held_out and held_out["by_distance"]
+        else "",
         actors=_part(
             "Moving actors by frame",
             f"{_timeline(actors, report.frames)}\n{_actor_table(actors)}",
@@ -146,7 +167,9 @@ def _part(title: str, content: str) -> str:
     return f"<h3>{title}</h3>\n{content}\n"
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[object]], *, figures: bool = False) -> str:
+def _table(
+    header: Sequence[str], rows: Iterable[Sequence[object]], *, figures: bool = False
+) -> str:
     """Return a table; with `figures`, all columns except the first hold numbers."""
 
     def line(cells: Sequence[object], tag: str) -> str:
@@ -171,19 +194,23 @@ def _bars(rows: Sequence[tuple[str, float]]) -> str:
 
 
 def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
-    """Return one bar per actor, from its first to its last frame; it is paler if fewer frames in between show the actor."""
+    """Return one bar per actor, from its first to its last frame; it is paler if fewer frames in
+    between show the actor.
+    """
     first = min([*(actor.first for actor in actors), *frames[:1]])
     last = max([*(actor.last for actor in actors), *frames[-1:]])
     scale = 560 / max(last - first, 1)
     lines = []
     for row, actor in enumerate(actors):
-        y, x, width = row * _ROW, 130 + (actor.first - first) * scale, max((actor.last - actor.first) * scale, 2)
+        y, x, width = (
+            row * _ROW,
+            130 + (actor.first - first) * scale,
+            max((actor.last - actor.first) * scale, 2),
+        )
         name = f"{actor.label} {actor.instance or ''}".strip()
         lines.append(f'<text x="0" y="{y + 13}">{escape(name)}</text>')
         share = actor.observations / (actor.last - actor.first + 1)
-        bar = (
-            f'<rect x="{x:.1f}" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}" fill-opacity="{share:.2f}"/>'
-        )
+        bar = f'<rect x="{x:.1f}" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}" fill-opacity="{share:.2f}"/>'
         lines.append(bar)
     axis = len(actors) * _ROW + 14
     lines += [f'<text x="130" y="{axis}">{first}</text>', f'<text x="680" y="{axis}">{last}</text>']
@@ -191,9 +218,7 @@ def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
 
 
 def _svg(width: int, height: int, lines: Sequence[str]) -> str:
-    return (
-        f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" font-size="12">{"".join(lines)}</svg>'
-    )
+    return f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" font-size="12">{"".join(lines)}</svg>'
 
 
 def _actor_table(actors: Sequence[ActorTrack]) -> str:
@@ -240,7 +265,11 @@ def _held_out_table(values: Mapping[str, Any]) -> str:
             _metres(rays["error_median_m"]),
             _metres(rays["error_90_m"]),
         ]
-        for label, rays in {"all": values["rays"], **values["by_distance"], **values["by_class"]}.items()
+        for label, rays in {
+            "all": values["rays"],
+            **values["by_distance"],
+            **values["by_class"],
+        }.items()
     ]
     return _table(header, rows, figures=True)
 
@@ -253,7 +282,9 @@ def _bin_name(power: int) -> str:
     return "1" if power == 0 else f"{2**power} to {2 ** (power + 1) - 1}"
 
 
-_PALETTE = np.array([(255, 255, 255), (200, 204, 208), (30, 90, 200), (235, 130, 20), (215, 30, 30)], np.uint8)
+_PALETTE = np.array(
+    [(255, 255, 255), (200, 204, 208), (30, 90, 200), (235, 130, 20), (215, 30, 30)], np.uint8
+)
 
 
 def write_audit_page(result: AuditResult, out: str | Path) -> None:
@@ -278,7 +309,13 @@ def write_audit_page(result: AuditResult, out: str | Path) -> None:
     state = "sound, as far as the drives tell" if result.ok else count(len(result.faults), "fault")
     text = f"Compared with the scans of {escape(result.scans)}: <b>{state}</b>.{lines}"
     title = f"Audit of {escape(result.grids)}"
-    page = fill("audit.html", title=title, summary=text, sequences="".join(parts), pictures=_pictures(result))
+    page = fill(
+        "audit.html",
+        title=title,
+        summary=text,
+        sequences="".join(parts),
+        pictures=_pictures(result),
+    )
     write_output(Path(out), page.encode())
 
 
@@ -286,7 +323,9 @@ def _row(verdict: Verdict) -> str:
     check, state, text, advice, more = map(
         escape, (verdict.check, verdict.state, verdict.text, verdict.advice, verdict.details)
     )
-    more = f"<details><summary>by class, distance and height</summary>{more}</details>" if more else ""
+    more = (
+        f"<details><summary>by class, distance and height</summary>{more}</details>" if more else ""
+    )
     return f'<tr><td>{check}</td><td class="{state}">{state}</td><td>{text}{more}</td><td>{advice}</td></tr>'
 
 
@@ -294,7 +333,8 @@ def _pictures(result: AuditResult) -> str:
     figures = []
     for path, number, frame, wrong in result.worst:
         one, drawn = voxels_of(result, path, number, frame)
-        for kind in range(1, FALSE_FREE + 1):  # errors are drawn in the highest layer, where nothing hides them
+        # errors are drawn in the highest layer, where nothing hides them
+        for kind in range(1, FALSE_FREE + 1):
             drawn[:, :, -1] = np.where((drawn == kind).any(axis=2), kind, drawn[:, :, -1])
         picture = one.spec.seen_from_above(drawn, _PALETTE, left_handed=one.axes == "left")
         title = f"{path}, scan {frame}: {count(wrong, 'wrong voxel')}"

@@ -37,7 +37,8 @@ class ReportResult:
 
     Attributes:
         location: location of the data set.
-        reports: the report of each grid, by the path of its sequence and the name of the grid: "Val/Town/cartesian/evaluation".
+        reports: the report of each grid, by the path of its sequence and the name of the grid:
+            "Val/Town/cartesian/evaluation".
         failures: frames that could not be read, for reports that were made.
     """
 
@@ -63,15 +64,18 @@ def report(
     save: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> ReportResult:
-    """Return the report of each grid of a data set: the report that its run wrote, or one that is made from the files.
+    """Return the report of each grid of a data set: the report that its run wrote, or one that is
+    made from the files.
 
-    A report that is made from the files equals that of the run, if the scans that the grids were made from are in the same sequence.
+    A report that is made from the files equals that of the run, if the scans that the grids were
+    made from are in the same sequence.
 
     Args:
         source: anything that `carlasc.open` takes.
         grid: name of one grid; None for all.
         remake: make all reports from the files, also where reports exist.
-        holdout: add held-out scores (see `carlasc.inspection.holdout`) if they are missing, for Cartesian grids that were made from scans.
+        holdout: add held-out scores (see `carlasc.inspection.holdout`) if they are missing, for
+            Cartesian grids that were made from scans.
         save: write the reports beside their grids: folders only, and only grids that carlasc made.
         run: how the work is spread, with a callback for the progress of reports that are made.
 
@@ -89,7 +93,10 @@ def report(
         if grid in (None, name) and sequence.predicted_by(name) is None
     ]
     if not grids:
-        expected, advice = "a grid" if grid is None else f"the grid {grid}", "make grids with `carlasc regrid`"
+        expected, advice = (
+            "a grid" if grid is None else f"the grid {grid}",
+            "make grids with `carlasc regrid`",
+        )
         raise MissingDataError(opened.location, expected=expected, found="none", advice=advice)
     if save:
         for _, sequence, name in grids:
@@ -119,7 +126,9 @@ _Measured = FrameFacts | FrameFailure
 
 def _measure_all(makers: list[_ReportMaker], run: Run) -> list[list[_Measured]]:
     """Return the measurements of the frames of each report."""
-    steps = StepCounter(run.progress, sum(len(maker.frames) + maker.steps_before for maker in makers))
+    steps = StepCounter(
+        run.progress, sum(len(maker.frames) + maker.steps_before for maker in makers)
+    )
     steps(0)
     for maker in makers:
         maker.find_actors(run, steps)
@@ -157,7 +166,9 @@ class _ReportMaker:
         name = layout.report_file(self.grid)
         if name not in self.sequence.documents():
             return None
-        return Report.from_json(self.sequence.read_document(name), f"{self.sequence.location}/{name}")
+        return Report.from_json(
+            self.sequence.read_document(name), f"{self.sequence.location}/{name}"
+        )
 
     @property
     def steps_before(self) -> int:
@@ -165,7 +176,10 @@ class _ReportMaker:
         return 0 if self.inputs is None else self.inputs.steps_before
 
     def find_actors(self, run: Run, steps: Callable[[int], None]) -> None:
-        """Refine poses and find the actors, if the grid was made so. If a scan cannot be read, the grid is not made again."""
+        """Refine poses and find the actors, if the grid was made so.
+
+        If a scan cannot be read, the grid is not made again.
+        """
         if self.inputs is None:
             return
         try:
@@ -184,7 +198,9 @@ class _ReportMaker:
                 light,
                 self.grid,
                 number,
-                ScanFrame(self.inputs, number, number) if self.inputs is not None and number in scans else None,
+                ScanFrame(self.inputs, number, number)
+                if self.inputs is not None and number in scans
+                else None,
                 None if self.inputs is None or number not in sampled else self.inputs.plan,
             )
             for number in self.frames
@@ -194,7 +210,9 @@ class _ReportMaker:
         """Make the report from the measurements."""
         sequence = self.sequence
         names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(self.grid))
-        documents = {name: sequence.read_document(name) for name in names if name in sequence.documents()}
+        documents = {
+            name: sequence.read_document(name) for name in names if name in sequence.documents()
+        }
         classes, params = sequence.classes_of(self.grid), sequence.params(self.grid)
         facts = [result for result in measured if isinstance(result, FrameFacts)]
         actors = None if self.inputs is None else self.inputs.summaries()
@@ -202,7 +220,9 @@ class _ReportMaker:
         return Report.make(self.grid, facts, params, classes, documents, actors=actors, poses=poses)
 
     def held_out(self, run: Run) -> Mapping[str, Any] | None:
-        """Measure held-out scores; None if the grid is cylindrical, or was not made from the scans beside it."""
+        """Measure held-out scores; None if the grid is cylindrical, or was not made from the scans
+        beside it.
+        """
         spec = self.sequence.grids[self.grid]
         if self.inputs is None or spec.coordinates != "cartesian":
             return None
@@ -217,7 +237,8 @@ class _ReportMaker:
         )
         if result.total is None:
             return None
-        given = [asdict(scores.all) for scores in result.given_poses.values()]  # of the one sequence
+        # of the one sequence
+        given = [asdict(scores.all) for scores in result.given_poses.values()]
         return {**result.total.to_dict(), **({"given_poses": given[0]} if given else {})}
 
 
@@ -235,20 +256,29 @@ def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
         plan = GridPlan(sequence.grids[grid], grid, options, voting, FrameRange.of(None))
         inputs = ScanSequence(sequence, plan, options)
         return inputs if len(inputs.feed.frames) else None
-    except (CarlascError, ValueError, TypeError, OverflowError):  # a record of another version, or invalid poses
+    except (
+        CarlascError,
+        ValueError,
+        TypeError,
+        OverflowError,
+    ):  # a record of another version, or invalid poses
         return None
 
 
 def _options_of(record: Mapping[str, Any]) -> FromScans:
     """Return the options in the record of a run; options that it does not name have their defaults."""
-    given = {option.name: record[option.name] for option in fields(FromScans) if option.name in record}
+    given = {
+        option.name: record[option.name] for option in fields(FromScans) if option.name in record
+    }
     # The record names all sources of motion; several sources mean that "auto" chose them.
     if "+" in str(given.get("motion", "")) or given.get("dynamic") == "tube":
         del given["motion"]
     if "window" in given:
         first, _, last = str(given["window"]).partition(":")
         given["window"] = (int(first), int(last))
-    given["poses"] = PoseOptions(record.get("poses", "file"), record.get("refine", "never"), force=True)
+    given["poses"] = PoseOptions(
+        record.get("poses", "file"), record.get("refine", "never"), force=True
+    )
     if "motion" in given:
         given["motion"] = MotionOptions(given["motion"])
     return FromScans(**given)
@@ -260,7 +290,11 @@ def _measure(task: _ReportedFrame) -> FrameFacts | FrameFailure:
     names = (*layout.SCAN_FIELDS, *(f"{grid}/{part}" for part in layout.GRID_FIELDS))
     try:
         present = sequence.fields()
-        arrays = {n: sequence.read(n, number) for n in names if n in present and number in sequence.frames(n)}
+        arrays = {
+            n: sequence.read(n, number)
+            for n in names
+            if n in present and number in sequence.frames(n)
+        }
         spec, classes, changes = sequence.grids[grid], sequence.classes_of(grid), None
         if task.scans is not None and task.plan is not None:
             changes = Changes.between(sequence.grid(grid, number), task.scans.thinned(task.plan))

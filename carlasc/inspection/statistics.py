@@ -134,23 +134,34 @@ class Statistics:
         return {name: int(counts[index]) for index, name in self.classes.names.items()}
 
     def weights(self) -> dict[str, float]:
-        """Return the loss weight of each class, remapped if there is a remap, from the known voxels of all sequences."""
+        """Return the loss weight of each class, remapped if there is a remap, from the known voxels
+        of all sequences.
+        """
         weights = class_weights(self.total.voxels, self.remap)
         table = self.classes if self.remap is None else self.remap.target
         return {name: float(weights[index]) for index, name in table.names.items()}
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return a row per sequence and class: split, class, and the numbers of points and of voxels.
+        """Return a row per sequence and class: split, class, and the numbers of points and of
+        voxels.
 
         Raises:
             DependencyError: pandas is not installed.
         """
         return data_frame(
             (
-                {"sequence": path, "split": self.splits[path], "class": name, "points": points, "voxels": voxels}
+                {
+                    "sequence": path,
+                    "split": self.splits[path],
+                    "class": name,
+                    "points": points,
+                    "voxels": voxels,
+                }
                 for path, histogram in self.sequences.items()
                 for (name, points), voxels in zip(
-                    self.summed(histogram.points).items(), self.summed(histogram.voxels).values(), strict=True
+                    self.summed(histogram.points).items(),
+                    self.summed(histogram.voxels).values(),
+                    strict=True,
                 )
             ),
             "sequence",
@@ -161,9 +172,19 @@ class Statistics:
 
         def plain(histogram: Histogram) -> dict[str, Any]:
             counts = {kind: self.named(histogram.of(kind)) for kind in KINDS}
-            remapped = {f"{kind}_remapped": self.summed(histogram.of(kind)) for kind in KINDS} if self.remap else {}
-            figures = {"unknown_voxels": histogram.unknown, "scans": histogram.scans, "grids": histogram.grids}
-            figures |= {name: getattr(histogram, name) for name in ("actor_voxels", "moving_voxels")}
+            remapped = (
+                {f"{kind}_remapped": self.summed(histogram.of(kind)) for kind in KINDS}
+                if self.remap
+                else {}
+            )
+            figures = {
+                "unknown_voxels": histogram.unknown,
+                "scans": histogram.scans,
+                "grids": histogram.grids,
+            }
+            figures |= {
+                name: getattr(histogram, name) for name in ("actor_voxels", "moving_voxels")
+            }
             share = histogram.known_share
             return counts | remapped | figures | {"known_share": None if np.isnan(share) else share}
 
@@ -191,9 +212,10 @@ def stats(
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
-        grid: the grid whose voxels are counted. In a sequence that has only one grid, of another name, that one is counted.
-        remap: the remap to the classes of a second table: a remap or its name, None for no second table, or "auto", which takes the
-            paper's 11 classes or SemanticKITTI's 19.
+        grid: the grid whose voxels are counted. In a sequence that has only one grid, of another
+            name, that one is counted.
+        remap: the remap to the classes of a second table: a remap or its name, None for no second
+            table, or "auto", which takes the paper's 11 classes or SemanticKITTI's 19.
         every: count every N-th frame.
         run: how the work is spread, with a callback for progress.
 
@@ -228,7 +250,8 @@ def stats(
     return Statistics(opened.location, classes, chosen, histograms, splits, tuple(failures))
 
 
-_Task = tuple[Sequence, str, tuple[int, ...]]  # a sequence, a field with classes, some of its frames
+# a sequence, a field with classes, some of its frames
+_Task = tuple[Sequence, str, tuple[int, ...]]
 
 
 def _tasks(sequence: Sequence, grid: str, every: int) -> list[_Task]:
@@ -238,7 +261,9 @@ def _tasks(sequence: Sequence, grid: str, every: int) -> list[_Task]:
     tasks: list[_Task] = []
     for field in ("labels", f"{grid}/labels"):
         frames = sequence.frames(field)[::every].tolist() if field in sequence.fields() else []
-        tasks += [(sequence, field, tuple(frames[i : i + _CHUNK])) for i in range(0, len(frames), _CHUNK)]
+        tasks += [
+            (sequence, field, tuple(frames[i : i + _CHUNK])) for i in range(0, len(frames), _CHUNK)
+        ]
     return tasks
 
 
@@ -254,10 +279,14 @@ def _count(task: _Task, classes: ClassTable) -> tuple[Histogram, list[tuple[str,
     return histogram, failures
 
 
-def _fail(task: _Task, message: str, classes: ClassTable) -> tuple[Histogram, list[tuple[str, str]]]:
+def _fail(
+    task: _Task, message: str, classes: ClassTable
+) -> tuple[Histogram, list[tuple[str, str]]]:
     """Return the result of frames whose workers failed."""
     sequence, field, frames = task
-    return Histogram.empty(classes), [(f"{sequence.path} {field} {frame:06d}", message) for frame in frames]
+    return Histogram.empty(classes), [
+        (f"{sequence.path} {field} {frame:06d}", message) for frame in frames
+    ]
 
 
 def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable) -> Histogram:
@@ -280,21 +309,32 @@ def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable
         has = f"{grid}{part}" in sequence.fields() and frame in sequence.frames(f"{grid}{part}")
         array = sequence.read(f"{grid}{part}", frame) if has else np.empty(0, np.uint8)
         who.append(len(array) if part == "velocity" else int(np.count_nonzero(array)))
-    return Histogram(nothing, np.bincount(labels, minlength=classes.num_channels), unknown, 0, 1, *who)
+    return Histogram(
+        nothing, np.bincount(labels, minlength=classes.num_channels), unknown, 0, 1, *who
+    )
 
 
 def _table_of(sequence: Sequence, field: str) -> ClassTable:
-    return sequence.metadata.classes if field == "labels" else sequence.classes_of(field.removesuffix("/labels"))
+    return (
+        sequence.metadata.classes
+        if field == "labels"
+        else sequence.classes_of(field.removesuffix("/labels"))
+    )
 
 
 def _common_table(tasks: Iterable[_Task], where: str) -> ClassTable:
-    """Return the class table of the grids, or of the points if there are no grids: points beside a prediction are counted in its classes."""
+    """Return the class table of the grids, or of the points if there are no grids: points beside a
+    prediction are counted in its classes.
+    """
     fields = {(sequence.path, field): _table_of(sequence, field) for sequence, field, _ in tasks}
     grids = [table for (_, field), table in fields.items() if field != "labels"]
     tables = {table.name: table for table in grids or fields.values()}
     if len(tables) > 1:
         raise FormatError(
-            f"{where}: classes", expected="one table", found=", ".join(sorted(tables)), advice=_COUNT_APART
+            f"{where}: classes",
+            expected="one table",
+            found=", ".join(sorted(tables)),
+            advice=_COUNT_APART,
         )
     (classes,) = tables.values()
     for table in fields.values():
@@ -317,5 +357,7 @@ def _choose_remap(remap: str | Remap | None, classes: ClassTable) -> Remap | Non
         return benchmark_remap(classes)
     chosen = remap_named(remap) if isinstance(remap, str) else remap
     if chosen.source.name != classes.name:
-        raise FormatError(f"remap {chosen.name}", expected=f"labels of {chosen.source.name}", found=classes.name)
+        raise FormatError(
+            f"remap {chosen.name}", expected=f"labels of {chosen.source.name}", found=classes.name
+        )
     return chosen

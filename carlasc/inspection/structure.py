@@ -1,7 +1,9 @@
-"""The structure of a scan: points on static, upright objects, which show the motion of the sensor; and the overlap of two structures.
+"""The structure of a scan: points on static, upright objects, which show the motion of the sensor;
+and the overlap of two structures.
 
-Points on the ground are left out: on flat ground, the rings of a LiDAR move with the sensor, so that they match best under
-the poses of a sensor that does not move. Points on moving objects, and points so near that they may be on the ego vehicle, are left out too.
+Points on the ground are left out: on flat ground, the rings of a LiDAR move with the sensor, so
+that they match best under the poses of a sensor that does not move. Points on moving objects, and
+points so near that they may be on the ego vehicle, are left out too.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
     """Read the structure of a scan.
 
     Args:
-        sequence: has the field `points`; `labels` and `flow` are used if the sequence has them and they fit.
+        sequence: has the field `points`; `labels` and `flow` are used if the sequence has them and
+            they fit.
         frame: frame number.
 
     Returns:
@@ -48,7 +51,10 @@ def static_structure(sequence: Sequence, frame: int) -> NDArray[np.float64]:
 
 
 def structure_of(
-    points: NDArray[np.floating], labels: NDArray[Any] | None, flow: NDArray[Any] | None, classes: ClassTable
+    points: NDArray[np.floating],
+    labels: NDArray[Any] | None,
+    flow: NDArray[Any] | None,
+    classes: ClassTable,
 ) -> NDArray[np.float64]:
     """Return the structure of a scan.
 
@@ -64,7 +70,8 @@ def structure_of(
     keep = within(points, points.dtype.type(MIN_RANGE_M), points.dtype.type(MAX_RANGE_M))
     if labels is not None and bool(labels.any()):
         keep &= _static_classes(classes)[
-            np.minimum(labels.astype(np.int64), np.iinfo(np.uint16).max)  # packed stores keep labels in uint8
+            # packed stores keep labels in uint8
+            np.minimum(labels.astype(np.int64), np.iinfo(np.uint16).max)
         ]
     else:
         keep[keep] = _is_upright(points[keep])
@@ -75,7 +82,10 @@ def structure_of(
 
 @cached(error_model="python")
 def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDArray[np.bool_]:
-    """Return (N,) which of (N, 3) points are between two distances from the sensor. Points that are not finite are not."""
+    """Return (N,) which of (N, 3) points are between two distances from the sensor.
+
+    Points that are not finite are not.
+    """
     found = np.empty(len(points), np.bool_)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -84,7 +94,9 @@ def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDA
 
 
 def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[Any] | None:
-    """Return a field of the points; None if it is missing or cannot be read (other checks report that)."""
+    """Return a field of the points; None if it is missing or cannot be read (other checks report
+    that).
+    """
     if field not in sequence.fields():
         return None
     try:
@@ -95,19 +107,26 @@ def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArra
 
 
 def _rows(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which rows of an (N, 3) mask are all true: `mask.all(axis=1)` in a seventh of its time."""
+    """Return which rows of an (N, 3) mask are all true: `mask.all(axis=1)` in a seventh of its
+    time.
+    """
     return mask[:, 0] & mask[:, 1] & mask[:, 2]
 
 
 def _static_classes(table: ClassTable) -> NDArray[np.bool_]:
-    """Return which ids are static objects above the ground. If no class contains only moving objects, all movable classes are left out."""
+    """Return which ids are static objects above the ground.
+
+    If no class contains only moving objects, all movable classes are left out.
+    """
     static = np.zeros(np.iinfo(np.uint16).max + 1, np.bool_)
     static[sorted(set(table.names) - {0} - table.ground - (table.moving or table.movable))] = True
     return static
 
 
 def _is_upright(points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return (N,) which points are on upright objects, from the range of heights in columns of 0.4 m."""
+    """Return (N,) which points are on upright objects, from the range of heights in columns of 0.4
+    m.
+    """
     columns = np.floor((points[:, :2] + MAX_RANGE_M) / _COLUMN_M).astype(np.int64)
     width = int(2 * MAX_RANGE_M / _COLUMN_M) + 1
     column = columns[:, 0] * width + columns[:, 1]
@@ -138,7 +157,9 @@ def overlap(occupied: NDArray[np.bool_], motion: Transform, points: NDArray[np.f
 
 
 @cached(error_model="python")
-def occupy(occupied: NDArray[np.bool_], points: NDArray[np.float64], reach_m: float, voxel_m: float) -> None:
+def occupy(
+    occupied: NDArray[np.bool_], points: NDArray[np.float64], reach_m: float, voxel_m: float
+) -> None:
     """Mark the cells of a grid that hold points; the arguments are those of `count_occupied`."""
     cells = len(occupied)
     for i in range(len(points)):

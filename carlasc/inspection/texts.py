@@ -1,7 +1,7 @@
 """The texts of cards and reports: files in `templates/`, with `$names` that are replaced by values.
 
-`string.Template` inserts values unchanged, so that a `$` or a brace in the name of a data set stays text. The caller escapes values for
-Markdown or HTML.
+`string.Template` inserts values unchanged, so that a `$` or a brace in the name of a data set stays
+text. The caller escapes values for Markdown or HTML.
 """
 
 from __future__ import annotations

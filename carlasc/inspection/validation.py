@@ -1,4 +1,6 @@
-"""Checks of a data set for known mistakes, with their likely causes; and whether the files of a grid are unchanged since its report."""
+"""Checks of a data set for known mistakes, with their likely causes; and whether the files of a
+grid are unchanged since its report.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,13 @@ from carlasc.groundtruth.reporting.report import Report, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values
-from carlasc.inspection.findings import SEVERITIES, Finding, SequenceReport, Severity, ValidationResult
+from carlasc.inspection.findings import (
+    SEVERITIES,
+    Finding,
+    SequenceReport,
+    Severity,
+    ValidationResult,
+)
 from carlasc.inspection.image_alignment import compare_images, judge_images
 from carlasc.inspection.pose_quality import PoseQuality, check_poses, check_times, describe_mounting
 from carlasc.inspection.structure import static_structure
@@ -65,7 +73,10 @@ class Freshness:
         self._rows[grid] = {frame: row for row, frame in enumerate(report.frames)}
 
     def compare(self, frame: int) -> None:
-        """Compare the files of one frame. Files that cannot be read are skipped: other checks report them."""
+        """Compare the files of one frame.
+
+        Files that cannot be read are skipped: other checks report them.
+        """
         seen: dict[str, str | None] = {}
         for grid, report in self.reports.items():
             row = self._rows[grid].get(frame)
@@ -79,7 +90,9 @@ class Freshness:
                     self._changed.setdefault((grid, field), []).append(frame)
 
     def _digest(self, field: str, frame: int) -> str | None:
-        """Return the digest of a field of a frame, "" if it does not exist; None if it cannot be read."""
+        """Return the digest of a field of a frame, "" if it does not exist; None if it cannot be
+        read.
+        """
         if frame not in self.sequence.frames(field):
             return ""
         try:
@@ -111,7 +124,9 @@ class Freshness:
                 yield self._finding(grid, f"the {name} that its report was made from", found)
         missing = set(self.sequence.frames(f"{grid}/labels").tolist()) - set(report.frames)
         if missing:
-            finding = self._finding(grid, "a report of all frames", f"{len(missing)} frames that it does not cover")
+            finding = self._finding(
+                grid, "a report of all frames", f"{len(missing)} frames that it does not cover"
+            )
             yield replace(finding, severity="note")
 
     def _finding(self, grid: str, expected: str, found: str) -> Finding:
@@ -122,7 +137,8 @@ class Freshness:
 _SAMPLES = 40  # frames per sequence whose contents are read by default
 _POOR_SHARE = 0.5  # a smaller share of points in voxels of their class is an error,
 _DOUBTFUL_SHARE = 0.7  # and a smaller one than this a warning
-_COARSE_M = 0.75  # coarser voxels contain several classes and much free space, so that a small share is no mistake
+# coarser voxels contain several classes and much free space, so that a small share is no mistake
+_COARSE_M = 0.75
 _NO_OVERLAP = 0.3  # a smaller overlap of scans under the poses is a warning
 
 Progress = Callable[[int, int], None]
@@ -134,14 +150,17 @@ def validate(
     every: int | None = None,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> ValidationResult:
-    """Check a data set: files against each other, values, poses, times, and scans against poses and grids.
+    """Check a data set: files against each other, values, poses, times, and scans against poses and
+    grids.
 
-    Names, numbers of frames, poses, times and the sizes of local files are checked for all frames; contents are read for some frames. A
-    file that cannot be read is a finding; the other files are still checked.
+    Names, numbers of frames, poses, times and the sizes of local files are checked for all frames;
+    contents are read for some frames. A file that cannot be read is a finding; the other files are
+    still checked.
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
-        every: read the contents of every N-th frame; 1 reads all, None about forty frames per sequence.
+        every: read the contents of every N-th frame; 1 reads all, None about forty frames per
+            sequence.
         run: how the work is spread over the sequences, with a callback for progress.
 
     Returns:
@@ -185,11 +204,18 @@ class _CheckedFrames:
 
 
 def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
-    found = np.unique(np.concatenate([np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]))
+    found = np.unique(
+        np.concatenate(
+            [np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]
+        )
+    )
     frames = tuple(found.tolist())
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
-    # opening a local file is cheap; a frame of a packed store must be decoded, and has the right size anyway
-    return _CheckedFrames(sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read)
+    # opening a local file is cheap; a frame of a packed store must be decoded, and has the right
+    # size anyway
+    return _CheckedFrames(
+        sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read
+    )
 
 
 def _fields(sequence: Sequence) -> list[str]:
@@ -204,7 +230,15 @@ _Examined = tuple[list[Finding], SequenceReport]
 
 def _fail(plan: _CheckedFrames, message: str) -> _Examined:
     """Return the result of a sequence that no worker could check."""
-    finding = Finding("error", "check", plan.sequence.path, plan.sequence.location, "a check that ends", message, "")
+    finding = Finding(
+        "error",
+        "check",
+        plan.sequence.path,
+        plan.sequence.location,
+        "a check that ends",
+        message,
+        "",
+    )
     return [finding], SequenceReport(plan.sequence.path, len(plan.frames), 0, {}, None)
 
 
@@ -239,14 +273,24 @@ def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _
     if poses is not None:
         found.extend(_judge_poses(sequence, poses))
     step()
-    shares = {name: diagnosis.share for name, diagnosis in diagnoses.items() if not math.isnan(diagnosis.share)}
+    shares = {
+        name: diagnosis.share
+        for name, diagnosis in diagnoses.items()
+        if not math.isnan(diagnosis.share)
+    }
     pose_share = poses.share if poses is not None and poses.pairs else None
     quality = None if poses is None else poses.quality
     images = compare_images(sequence) if described else []
     found.extend(judge_images(sequence, images))
     about = {agreement.camera: str(agreement) for agreement in images}
     return found, SequenceReport(
-        sequence.path, len(plan.frames), len(plan.read), shares, pose_share, *_figures(quality), about
+        sequence.path,
+        len(plan.frames),
+        len(plan.read),
+        shares,
+        pose_share,
+        *_figures(quality),
+        about,
     )
 
 
@@ -254,7 +298,11 @@ def _figures(quality: PoseQuality | None) -> tuple[float | None, float | None, d
     """Return what a report says about the poses."""
     if quality is None:
         return None, None, {}
-    return quality.disagreement_m, quality.refined_m, {} if quality.mounting is None else quality.mounting.describe()
+    return (
+        quality.disagreement_m,
+        quality.refined_m,
+        {} if quality.mounting is None else quality.mounting.describe(),
+    )
 
 
 def _is_described(sequence: Sequence) -> bool:
@@ -268,7 +316,10 @@ def _is_described(sequence: Sequence) -> bool:
 def _measure_grids(
     sequence: Sequence, frame: int, evidence: dict[str, GridEvidence], below: dict[str, GroundBelow]
 ) -> None:
-    """Compare the points of a frame with its grids. Files that cannot be read are skipped: other checks report them."""
+    """Compare the points of a frame with its grids.
+
+    Files that cannot be read are skipped: other checks report them.
+    """
     if "points" not in sequence.fields():
         return
     try:
@@ -277,7 +328,8 @@ def _measure_grids(
         return
     ground = ground_of(points, labels, sequence.metadata.classes.ground)
     for name in sequence.grids:
-        if sequence.predicted_by(name) is not None:  # a network makes mistakes, and may have other classes
+        # a network makes mistakes, and may have other classes
+        if sequence.predicted_by(name) is not None:
             continue
         try:
             grid = sequence.grid(name, frame)
@@ -287,8 +339,12 @@ def _measure_grids(
         below.setdefault(name, GroundBelow(grid.spec)).add(ground)
 
 
-def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArray[np.unsignedinteger] | None]:
-    """Read the points that a grid is made from: finite, and within the ranges given in carlasc.json."""
+def _points(
+    sequence: Sequence, frame: int
+) -> tuple[NDArray[np.float32], NDArray[np.unsignedinteger] | None]:
+    """Read the points that a grid is made from: finite, and within the ranges given in
+    carlasc.json.
+    """
     scan = sequence.scan(frame, ("labels",))
     x, y, z = scan.points.T.astype(np.float64)
     distance = np.sqrt(x * x + y * y + z * z)
@@ -300,7 +356,11 @@ def _points(sequence: Sequence, frame: int) -> tuple[NDArray[np.float32], NDArra
 
 def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
     """Measure the overlap of scans under their poses; None without scans or valid poses."""
-    if "points" not in sequence.fields() or layout.POSES not in sequence.documents() or not sequence.metadata.has_rays:
+    if (
+        "points" not in sequence.fields()
+        or layout.POSES not in sequence.documents()
+        or not sequence.metadata.has_rays
+    ):
         return None
     frames = sequence.frames("points").tolist()
     try:
@@ -330,14 +390,18 @@ def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
     return diagnose_poses(structure, poses, points=points, seconds=seconds)
 
 
-def _judge_grid(sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDiagnosis) -> Iterator[Finding]:
+def _judge_grid(
+    sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDiagnosis
+) -> Iterator[Finding]:
     where = f"{sequence.location}/{grid}"
     expected = "points in voxels of their class"
     share = f"{diagnosis.share:.1%} of the points in known voxels, over {diagnosis.frames} frames"
     if not diagnosis.frames:
         return
     other_classes = diagnosis.occupied_share > max(_DOUBTFUL_SHARE, diagnosis.share + 0.2)
-    if diagnosis.mistake is not None and not (other_classes and diagnosis.corrected_share < _POOR_SHARE):
+    if diagnosis.mistake is not None and not (
+        other_classes and diagnosis.corrected_share < _POOR_SHARE
+    ):
         found = f"{share}; the likely cause is {diagnosis.mistake}: after correction, {diagnosis.corrected_share:.1%}"
         advice = "correct the program that writes the points or the grid, or make the grid again with `carlasc regrid`"
         yield Finding("error", "scan-in-voxels", sequence.path, where, expected, found, advice)
@@ -345,16 +409,16 @@ def _judge_grid(sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDi
         if other_classes:
             found = f"{share}, but {diagnosis.occupied_share:.1%} in occupied voxels; the likely cause is labels of another class table, or in another order"
         else:
-            found = (
-                f"{share}, and no known correction raises it; the likely cause is scans and grids of different frames"
-            )
+            found = f"{share}, and no known correction raises it; the likely cause is scans and grids of different frames"
         severity: Severity = "error" if diagnosis.share < _POOR_SHARE else "warning"
         advice = "draw both with `carlasc render`, or make the grid again with `carlasc regrid`"
         yield Finding(severity, "scan-in-voxels", sequence.path, where, expected, found, advice)
 
 
 def _largest_edge(spec: GridSpec) -> float:
-    """Return the length of the longest edge of a voxel in metres; in a cylindrical grid, at half its radius."""
+    """Return the length of the longest edge of a voxel in metres; in a cylindrical grid, at half
+    its radius.
+    """
     edges = spec.voxel_size.copy()
     if spec.coordinates == "cylindrical":
         edges[1] *= (spec.lower[0] + spec.upper[0]) / 2
@@ -369,14 +433,28 @@ def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Findi
     described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)
     if diagnosis.correction is not None:
         found = f"{diagnosis.share_there:.1%} of a scan's structure overlaps that of an earlier scan; the likely cause is {diagnosis.correction.name}: after correction, {diagnosis.corrected_share:.1%}"
-        yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, diagnosis.correction.advice)
+        yield Finding(
+            "error",
+            "poses-on-scans",
+            sequence.path,
+            where,
+            expected,
+            found,
+            diagnosis.correction.advice,
+        )
     elif described is not None:
         yield Finding("warning", "poses-on-scans", sequence.path, where, expected, *described)
     elif quality is not None and quality.is_poor:
         found = f"scans that are {100 * (quality.disagreement_m or 0):.1f} cm from the surfaces that their neighbours saw; under refined poses {100 * (quality.refined_m or 0):.1f} cm"
         advice = "write refined poses with `carlasc refine` before you stack scans yourself; `carlasc regrid` refines them anyway"
         yield Finding(
-            "warning", "pose-jitter", sequence.path, where, "scans that agree with their neighbours", found, advice
+            "warning",
+            "pose-jitter",
+            sequence.path,
+            where,
+            "scans that agree with their neighbours",
+            found,
+            advice,
         )
     elif diagnosis.offset_m is not None:
         x, y, z = diagnosis.offset_m
@@ -385,7 +463,5 @@ def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Findi
         yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, advice)
     elif diagnosis.pairs and diagnosis.share < _NO_OVERLAP:
         found = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan, and no known correction raises it"
-        advice = (
-            "check that the poses belong to this sequence, or estimate them with `carlasc convert --poses kiss-icp`"
-        )
+        advice = "check that the poses belong to this sequence, or estimate them with `carlasc convert --poses kiss-icp`"
         yield Finding("warning", "poses-on-scans", sequence.path, where, expected, found, advice)

@@ -1,4 +1,6 @@
-"""Scores of grids: confusion, completeness, rays, segments, uncertainty, consistency over time; conventions of benchmarks; whole data sets."""
+"""Scores of grids: confusion, completeness, rays, segments, uncertainty, consistency over time;
+conventions of benchmarks; whole data sets.
+"""
 
 import lazy_loader
 

@@ -1,4 +1,6 @@
-"""Scores of the actor and the velocity of each voxel: panoptic quality, tracking over time, velocity errors."""
+"""Scores of the actor and the velocity of each voxel: panoptic quality, tracking over time,
+velocity errors.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +34,11 @@ class ActorScore:
     Attributes:
         panoptic: panoptic quality of each class.
         tracking: quality of segmentation and tracking (LSTQ) over the frames of each sequence.
-        velocity_m_s: mean length of the velocity error, over voxels that move in the ground truth, m/s; NaN if no voxel moves.
+        velocity_m_s: mean length of the velocity error, over voxels that move in the ground truth,
+            m/s; NaN if no voxel moves.
         velocity_by_class: mean velocity error by class name, m/s.
-        velocity_by_speed: mean velocity error by the lower bound of the band of the true speed, m/s.
+        velocity_by_speed: mean velocity error by the lower bound of the band of the true speed,
+            m/s.
     """
 
     panoptic: PanopticScore
@@ -45,14 +49,23 @@ class ActorScore:
 
     def to_dict(self, classes: ClassTable) -> dict[str, Any]:
         """Return all scores by name, as fractions and m/s, for JSON; None for undefined scores."""
-        pq = {name: self.panoptic.pq[label] for label, name in classes.names.items() if label < len(self.panoptic.pq)}
+        pq = {
+            name: self.panoptic.pq[label]
+            for label, name in classes.names.items()
+            if label < len(self.panoptic.pq)
+        }
         means = {what: self.panoptic.mean(what) for what in ("pq", "sq", "rq")}
         figures = means | {"pq_things": self.panoptic.mean(which="things")} | vars(self.tracking)
         figures |= {"velocity_m_s": self.velocity_m_s}
         by_speed = {f"from {low:g} m/s": value for low, value in self.velocity_by_speed.items()}
-        groups = {"class_pq": pq, "velocity_by_class": self.velocity_by_class, "velocity_by_speed": by_speed}
+        groups = {
+            "class_pq": pq,
+            "velocity_by_class": self.velocity_by_class,
+            "velocity_by_speed": by_speed,
+        }
         return {name: _number(value) for name, value in figures.items()} | {
-            name: {key: _number(value) for key, value in group.items()} for name, group in groups.items()
+            name: {key: _number(value) for key, value in group.items()}
+            for name, group in groups.items()
         }
 
 
@@ -69,7 +82,8 @@ class ActorScores:
         k, free = convention.num_classes, convention.free
         self.panoptic = PanopticQuality(k, things, free=free)
         self.tracking = TrackingQuality(k, things, unaveraged={free})
-        self.errors = np.zeros((2, k, len(SPEEDS_M_S)))  # sum of errors and number of voxels, by class and speed band
+        # sum of errors and number of voxels, by class and speed band
+        self.errors = np.zeros((2, k, len(SPEEDS_M_S)))
 
     @staticmethod
     def check(pair: Pair) -> None:
@@ -79,7 +93,10 @@ class ActorScores:
             ArgumentError: one of them has no field `instance`.
         """
         for side in (pair.truth, pair.prediction):
-            if not isinstance(side, SequenceGrid) or f"{side.grid}/instance" not in side.sequence.fields():
+            if (
+                not isinstance(side, SequenceGrid)
+                or f"{side.grid}/instance" not in side.sequence.fields()
+            ):
                 raise ArgumentError(
                     "actors", expected="grids with instances for prediction and ground truth", found=f"no instances in {side.location}",
                     advice="make the ground truth with `regrid --keep-actors`",
@@ -91,7 +108,8 @@ class ActorScores:
         Args:
             pair: prediction and ground truth.
             frame: frame number.
-            prepared: predicted and true classes of the convention, (X, Y, Z), and the mask of scored voxels, (X, Y, Z) bool.
+            prepared: predicted and true classes of the convention, (X, Y, Z), and the mask of
+                scored voxels, (X, Y, Z) bool.
 
         Raises:
             FormatError: a file does not fit its grid.
@@ -103,14 +121,18 @@ class ActorScores:
                 known[name] = side.sequence.read(f"{side.grid}/instance", frame)
                 moving[name] = _dense(side, frame, truth.shape)
         numberless = np.isin(truth, sorted(self.panoptic.things)) & (known["truth"] == 0)
-        counted = counted & ~numberless  # without voxels of movable classes whose actor is not known
+        # without voxels of movable classes whose actor is not known
+        counted = counted & ~numberless
         sides = (prediction, known["prediction"]), (truth, known["truth"])
         self.panoptic.update(*sides, mask=counted)
         self.tracking.update(pair.truth.path, *sides, mask=counted)
         moves = counted.reshape(-1) & (moving["truth"] != 0).any(axis=1)
         speed = np.linalg.norm(moving["truth"][moves], axis=1)
         error = np.linalg.norm(moving["prediction"][moves] - moving["truth"][moves], axis=1)
-        place = truth.reshape(-1)[moves].astype(np.int64), np.searchsorted(SPEEDS_M_S, speed, side="right") - 1
+        place = (
+            truth.reshape(-1)[moves].astype(np.int64),
+            np.searchsorted(SPEEDS_M_S, speed, side="right") - 1,
+        )
         np.add.at(self.errors[0], place, error)
         np.add.at(self.errors[1], place, 1)
 
@@ -123,7 +145,10 @@ class ActorScores:
     def compute(self) -> ActorScore:
         """Return the scores of all added frames."""
         total, count = self.errors
-        by_class, by_speed = ratio(total.sum(axis=1), count.sum(axis=1)), ratio(total.sum(axis=0), count.sum(axis=0))
+        by_class, by_speed = (
+            ratio(total.sum(axis=1), count.sum(axis=1)),
+            ratio(total.sum(axis=0), count.sum(axis=0)),
+        )
         names = self.convention.classes.names
         return ActorScore(
             self.panoptic.compute(),
@@ -138,11 +163,15 @@ def movable_of(convention: Convention, table: ClassTable) -> frozenset[int]:
     """Return the classes of a convention to which the movable classes of a table are mapped."""
     mapping = convention.maps[table.name]
     found = {mapping[label] for label in table.movable if label in mapping}
-    return frozenset(label for label in found if label in convention.averaged and label != convention.free)
+    return frozenset(
+        label for label in found if label in convention.averaged and label != convention.free
+    )
 
 
 def _dense(side: SequenceGrid, frame: int, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return (V, 3) float32 velocities of voxels, m/s; zero where nothing moves or the grid has no velocities."""
+    """Return (V, 3) float32 velocities of voxels, m/s; zero where nothing moves or the grid has no
+    velocities.
+    """
     name = f"{side.grid}/velocity"
     if name not in side.sequence.fields() or frame not in side.sequence.frames(name):
         return np.zeros((math.prod(size), 3), np.float32)

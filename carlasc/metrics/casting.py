@@ -1,6 +1,7 @@
 """Casting rays through voxel grids: the first occupied voxel on each ray and its distance.
 
-For arrays, compiled code walks ray by ray on the CPU. For torch tensors, all rays take one step at a time on the device of the tensors.
+For arrays, compiled code walks ray by ray on the CPU. For torch tensors, all rays take one step at
+a time on the device of the tensors.
 """
 
 from __future__ import annotations
@@ -19,14 +20,18 @@ if TYPE_CHECKING:
     import torch
 
 
-_STEPS = 10  # number of pitches of the first part: for a sensor 1 m above flat ground, they hit it every metre from 1 m to 10 m
+# number of pitches of the first part: for a sensor 1 m above flat ground, they hit it every metre
+# from 1 m to 10 m
+_STEPS = 10
 _HIGHEST_RAD = 0.21  # the last pitch is the first one at or above this angle
 
 
 def rayiou_directions() -> NDArray[np.float64]:
-    """Return the directions of the rays that RayIoU casts from each origin (SparseOcc's evaluation script).
+    """Return the directions of the rays that RayIoU casts from each origin (SparseOcc's evaluation
+    script).
 
-    They are similar to a LiDAR: 360 azimuths, one degree apart, for each of 39 pitches from -45 to 12.55 degrees.
+    They are similar to a LiDAR: 360 azimuths, one degree apart, for each of 39 pitches from -45 to
+    12.55 degrees.
 
     Returns:
         (14040, 3) float64 unit vectors, pitch by pitch.
@@ -35,7 +40,9 @@ def rayiou_directions() -> NDArray[np.float64]:
     while pitches[-1] < _HIGHEST_RAD:
         pitches.append(pitches[-1] + (pitches[-1] - pitches[-2]))
     pitch, azimuth = np.meshgrid(pitches, np.deg2rad(np.arange(360.0)), indexing="ij")
-    directions = np.stack([np.cos(pitch) * np.cos(azimuth), np.cos(pitch) * np.sin(azimuth), np.sin(pitch)], axis=-1)
+    directions = np.stack(
+        [np.cos(pitch) * np.cos(azimuth), np.cos(pitch) * np.sin(azimuth), np.sin(pitch)], axis=-1
+    )
     return directions.reshape(-1, 3)
 
 
@@ -47,10 +54,12 @@ def cast_rays(
     *,
     free: int = 0,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Cast rays through grids of the same geometry, and return the first occupied voxel on each ray.
+    """Cast rays through grids of the same geometry, and return the first occupied voxel on each
+    ray.
 
-    For each ray, the result is the first voxel that is not free, possibly the voxel of the origin. If all voxels are free, it is the last
-    voxel before the ray leaves the grid. A ray that starts outside the grid begins at the point where it enters the grid.
+    For each ray, the result is the first voxel that is not free, possibly the voxel of the origin.
+    If all voxels are free, it is the last voxel before the ray leaves the grid. A ray that starts
+    outside the grid begins at the point where it enters the grid.
 
     Args:
         grids: (G, X, Y, Z) class ids of up to 8 grids; rays are cast through all grids in one pass.
@@ -60,17 +69,26 @@ def cast_rays(
         free: the id of free space.
 
     Returns:
-        (G, O * R) flat index of the voxel of each ray, -1 if the ray does not enter the grid; and (G, O * R) distance in metres from
-        the origin to the point where the ray leaves that voxel. The rays of each origin are consecutive.
+        (G, O * R) flat index of the voxel of each ray, -1 if the ray does not enter the grid; and
+        (G, O * R) distance in metres from the origin to the point where the ray leaves that voxel.
+        The rays of each origin are consecutive.
 
     Raises:
         ArgumentError: the grid is cylindrical, or the shapes do not match.
     """
     if spec.coordinates != "cartesian":
-        raise ArgumentError("grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates)
+        raise ArgumentError(
+            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
+        )
     if grids.ndim != 4 or grids.shape[1:] != spec.size:
-        raise ArgumentError("grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=str(grids.shape))
-    starts, lower, voxel = np.asarray(origins, np.float64).reshape(-1, 3), np.array(spec.lower), spec.voxel_size
+        raise ArgumentError(
+            "grids", expected=f"shape (G, {', '.join(map(str, spec.size))})", found=str(grids.shape)
+        )
+    starts, lower, voxel = (
+        np.asarray(origins, np.float64).reshape(-1, 3),
+        np.array(spec.lower),
+        spec.voxel_size,
+    )
     steps = np.asarray(directions, np.float64).reshape(-1, 3)
     solid = np.zeros(grids.shape[1:], np.uint8)
     for bit, grid in enumerate(grids):
@@ -79,14 +97,25 @@ def cast_rays(
         raise ArgumentError("grids", expected="at most 8 grids", found=str(len(grids)))
     found = np.full((len(grids), len(starts) * len(steps)), -1, np.int64)
     depth = np.zeros(found.shape)
-    _cast(solid.reshape(-1), np.array(spec.size), (starts - lower) / voxel, steps / voxel, found, depth)
+    _cast(
+        solid.reshape(-1),
+        np.array(spec.size),
+        (starts - lower) / voxel,
+        steps / voxel,
+        found,
+        depth,
+    )
     return found, depth
 
 
 def follow_rays(
-    solid: NDArray[np.uint8], spec: GridSpec, origin: NDArray[np.floating], points: NDArray[np.floating]
+    solid: NDArray[np.uint8],
+    spec: GridSpec,
+    origin: NDArray[np.floating],
+    points: NDArray[np.floating],
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Trace measured rays through a grid: the first solid voxel on each ray, and the content of the voxels before the measured point.
+    """Trace measured rays through a grid: the first solid voxel on each ray, and the content of the
+    voxels before the measured point.
 
     Args:
         solid: (X, Y, Z) uint8 bits of the content of a voxel; a ray passes voxels with 0.
@@ -95,26 +124,34 @@ def follow_rays(
         points: (N, 3) metres, measured points inside the grid.
 
     Returns:
-        (N,) float64 distance in metres from the origin to the middle of the path of the ray through its first solid voxel, which may be
-        behind the point; infinite if no voxel on the ray is solid. And (N,) uint8 combined bits of all voxels that the ray passes before
-        the point, without the voxel of the point and its 26 neighbours.
+        (N,) float64 distance in metres from the origin to the middle of the path of the ray through
+        its first solid voxel, which may be behind the point; infinite if no voxel on the ray is
+        solid. And (N,) uint8 combined bits of all voxels that the ray passes before the point,
+        without the voxel of the point and its 26 neighbours.
 
     Raises:
         ArgumentError: the grid is cylindrical.
     """
     if spec.coordinates != "cartesian":
-        raise ArgumentError("grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates)
+        raise ArgumentError(
+            "grid", expected="a Cartesian grid to cast rays through", found=spec.coordinates
+        )
     ends, lower, voxel = np.asarray(points, np.float64), np.array(spec.lower), spec.voxel_size
     first, passed = np.full(len(ends), np.inf), np.zeros(len(ends), np.uint8)
     start, size = (np.asarray(origin, np.float64) - lower) / voxel, np.array(spec.size)
     lengths = np.linalg.norm(ends - origin, axis=1)
-    _follow(np.ascontiguousarray(solid), size, start, (ends - lower) / voxel, lengths, first, passed)
+    _follow(
+        np.ascontiguousarray(solid), size, start, (ends - lower) / voxel, lengths, first, passed
+    )
     return first, passed
 
 
 @cached
 def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[no-untyped-def]
-    """Walk each ray from voxel to voxel, in voxel units. The parameter t is 0 at the origin and 1 at the point."""
+    """Walk each ray from voxel to voxel, in voxel units.
+
+    The parameter t is 0 at the origin and 1 at the point.
+    """
     step, cell, last = np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64)
     crossing, between = np.empty(3), np.empty(3)
     for r in range(len(ends)):
@@ -130,7 +167,9 @@ def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[n
             cell[axis] = min(max(int(np.floor(place)), 0), size[axis] - 1)
             last[axis] = min(max(int(np.floor(ends[r, axis])), 0), size[axis] - 1)
             forward = step[axis] > 0
-            crossing[axis] = (cell[axis] + forward - start[axis]) / step[axis] if step[axis] != 0 else np.inf
+            crossing[axis] = (
+                (cell[axis] + forward - start[axis]) / step[axis] if step[axis] != 0 else np.inf
+            )
             between[axis] = np.abs(1 / step[axis]) if step[axis] != 0 else np.inf
         while True:
             axis = 0
@@ -157,7 +196,10 @@ def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[n
 
 @cached
 def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-def]
-    """Walk each ray from voxel to voxel (Amanatides and Woo), in voxel units. The distance along the ray is in metres."""
+    """Walk each ray from voxel to voxel (Amanatides and Woo), in voxel units.
+
+    The distance along the ray is in metres.
+    """
     num_grids = len(found)
     everything = (1 << num_grids) - 1
     nx, ny, nz = size[0], size[1], size[2]
@@ -181,7 +223,8 @@ def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-
             ty = (j + (dy > 0) - y) / dy if dy != 0 else np.inf
             tz = (k + (dz > 0) - z) / dz if dz != 0 else np.inf
             sx, sy, sz = np.abs(1 / dx), np.abs(1 / dy), np.abs(1 / dz)
-            # number of faces before the ray leaves the grid: counting down takes one comparison per step
+            # number of faces before the ray leaves the grid: counting down takes one comparison per
+            # step
             left_x, left_y, left_z = (
                 (nx - 1 - i if dx > 0 else i),
                 (ny - 1 - j if dy > 0 else j),
@@ -244,13 +287,16 @@ def cast_rays_on_device(
         free: the id of free space.
 
     Returns:
-        (G, O * R) int64 flat voxel index of each ray, and (G, O * R) float64 distance in metres to the point where the ray leaves it.
+        (G, O * R) int64 flat voxel index of each ray, and (G, O * R) float64 distance in metres to
+        the point where the ray leaves it.
     """
     import torch
 
     device, double = grids.device, torch.float64
     voxel = spec.voxel_size
-    starts = torch.as_tensor((np.asarray(origins, np.float64) - np.array(spec.lower)) / voxel, device=device)
+    starts = torch.as_tensor(
+        (np.asarray(origins, np.float64) - np.array(spec.lower)) / voxel, device=device
+    )
     steps = torch.as_tensor(np.asarray(directions, np.float64) / voxel, device=device)
     start, step = starts.repeat_interleave(len(steps), dim=0), steps.repeat(len(starts), 1)
     size = torch.tensor(spec.size, device=device)
@@ -269,7 +315,9 @@ def cast_rays_on_device(
     while len(walking):
         distance, axis = to_face[walking].min(dim=1)
         flat = (cell[walking] * strides).sum(dim=1)
-        further = cell[walking].scatter_add(1, axis[:, None], sign[walking].gather(1, axis[:, None]))
+        further = cell[walking].scatter_add(
+            1, axis[:, None], sign[walking].gather(1, axis[:, None])
+        )
         leaves = ((further < 0) | (further >= size)).any(dim=1)
         ends = (solid[:, flat] | leaves) & open_rays[:, walking]
         for g in range(len(grids)):

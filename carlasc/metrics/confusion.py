@@ -1,6 +1,8 @@
-"""The confusion matrix, counting for NumPy arrays and torch tensors, and the scores computed from it.
+"""The confusion matrix, counting for NumPy arrays and torch tensors, and the scores computed from
+it.
 
-Matrices of frames, sequences and processes can be added. Scores are computed from the sum, as in the paper for a whole split.
+Matrices of frames, sequences and processes can be added. Scores are computed from the sum, as in
+the paper for a whole split.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ Absent = Literal["zero", "skip"]
 
 @dataclass(frozen=True)
 class Completeness:
-    """Scores of occupied against free space: all classes except free count as one. NaN if the denominator is zero.
+    """Scores of occupied against free space: all classes except free count as one.
+
+    NaN if the denominator is zero.
 
     Attributes:
         precision: share of the voxels predicted as occupied that are occupied.
@@ -50,19 +54,26 @@ class ConfusionMatrix:
         counts: (K, K) int64, ground truth in rows, prediction in columns.
     """
 
-    def __init__(self, num_classes: int, *, free: int = 0, counts: NDArray[np.integer] | None = None) -> None:
+    def __init__(
+        self, num_classes: int, *, free: int = 0, counts: NDArray[np.integer] | None = None
+    ) -> None:
         """Start with an empty matrix, or with `counts`.
 
         Raises:
-            ArgumentError: `num_classes` is less than 1, `free` is not in 0..K-1, or `counts` has another shape.
+            ArgumentError: `num_classes` is less than 1, `free` is not in 0..K-1, or `counts` has
+                another shape.
         """
         if num_classes < 1:
             raise ArgumentError("num_classes", expected="1 or more", found=str(num_classes))
         if not 0 <= free < num_classes:
-            raise ArgumentError("free", expected=f"a class id in 0..{num_classes - 1}", found=str(free))
+            raise ArgumentError(
+                "free", expected=f"a class id in 0..{num_classes - 1}", found=str(free)
+            )
         if counts is not None and np.shape(counts) != (num_classes, num_classes):
             raise ArgumentError(
-                "counts", expected=f"the shape {(num_classes, num_classes)}", found=str(np.shape(counts))
+                "counts",
+                expected=f"the shape {(num_classes, num_classes)}",
+                found=str(np.shape(counts)),
             )
         self.num_classes = num_classes
         self.free = free
@@ -78,7 +89,8 @@ class ConfusionMatrix:
         Args:
             prediction: any shape, integer class ids.
             truth: the same shape, integer class ids.
-            mask: the same shape, bool: only these voxels are counted; None counts all. The ids of other voxels may have any value.
+            mask: the same shape, bool: only these voxels are counted; None counts all. The ids of
+                other voxels may have any value.
 
         Returns:
             The matrix itself.
@@ -96,7 +108,9 @@ class ConfusionMatrix:
         device = device_of(prediction, truth, mask)
         if device is None:  # torch tensors on the CPU convert to NumPy without a copy
             known = None if mask is None else np.asarray(mask)
-            self.counts += count_arrays(np.asarray(prediction), np.asarray(truth), known, self.num_classes)
+            self.counts += count_arrays(
+                np.asarray(prediction), np.asarray(truth), known, self.num_classes
+            )
         else:
             self.counts += count_tensors(device, prediction, truth, mask, self.num_classes)
         return self
@@ -110,7 +124,9 @@ class ConfusionMatrix:
         return self.__iadd__(other)
 
     def compute(self) -> dict[str, float]:
-        """Return the usual scores by name: `miou`, `accuracy`, and `precision`, `recall` and `iou` of occupied space."""
+        """Return the usual scores by name: `miou`, `accuracy`, and `precision`, `recall` and `iou`
+        of occupied space.
+        """
         return {"miou": self.miou, "accuracy": self.accuracy, **vars(self.completeness())}
 
     def __iadd__(self, other: ConfusionMatrix) -> Self:
@@ -130,7 +146,9 @@ class ConfusionMatrix:
 
     def __eq__(self, other: object) -> bool:
         return (
-            isinstance(other, ConfusionMatrix) and self.free == other.free and np.array_equal(self.counts, other.counts)
+            isinstance(other, ConfusionMatrix)
+            and self.free == other.free
+            and np.array_equal(self.counts, other.counts)
         )
 
     __hash__ = None  # type: ignore[assignment]  # matrices are mutable
@@ -160,31 +178,44 @@ class ConfusionMatrix:
 
     @property
     def iou(self) -> NDArray[np.float64]:
-        """(K,) intersection over union per class; NaN for classes that do not occur in the prediction or the ground truth."""
-        return ratio(self.true_positives, self.true_positives + self.false_positives + self.false_negatives)
+        """(K,) intersection over union per class; NaN for classes that do not occur in the
+        prediction or the ground truth.
+        """
+        return ratio(
+            self.true_positives, self.true_positives + self.false_positives + self.false_negatives
+        )
 
     @property
     def precision(self) -> NDArray[np.float64]:
-        """(K,) precision per class: share of the predicted voxels that are correct; NaN for classes that are never predicted."""
+        """(K,) precision per class: share of the predicted voxels that are correct; NaN for classes
+        that are never predicted.
+        """
         return ratio(self.true_positives, self.counts.sum(axis=0))
 
     @property
     def recall(self) -> NDArray[np.float64]:
-        """(K,) recall per class: share of the true voxels that are predicted correctly; NaN for classes without true voxels."""
+        """(K,) recall per class: share of the true voxels that are predicted correctly; NaN for
+        classes without true voxels.
+        """
         return ratio(self.true_positives, self.counts.sum(axis=1))
 
     @property
     def miou(self) -> float:
-        """Mean IoU as in the paper: over all classes, including free. Absent classes count as zero."""
+        """Mean IoU as in the paper: over all classes, including free.
+
+        Absent classes count as zero.
+        """
         return self.mean_iou()
 
     def mean_iou(self, *, with_free: bool = True, absent: Absent = "zero") -> float:
         """Return the mean IoU over the classes.
 
         Args:
-            with_free: whether free space is in the mean (in the paper of CarlaSC it is, in SemanticKITTI not).
-            absent: treatment of classes that do not occur in the prediction or the ground truth: "zero" (the paper and SemanticKITTI)
-                counts them as 0, "skip" leaves them out of the mean. The mean over no class is NaN.
+            with_free: whether free space is in the mean (in the paper of CarlaSC it is, in
+                SemanticKITTI not).
+            absent: treatment of classes that do not occur in the prediction or the ground truth:
+                "zero" (the paper and SemanticKITTI) counts them as 0, "skip" leaves them out of the
+                mean. The mean over no class is NaN.
 
         Raises:
             ArgumentError: `absent` has another value.
@@ -205,7 +236,9 @@ class ConfusionMatrix:
         hit = self.counts[np.ix_(occupied, occupied)].sum()
         predicted, true = self.counts[:, occupied].sum(), self.counts[occupied].sum()
         return Completeness(
-            float(ratio(hit, predicted)), float(ratio(hit, true)), float(ratio(hit, predicted + true - hit))
+            float(ratio(hit, predicted)),
+            float(ratio(hit, true)),
+            float(ratio(hit, predicted + true - hit)),
         )
 
 
@@ -222,7 +255,9 @@ def check_absent(absent: str) -> None:
 def ratio(numerator: Any, denominator: Any) -> NDArray[np.float64]:
     """Return the quotient; NaN where the denominator is zero."""
     numerator, denominator = np.asarray(numerator, np.float64), np.asarray(denominator, np.float64)
-    return np.divide(numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0)
+    return np.divide(
+        numerator, denominator, out=np.full(denominator.shape, np.nan), where=denominator > 0
+    )
 
 
 @dataclass(frozen=True)
@@ -230,7 +265,8 @@ class TruthScore:
     """The comparison of ground truth with a reference. Scores of frames are added with `+`.
 
     Attributes:
-        matrix: confusion matrix over the voxels that are known in both grids, with the reference in rows.
+        matrix: confusion matrix over the voxels that are known in both grids, with the reference in
+            rows.
         known: number of voxels that are known in the grid.
         known_reference: number of voxels that are known in the reference.
         known_both: number of voxels that are known in both.
@@ -243,7 +279,9 @@ class TruthScore:
 
     @property
     def coverage(self) -> float:
-        """Share of the known voxels of the reference that are also known in the grid; NaN if the reference has no known voxels."""
+        """Share of the known voxels of the reference that are also known in the grid; NaN if the
+        reference has no known voxels.
+        """
         return self.known_both / self.known_reference if self.known_reference else float("nan")
 
     @property
@@ -260,21 +298,28 @@ class TruthScore:
         )
 
 
-def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.bool_] | None = None) -> TruthScore:
+def score_truth(
+    grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.bool_] | None = None
+) -> TruthScore:
     """Score a ground truth grid against a reference, over the voxels that are known in both.
 
     Args:
         grid: the grid to score; voxels with count 0 are unknown.
         reference: the grid that is regarded as correct, with the same spec.
         num_classes: number of classes; ids are below it.
-        mask: (X, Y, Z) bool: only these voxels are scored, such as a distance band; None scores all.
+        mask: (X, Y, Z) bool: only these voxels are scored, such as a distance band; None scores
+            all.
 
     Raises:
         FormatError: the grids differ in geometry, or an id is out of range.
     """
     if grid.spec != reference.spec:
-        expected, found = (f"{spec}, {spec.lower} to {spec.upper}" for spec in (reference.spec, grid.spec))
-        raise FormatError("grid", expected=f"the geometry of the reference, {expected}", found=found)
+        expected, found = (
+            f"{spec}, {spec.lower} to {spec.upper}" for spec in (reference.spec, grid.spec)
+        )
+        raise FormatError(
+            "grid", expected=f"the geometry of the reference, {expected}", found=found
+        )
     selected = np.ones(grid.spec.size, np.bool_) if mask is None else mask
     known, known_reference = grid.known & selected, reference.known & selected
     both = known & known_reference
@@ -283,9 +328,16 @@ def score_truth(grid: Grid, reference: Grid, num_classes: int, mask: NDArray[np.
 
 
 def device_of(*arrays: Any) -> Any:
-    """Return the device of the first torch tensor that is not on the CPU, otherwise None. Does not import torch."""
+    """Return the device of the first torch tensor that is not on the CPU, otherwise None.
+
+    Does not import torch.
+    """
     torch = sys.modules.get("torch")
-    tensors = [array for array in arrays if torch and isinstance(array, torch.Tensor) and array.device.type != "cpu"]
+    tensors = [
+        array
+        for array in arrays
+        if torch and isinstance(array, torch.Tensor) and array.device.type != "cpu"
+    ]
     return tensors[0].device if tensors else None
 
 
@@ -315,16 +367,27 @@ def count_arrays(
         if labels.dtype.kind not in "uib":
             raise FormatError(name, expected="integer class ids", found=str(labels.dtype))
     prediction, truth = (np.ascontiguousarray(labels).reshape(-1) for labels in (prediction, truth))
-    counted = np.ones(prediction.shape, np.bool_) if mask is None else np.ascontiguousarray(mask, np.bool_).reshape(-1)
+    counted = (
+        np.ones(prediction.shape, np.bool_)
+        if mask is None
+        else np.ascontiguousarray(mask, np.bool_).reshape(-1)
+    )
     prediction = _in_range(prediction, counted, num_classes, "prediction")
     truth = _in_range(truth, counted, num_classes, "truth")
-    return _count_pairs(prediction, truth, counted, num_classes).sum(axis=0).reshape(num_classes, num_classes)
+    return (
+        _count_pairs(prediction, truth, counted, num_classes)
+        .sum(axis=0)
+        .reshape(num_classes, num_classes)
+    )
 
 
 def count_tensors(
     device: torch.device, prediction: Labels, truth: Labels, mask: Labels | None, num_classes: int
 ) -> NDArray[np.int64]:
-    """Count on a torch device. Only the (K, K) result is copied back. Arguments, result and errors are those of `count_arrays`."""
+    """Count on a torch device.
+
+    Only the (K, K) result is copied back. Arguments, result and errors are those of `count_arrays`.
+    """
     import torch
 
     def on_device(array: Labels) -> torch.Tensor:
@@ -345,9 +408,16 @@ def count_tensors(
     return pairs.reshape(num_classes, num_classes).cpu().numpy()
 
 
-def _in_range(labels: NDArray[Any], counted: NDArray[np.bool_], num_classes: int, name: str) -> NDArray[Any]:
-    """Return labels with all ids in 0..K-1. An id out of range is an error in counted voxels, and becomes 0 in other voxels."""
-    if not labels.size or (labels.max() < num_classes and (labels.dtype.kind != "i" or labels.min() >= 0)):
+def _in_range(
+    labels: NDArray[Any], counted: NDArray[np.bool_], num_classes: int, name: str
+) -> NDArray[Any]:
+    """Return labels with all ids in 0..K-1.
+
+    An id out of range is an error in counted voxels, and becomes 0 in other voxels.
+    """
+    if not labels.size or (
+        labels.max() < num_classes and (labels.dtype.kind != "i" or labels.min() >= 0)
+    ):
         return labels
     wrong = ((labels < 0) | (labels >= num_classes)) & counted
     if wrong.any():
@@ -361,8 +431,9 @@ def _count_pairs(
 ) -> NDArray[np.int64]:
     """Return `np.bincount(truth * K + prediction)` of the counted voxels, in one pass.
 
-    Most voxels are free and predicted as free, so successive voxels increment the same element. Using four tables in turn avoids stalls
-    on the previous store. The caller adds them up, because `sum` would take most of the compile time.
+    Most voxels are free and predicted as free, so successive voxels increment the same element.
+    Using four tables in turn avoids stalls on the previous store. The caller adds them up, because
+    `sum` would take most of the compile time.
 
     Returns:
         (4, K * K) int64; the result is the sum over the first axis.
@@ -377,7 +448,9 @@ def _count_pairs(
 def check_ids(name: str, ids: NDArray[Any], num_classes: int) -> None:
     """Raise FormatError if class ids, of any shape, are not all in 0..K-1."""
     if ids.size and (ids.min() < 0 or ids.max() >= num_classes):
-        raise FormatError(name, expected=f"class ids 0..{num_classes - 1}", found=f"{ids.min()} to {ids.max()}")
+        raise FormatError(
+            name, expected=f"class ids 0..{num_classes - 1}", found=f"{ids.min()} to {ids.max()}"
+        )
 
 
 def _out_of_range(name: str, found: int, times: int, num_classes: int) -> FormatError:

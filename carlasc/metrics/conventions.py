@@ -39,7 +39,8 @@ class ConventionScore:
 
     Attributes:
         miou: mean IoU over the classes of the convention.
-        class_iou: IoU by name of each class of the mean; NaN for classes that do not occur in the prediction or the ground truth.
+        class_iou: IoU by name of each class of the mean; NaN for classes that do not occur in the
+            prediction or the ground truth.
         precision: share of the voxels predicted as occupied that are occupied.
         recall: share of the occupied voxels that are predicted as occupied.
         iou: intersection over union of the occupied voxels.
@@ -65,14 +66,15 @@ class Convention:
         free: id of free space among them.
         averaged: ids of the classes of the mean.
         maps: by name of a class table, the scored id, or IGNORED, by id.
-        usual_truth: default class table of ground truth files that do not name one: the table of the benchmark.
+        usual_truth: default class table of ground truth files that do not name one: the table of
+            the benchmark.
         usual_prediction: default class table of prediction files that do not name one.
         seen_by: sensor whose mask defines the known voxels: "lidar" or "camera".
-        unknown: treatment of voxels that are unknown in the ground truth (count 0): "left out", or "free" if the benchmark does not
-            distinguish them from free voxels.
-        absent: treatment of classes that do not occur in the prediction or the ground truth: "zero" counts them as 0 in the mean; "skip"
-            leaves them out; "skip-truth" leaves out classes that are not in the ground truth, even if they were predicted; "nan" makes the
-            mean NaN.
+        unknown: treatment of voxels that are unknown in the ground truth (count 0): "left out", or
+            "free" if the benchmark does not distinguish them from free voxels.
+        absent: treatment of classes that do not occur in the prediction or the ground truth: "zero"
+            counts them as 0 in the mean; "skip" leaves them out; "skip-truth" leaves out classes
+            that are not in the ground truth, even if they were predicted; "nan" makes the mean NaN.
         epsilon: added to the denominator of each IoU.
         notes: a remark about the scores, one sentence.
     """
@@ -105,7 +107,8 @@ class Convention:
         if table.name not in self.maps:
             raise FormatError(
                 where,
-                expected=f"a class table with a map in the convention {self.name} ({', '.join(self.maps)})",
+                expected=f"a class table with a map in the convention {self.name} "
+                f"({', '.join(self.maps)})",
                 found=table.name,
             )
 
@@ -121,7 +124,8 @@ class Convention:
         Args:
             prediction: labels of any shape, and the table of their ids.
             truth: labels of the same shape, and the table of their ids.
-            known: known voxels of the ground truth, bool, with the same number of elements; None for all.
+            known: known voxels of the ground truth, bool, with the same number of elements; None
+                for all.
             region: voxels to score, bool, with the same number of elements; None for all.
 
         Returns:
@@ -131,7 +135,8 @@ class Convention:
             FormatError: an id has no target.
         """
         pred, true = (
-            self._map(labels, table, name) for (labels, table), name in ((prediction, "prediction"), (truth, "truth"))
+            self._map(labels, table, name)
+            for (labels, table), name in ((prediction, "prediction"), (truth, "truth"))
         )
         counted = true != _LEFT_OUT
         if known is not None:
@@ -165,14 +170,19 @@ class Convention:
         Raises:
             FormatError: an id has no target.
         """
-        return ConfusionMatrix(self.num_classes, free=self.free).update(*self.prepare(prediction, truth, known, region))
+        return ConfusionMatrix(self.num_classes, free=self.free).update(
+            *self.prepare(prediction, truth, known, region)
+        )
 
     def score(self, matrix: ConfusionMatrix) -> ConventionScore:
         """Return the scores of a confusion matrix, which may be a sum over many frames."""
         union = matrix.true_positives + matrix.false_positives + matrix.false_negatives
-        iou = np.divide(matrix.true_positives, union + self.epsilon, out=np.full(len(union), np.nan), where=union > 0)[
-            list(self.averaged)
-        ]
+        iou = np.divide(
+            matrix.true_positives,
+            union + self.epsilon,
+            out=np.full(len(union), np.nan),
+            where=union > 0,
+        )[list(self.averaged)]
         in_truth = matrix.counts.sum(axis=1)[list(self.averaged)] > 0
         if self.absent == "zero":
             values = np.nan_to_num(iou)
@@ -193,14 +203,16 @@ class Convention:
 
     def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.uint8]:
         lookup = self._lookups[table.name]
-        found = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")  # the last entry is for all larger ids
+        # the last entry is for all larger ids
+        found = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")
         if (unknown := found == _UNKNOWN).any():
             bad = int(labels[unknown][0])
             raise FormatError(
                 where,
                 expected=f"class ids of {table.name}",
                 found=f"{bad} ({int(np.count_nonzero(labels == bad))} times)",
-                advice=f"the convention {self.name} has no class for this id: correct the labels, or use another convention",
+                advice=f"the convention {self.name} has no class for this id: correct the labels, "
+                f"or use another convention",
             )
         return found
 
@@ -208,7 +220,8 @@ class Convention:
     def _lookups(self) -> dict[str, NDArray[np.uint8]]:
         lookups = {}
         for name, mapping in self.maps.items():
-            lookups[name] = np.full(max(mapping) + 2, _UNKNOWN, np.uint8)  # one more entry, for all larger ids
+            # one more entry, for all larger ids
+            lookups[name] = np.full(max(mapping) + 2, _UNKNOWN, np.uint8)
             for old, new in mapping.items():
                 lookups[name][old] = _LEFT_OUT if new == IGNORED else new
         return lookups
@@ -225,7 +238,9 @@ def convention_named(name: str) -> Convention:
 
 
 def own_convention(table: ClassTable, *, free: int = 0) -> Convention:
-    """Return a convention that scores the unchanged ids of a class table: known voxels, and the mean over all classes, including free."""
+    """Return a convention that scores the unchanged ids of a class table: known voxels, and the
+    mean over all classes, including free.
+    """
     return Convention(
         "own", f"the data's own classes ({table.name})", table, free, tuple(sorted(table.names)), {table.name: _identity(table)},
         table, table, notes="Scores of other data sets cannot be compared with this one.",
@@ -237,7 +252,9 @@ def _identity(table: ClassTable) -> dict[int, int]:
 
 
 def _without_zero(mapping: Mapping[int, int]) -> dict[int, int]:
-    """Return a map to the 19 classes of SemanticKITTI without ids above 0 that map to 0, because 0 is empty space."""
+    """Return a map to the 19 classes of SemanticKITTI without ids above 0 that map to 0, because 0
+    is empty space.
+    """
     return {old: IGNORED if new == 0 and old != 0 else new for old, new in mapping.items()}
 
 
@@ -258,7 +275,8 @@ _OCC3D_LIDAR = Convention(
     OCC3D,
     OCC3D,
     absent="skip",
-    notes='"others" is one of the classes of the mean; SparseOcc\'s script is occ3d-lidar-sparseocc.',
+    notes='"others" is one of the classes of the mean; SparseOcc\'s script is '
+    "occ3d-lidar-sparseocc.",
 )
 
 CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
@@ -274,7 +292,9 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 {
                     "carla": REMAPS["carlasc11"].mapping,
                     "carlasc11": _identity(CARLASC11),
-                    "semantickitti": _via(REMAPS["semantickitti_to_carla"].mapping, REMAPS["carlasc11"].mapping),
+                    "semantickitti": _via(
+                        REMAPS["semantickitti_to_carla"].mapping, REMAPS["carlasc11"].mapping
+                    ),
                 },
                 CARLA,
                 CARLASC11,
@@ -294,7 +314,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 },
                 SEMANTICKITTI,
                 SEMANTICKITTI,
-                notes="Classes outside the 19 are ignored in the ground truth, and empty in predictions (the official script stops).",
+                notes="Classes outside the 19 are ignored in the ground truth, and empty in "
+                "predictions (the official script stops).",
             ),
             Convention(
                 "sscbench",
@@ -314,14 +335,16 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 name="occ3d-lidar-sparseocc",
                 title="Occ3D-nuScenes as SparseOcc's script takes the mean",
                 absent="skip-truth",
-                notes="A class that is not in the ground truth is left out of the mean, even if it was predicted.",
+                notes="A class that is not in the ground truth is left out of the mean, even if "
+                "it was predicted.",
             ),
             replace(
                 _OCC3D_LIDAR,
                 name="occ3d-camera",
                 title="Occ3D-nuScenes, voxels that a camera observed",
                 seen_by="camera",
-                notes="This score needs grids with the field `seen`, which voxels a camera observed.",
+                notes="This score needs grids with the field `seen`, which voxels a camera "
+                "observed.",
             ),
             Convention(
                 "openoccupancy",
@@ -335,7 +358,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 OPENOCCUPANCY,
                 unknown="free",
                 absent="nan",
-                notes="The benchmark has no mask: an unobserved voxel counts as empty, and an absent class makes the mean NaN.",
+                notes="The benchmark has no mask: an unobserved voxel counts as empty, and an "
+                "absent class makes the mean NaN.",
             ),
         )
     }

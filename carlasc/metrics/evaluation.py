@@ -1,4 +1,6 @@
-"""Scoring the predicted grids of a whole data set, one frame in memory at a time, by one or all conventions."""
+"""Scoring the predicted grids of a whole data set, one frame in memory at a time, by one or all
+conventions.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,14 @@ from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_name
 from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.rays import RayIoU, ray_origins
-from carlasc.metrics.regions import Breakdown, Masks, distance_bands, height_bands, motion, visibility
+from carlasc.metrics.regions import (
+    Breakdown,
+    Masks,
+    distance_bands,
+    height_bands,
+    motion,
+    visibility,
+)
 from carlasc.metrics.results import Evaluation, FrameScore
 from carlasc.metrics.scoring import Scoring
 from carlasc.running.processes import run_all
@@ -30,7 +39,8 @@ from carlasc.running.spreading import Run, StepCounter
 
 _FrameBatch = tuple[Pair, list[int]]  # frames of one pair that a worker scores in one task
 _Known = Callable[[Literal["lidar", "camera"]], NDArray[np.bool_] | None]
-# Labels of prediction and ground truth, and `known` of the ground truth, which is read once for all conventions.
+# Labels of prediction and ground truth, and `known` of the ground truth, which is read once for all
+# conventions.
 LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], _Known]
 _DISTANCES_M, _HEIGHTS = (0, 10, 20, 30), 4  # edges and number of the bands of `by`
 _TOGETHER = 8  # frames that a worker scores in one task
@@ -40,7 +50,11 @@ class Scorer:
     """Accumulates the frames of all sequences by one convention."""
 
     def __init__(
-        self, convention: str | Convention | None, pairs: list[Pair], source_classes: str | None, scoring: Scoring
+        self,
+        convention: str | Convention | None,
+        pairs: list[Pair],
+        source_classes: str | None,
+        scoring: Scoring,
     ) -> None:
         self.scoring = scoring
         self.impossible: CarlascError | None = None
@@ -51,7 +65,9 @@ class Scorer:
         self.failures: list[tuple[str, str]] = []
         self.frames: list[FrameScore] = []
         self.breakdown = Breakdown(self.convention.num_classes, free=self.convention.free)
-        self.rays = RayIoU(self.convention.num_classes, free=self.convention.free) if scoring.rays else None
+        self.rays = (
+            RayIoU(self.convention.num_classes, free=self.convention.free) if scoring.rays else None
+        )
         self.actors = ActorScores(self.convention) if scoring.actors else None
         try:
             for pair in pairs:
@@ -116,7 +132,9 @@ class Scorer:
         return ConfusionMatrix(self.convention.num_classes, free=self.convention.free)
 
     def _check(self, pair: Pair, given: ClassTable | None) -> tuple[ClassTable, ClassTable]:
-        """Return the class tables of prediction and ground truth, after checking that the convention can score them."""
+        """Return the class tables of prediction and ground truth, after checking that the
+        convention can score them.
+        """
         truth = pair.truth.classes or self.convention.usual_truth
         prediction = given or pair.prediction.classes or self.convention.usual_prediction
         self.convention.check(truth, pair.truth.location)
@@ -133,12 +151,17 @@ class Scorer:
         if true_spec and predicted_spec and true_spec != predicted_spec:
             raise FormatError(
                 pair.prediction.location,
-                expected=f"the geometry of the ground truth, {true_spec} {true_spec.lower} .. {true_spec.upper}",
+                expected=f"the geometry of the ground truth, {true_spec} {true_spec.lower} .. "
+                f"{true_spec.upper}",
                 found=f"{predicted_spec} {predicted_spec.lower} .. {predicted_spec.upper}",
             )
         if self.scoring.actors:
             ActorScores.check(pair)
-        for argument, asked in (("region", self.scoring.region), ("by", self.scoring.by), ("rays", self.scoring.rays)):
+        for argument, asked in (
+            ("region", self.scoring.region),
+            ("by", self.scoring.by),
+            ("rays", self.scoring.rays),
+        ):
             if asked and pair.spec is None:
                 raise ArgumentError(
                     argument,
@@ -146,7 +169,9 @@ class Scorer:
                     found="a region" if argument == "region" else str(asked),
                     advice=f"add params.json to {pair.truth.location}",
                 )
-        if (self.scoring.rays or "motion" in self.scoring.by) and not isinstance(pair.truth, SequenceGrid):
+        if (self.scoring.rays or "motion" in self.scoring.by) and not isinstance(
+            pair.truth, SequenceGrid
+        ):
             raise ArgumentError(
                 "rays" if self.scoring.rays else "by",
                 expected="a data set with poses and scans as ground truth",
@@ -161,10 +186,15 @@ class Scorer:
         if self.scoring.region is not None and spec is not None:
             region = self.scoring.region(spec).reshape(truth.shape)
         try:
-            matrix = self.convention.count((prediction, tables[0]), (truth, tables[1]), known, region)
+            matrix = self.convention.count(
+                (prediction, tables[0]), (truth, tables[1]), known, region
+            )
             if (self.scoring.by or self.scoring.rays or self.scoring.actors) and spec is not None:
                 pred, true, counted = self.convention.prepare(
-                    (prediction.reshape(spec.size), tables[0]), (truth.reshape(spec.size), tables[1]), known, region
+                    (prediction.reshape(spec.size), tables[0]),
+                    (truth.reshape(spec.size), tables[1]),
+                    known,
+                    region,
                 )
                 if self.actors is not None:
                     self.actors.update(pair, frame, (pred, true, counted))
@@ -174,13 +204,19 @@ class Scorer:
                     # Rays begin at the sensor positions of the frames with ground truth.
                     numbers = pair.truth.frames().tolist()
                     poses = np.stack([pair.truth.sequence.read_pose(number) for number in numbers])
-                    self.rays.update(pred, true, spec, ray_origins(poses, numbers.index(frame), spec))
-        except FormatError as error:  # add the location of prediction or ground truth to the message
+                    self.rays.update(
+                        pred, true, spec, ray_origins(poses, numbers.index(frame), spec)
+                    )
+        except (
+            FormatError
+        ) as error:  # add the location of prediction or ground truth to the message
             side = pair.prediction if error.where == "prediction" else pair.truth
             raise error.within(f"{side.location}: frame {pair.truth.name_of(frame)}") from error
         return matrix
 
-    def _known(self, pair: Pair, frame: int, known_by: _Known, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    def _known(
+        self, pair: Pair, frame: int, known_by: _Known, shape: tuple[int, ...]
+    ) -> NDArray[np.bool_] | None:
         """Return the known voxels of the ground truth; None for all."""
         if self.scoring.voxels == "all":
             return None
@@ -208,7 +244,9 @@ class Scorer:
         if "distance" in self.scoring.by:
             yield distance_bands(spec, _DISTANCES_M)
         if "height" in self.scoring.by:
-            yield height_bands(spec, np.linspace(spec.lower[2], spec.upper[2], _HEIGHTS + 1).tolist())
+            yield height_bands(
+                spec, np.linspace(spec.lower[2], spec.upper[2], _HEIGHTS + 1).tolist()
+            )
         if "visibility" in self.scoring.by:
             yield visibility(Grid(spec, truth, counts), free=self.convention.free)
         if "seen" in self.scoring.by and (seen := pair.truth.known(frame, "camera")) is not None:
@@ -216,13 +254,22 @@ class Scorer:
             yield {"seen": seen, "not seen": ~seen}
         if "motion" in self.scoring.by and isinstance(pair.truth, SequenceGrid):
             labels = pair.truth.labels(frame).reshape(spec.size)
-            yield motion(Grid(spec, labels, counts), pair.truth.sequence.scan(frame, ("flow",)), sorted(table.movable))
+            yield motion(
+                Grid(spec, labels, counts),
+                pair.truth.sequence.scan(frame, ("flow",)),
+                sorted(table.movable),
+            )
 
 
 def _resolve(convention: str | Convention | None, pairs: list[Pair]) -> Convention:
     if isinstance(convention, Convention):
         return convention
-    tables = [side.classes for pair in pairs for side in (pair.truth, pair.prediction) if side.classes is not None]
+    tables = [
+        side.classes
+        for pair in pairs
+        for side in (pair.truth, pair.prediction)
+        if side.classes is not None
+    ]
     table = tables[0] if tables else CARLA
     if convention is None:
         usual = "carlasc" if table.name in CONVENTIONS["carlasc"].maps else "own"
@@ -246,16 +293,20 @@ def evaluate(
     """Score predicted grids against the ground truth, one frame in memory at a time.
 
     Args:
-        source: the predictions: anything that `carlasc.open` opens, the folder of one grid, a folder of `.label` files, or files of
-            SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc.
+        source: the predictions: anything that `carlasc.open` opens, the folder of one grid, a
+            folder of `.label` files, or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or
+            CarlaOcc.
         truth: the ground truth, in the same forms.
-        convention: the rules of a benchmark: a Convention or a name in `carlasc.metrics.CONVENTIONS`. It defines the scored voxels, the
-            classes, and the mean. "own" scores the unchanged classes of the data. None takes the benchmark of the ground truth files; for
-            other data "carlasc" if it has a map for the class table, otherwise "own".
-        grid: name of the predicted grid; None takes the name of the true grid, or the only grid of a sequence.
+        convention: the rules of a benchmark: a Convention or a name in
+            `carlasc.metrics.CONVENTIONS`. It defines the scored voxels, the classes, and the mean.
+            "own" scores the unchanged classes of the data. None takes the benchmark of the ground
+            truth files; for other data "carlasc" if it has a map for the class table, otherwise
+            "own".
+        grid: name of the predicted grid; None takes the name of the true grid, or the only grid of
+            a sequence.
         truth_grid: name of the true grid; None takes `evaluation`, or the only grid of a sequence.
-        source_classes: name of the class table of the predictions, for data that do not name one. None takes the default table of the
-            convention.
+        source_classes: name of the class table of the predictions, for data that do not name one.
+            None takes the default table of the convention.
         scoring: voxels to score, and additional scores.
         frames: frames to score; None scores all frames of the ground truth.
         name: name of the predictions in tables; None takes a name from `source`.
@@ -270,7 +321,9 @@ def evaluate(
         FormatError: the grids or classes of prediction and ground truth cannot be compared.
     """
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
-    return score_pairs(pairs, convention, source_classes, scoring, frames, name or _name_of(source), run, notes)
+    return score_pairs(
+        pairs, convention, source_classes, scoring, frames, name or _name_of(source), run, notes
+    )
 
 
 def score_pairs(
@@ -310,7 +363,8 @@ def evaluate_by_all_conventions(
     """Score predictions by every convention. Each frame is read once. For defaults, see `evaluate`.
 
     Args:
-        source: the predictions: a data set, a sequence, the folder of a grid, or files of a benchmark.
+        source: the predictions: a data set, a sequence, the folder of a grid, or files of a
+            benchmark.
         truth: the ground truth, in the same forms.
         grid: name of the predicted grid.
         truth_grid: name of the true grid.
@@ -323,9 +377,15 @@ def evaluate_by_all_conventions(
         By name of the convention: the scores, or the error that prevented them.
     """
     pairs, notes = pair_grids(source, truth, grid, truth_grid)
-    scorers = {convention: Scorer(convention, pairs, source_classes, Scoring()) for convention in CONVENTIONS}
+    scorers = {
+        convention: Scorer(convention, pairs, source_classes, Scoring())
+        for convention in CONVENTIONS
+    }
     _score_frames(list(scorers.values()), pairs, frames, run)
-    return {convention: scorer.result(name or _name_of(source), notes) for convention, scorer in scorers.items()}
+    return {
+        convention: scorer.result(name or _name_of(source), notes)
+        for convention, scorer in scorers.items()
+    }
 
 
 def _name_of(source: Place) -> str:
@@ -343,11 +403,15 @@ def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, 
     total = sum(len(numbers) for _, numbers in frames_of)
     if not total:
         raise MissingDataError(
-            pairs[0].truth.location, expected="labels of a frame to score", found=f"none in the range {chosen}"
+            pairs[0].truth.location,
+            expected="labels of a frame to score",
+            found=f"none in the range {chosen}",
         )
     size = 1 if run.is_alone else _TOGETHER
     batches = [
-        (pair, numbers[first : first + size]) for pair, numbers in frames_of for first in range(0, len(numbers), size)
+        (pair, numbers[first : first + size])
+        for pair, numbers in frames_of
+        for first in range(0, len(numbers), size)
     ]
     step, score = StepCounter(run.progress, total), partial(_score_batch, scorers=scorers)
     with closing(run_all(score, batches, run, lost=score)) as results:
@@ -357,10 +421,13 @@ def _score_frames(scorers: Sequence[Scorer], pairs: list[Pair], frames: Frames, 
             step(len(numbers))
 
 
-def _score_batch(batch: _FrameBatch, lost: str | None = None, *, scorers: Sequence[Scorer]) -> list[Scorer]:
+def _score_batch(
+    batch: _FrameBatch, lost: str | None = None, *, scorers: Sequence[Scorer]
+) -> list[Scorer]:
     """Read and score frames in a worker, and return one new scorer for each of `scorers`.
 
-    With the message `lost`, every worker died with these frames: they are not read, and the message is recorded as failure.
+    With the message `lost`, every worker died with these frames: they are not read, and the message
+    is recorded as failure.
     """
     parts = [scorer.empty() for scorer in scorers]
     pair, frames = batch
@@ -382,10 +449,16 @@ def _read(pair: Pair, frame: int, predicted: set[int]) -> LabelPair:
     """Return predicted and true labels of a frame, of equal shape, and the known voxels."""
     if frame not in predicted:
         raise MissingDataError(
-            pair.prediction.location, expected=f"a prediction for frame {pair.truth.name_of(frame)}", found="none"
+            pair.prediction.location,
+            expected=f"a prediction for frame {pair.truth.name_of(frame)}",
+            found="none",
         )
     prediction, truth = pair.prediction.labels(frame), pair.truth.labels(frame)
     if prediction.size != truth.size:
         where = f"{pair.prediction.location}: frame {pair.truth.name_of(frame)}"
-        raise FormatError(where, expected=f"the shape of the ground truth {truth.shape}", found=str(prediction.shape))
+        raise FormatError(
+            where,
+            expected=f"the shape of the ground truth {truth.shape}",
+            found=str(prediction.shape),
+        )
     return prediction.reshape(truth.shape), truth, cache(partial(pair.truth.known, frame))

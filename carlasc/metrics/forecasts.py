@@ -29,7 +29,9 @@ _TOLERANCE_S = 0.05  # for the time of the later frame: half the period of most 
 
 
 class FutureGrid(GridFrames):
-    """The grids of later frames of a sequence, by the number of the present frame, in which the forecast is made."""
+    """The grids of later frames of a sequence, by the number of the present frame, in which the
+    forecast is made.
+    """
 
     def __init__(self, grid: SequenceGrid, horizon_s: float, around: Around) -> None:
         """Find the later frame of each frame.
@@ -37,13 +39,20 @@ class FutureGrid(GridFrames):
         Args:
             grid: the grids of the sequence.
             horizon_s: time between the present and the later frame, seconds.
-            around: sensor pose at the centre of the result: of the present frame ("present") or of the later frame ("future").
+            around: sensor pose at the centre of the result: of the present frame ("present") or of
+                the later frame ("future").
 
         Raises:
-            MissingDataError: no frame has a later frame, or poses to move it to the present are missing.
+            MissingDataError: no frame has a later frame, or poses to move it to the present are
+                missing.
         """
         self.grid, self.around = grid, around
-        self.path, self.location, self.spec, self.classes = grid.path, grid.location, grid.spec, grid.classes
+        self.path, self.location, self.spec, self.classes = (
+            grid.path,
+            grid.location,
+            grid.spec,
+            grid.classes,
+        )
         numbers, sequence = grid.frames(), grid.sequence
         times = sequence.times_of(numbers)
         wanted = times + horizon_s
@@ -54,10 +63,13 @@ class FutureGrid(GridFrames):
         self.later = dict(zip(numbers[near].tolist(), numbers[later[near]].tolist(), strict=True))
         if not self.later:
             found = f"frames of {np.ptp(times):g} s" if len(times) else "none"
-            raise MissingDataError(self.location, expected=f"frames that are {horizon_s:g} s apart", found=found)
+            raise MissingDataError(
+                self.location, expected=f"frames that are {horizon_s:g} s apart", found=found
+            )
         if around == "present" and layout.POSES not in sequence.documents():
             raise MissingDataError(
-                sequence.location, expected=f"{layout.POSES}, which moves later frames to the present", found="none",
+                sequence.location, expected=f"{layout.POSES}, which moves later frames to the "
+                                            f"present", found="none",
                 advice="for grids around the sensor pose of the later frame, use `around=future`",
             )  # fmt: skip
 
@@ -69,8 +81,12 @@ class FutureGrid(GridFrames):
         """Return (X, Y, Z) the labels of the later frame."""
         return self._later(frame).labels
 
-    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (X, Y, Z) bool, the known voxels of the later frame; None for cameras, because their mask cannot be moved."""
+    def known(
+        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
+    ) -> NDArray[np.bool_] | None:
+        """Return (X, Y, Z) bool, the known voxels of the later frame; None for cameras, because
+        their mask cannot be moved.
+        """
         if seen_by == "camera" or f"{self.grid.grid}/counts" not in self.grid.sequence.fields():
             return None
         return self._later(frame).known
@@ -98,17 +114,20 @@ def evaluate_forecasts(
 ) -> Mapping[float, Evaluation]:
     """Score forecasts against the ground truth of later frames, separately for each time horizon.
 
-    The forecasts are grids of `source` whose names end with the horizon: frame 10 of `forecast_1.5s` is the forecast that was made in frame
-    10 for the time 1.5 s later. The later frame is found by times.txt, with a tolerance of 0.05 s (without times.txt: ten frames per
+    The forecasts are grids of `source` whose names end with the horizon: frame 10 of
+    `forecast_1.5s` is the forecast that was made in frame 10 for the time 1.5 s later. The later
+    frame is found by times.txt, with a tolerance of 0.05 s (without times.txt: ten frames per
     second). Frames without a later frame are left out.
 
     Args:
         source: the forecasts: a data set in the layout, in any store.
         truth: the ground truth, in the same forms, with poses.txt.
-        around: sensor pose at the centre of the forecast grids: of the frame in which they are made ("present"; the later grid is moved
-            to it by the poses), or of the later frame ("future"). Voxels outside the moved grid are unknown.
+        around: sensor pose at the centre of the forecast grids: of the frame in which they are made
+            ("present"; the later grid is moved to it by the poses), or of the later frame
+            ("future"). Voxels outside the moved grid are unknown.
         convention: as in `evaluate`.
-        grid: name of the forecast grids without the horizon, such as `forecast`; None takes the only name.
+        grid: name of the forecast grids without the horizon, such as `forecast`; None takes the
+            only name.
         truth_grid: name of the true grid; None takes `evaluation`, or the only grid of a sequence.
         source_classes: as in `evaluate`.
         scoring: voxels to score. Rays, actors and motion are not supported.
@@ -119,13 +138,18 @@ def evaluate_forecasts(
         The scores by horizon, seconds, in ascending order.
 
     Raises:
-        ArgumentError: an argument has an unknown value, or `scoring` requests rays, actors or motion.
+        ArgumentError: an argument has an unknown value, or `scoring` requests rays, actors or
+            motion.
         MissingDataError: no forecast grid or no later frame exists.
         FormatError: the grids or classes of prediction and ground truth cannot be compared.
     """
     if scoring.rays or scoring.actors or "motion" in scoring.by:
         asked = "rays" if scoring.rays else "actors" if scoring.actors else "by motion"
-        raise ArgumentError("scoring", expected="classes, by distance, height or visibility for forecasts", found=asked)
+        raise ArgumentError(
+            "scoring",
+            expected="classes, by distance, height or visibility for forecasts",
+            found=asked,
+        )
     results = {}
     for horizon_s, name in _horizons(source, grid).items():
         pairs, notes = pair_grids(source, truth, name, truth_grid)
@@ -146,18 +170,28 @@ def _horizons(source: Place, grid: str | None) -> dict[float, str]:
     opened, found = as_source(source), dict[float, str]()
     names = sorted({name for sequence in opened.sequences().values() for name in sequence.grids})
     for match in filter(None, map(_NAMED.fullmatch, names)):
-        if match[1] == (grid or match[1]) and (other := found.setdefault(float(match[2]), match[0])) != match[0]:
+        if (
+            match[1] == (grid or match[1])
+            and (other := found.setdefault(float(match[2]), match[0])) != match[0]
+        ):
             both = f"{other} and {match[0]}"
             raise ArgumentError(
-                "grid", expected="one forecast grid per horizon", found=both, advice="choose a name with `grid`"
+                "grid",
+                expected="one forecast grid per horizon",
+                found=both,
+                advice="choose a name with `grid`",
             )
     if not found:
         expected = f"grids of forecasts such as {grid or 'forecast'}_1s"
-        raise MissingDataError(opened.location, expected=expected, found=", ".join(names) or "no grid")
+        raise MissingDataError(
+            opened.location, expected=expected, found=", ".join(names) or "no grid"
+        )
     return dict(sorted(found.items()))
 
 
 def _future(truth: GridFrames, horizon_s: float, around: Around) -> FutureGrid:
     if not isinstance(truth, SequenceGrid):
-        raise MissingDataError(truth.location, expected="a sequence with poses and times", found="files of grids")
+        raise MissingDataError(
+            truth.location, expected="a sequence with poses and times", found="files of grids"
+        )
     return FutureGrid(truth, horizon_s, around)

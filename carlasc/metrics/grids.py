@@ -1,6 +1,8 @@
-"""The frames of a grid to score, from a sequence, a plain folder of `.label` files or CarlaOcc; and voxel-by-voxel comparison of grids.
+"""The frames of a grid to score, from a sequence, a plain folder of `.label` files or CarlaOcc; and
+voxel-by-voxel comparison of grids.
 
-CarlaOcc has files `{sequence}/occupancy/{grid}/0000.npz` with rows x, y, z and label of the voxels inside meshes.
+CarlaOcc has files `{sequence}/occupancy/{grid}/0000.npz` with rows x, y, z and label of the voxels
+inside meshes.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ class GridFrames(ABC):
         location: name of the grid in errors.
         spec: geometry; None if it is not known.
         classes: class table of the ids; None if it is not known.
-        benchmark: name of the convention of the benchmark with this file format; None for other data.
+        benchmark: name of the convention of the benchmark with this file format; None for other
+            data.
     """
 
     path: str
@@ -51,8 +54,11 @@ class GridFrames(ABC):
         """Return the labels of a frame: (X, Y, Z), or (X * Y * Z,) if the geometry is not known."""
 
     @abstractmethod
-    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return the known voxels of a frame (counts > 0, or not invalid), bool; None if the data do not have this information.
+    def known(
+        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
+    ) -> NDArray[np.bool_] | None:
+        """Return the known voxels of a frame (counts > 0, or not invalid), bool; None if the data
+        do not have this information.
 
         `seen_by` selects the mask of the LiDAR or of cameras, for data that have both.
         """
@@ -62,7 +68,9 @@ class GridFrames(ABC):
         return str(frame)
 
     def follow(self, truth: GridFrames) -> None:  # noqa: B027 (only some data need it)
-        """Take the number of voxels and the frame numbers from the ground truth, if the files of predictions lack them."""
+        """Take the number of voxels and the frame numbers from the ground truth, if the files of
+        predictions lack them.
+        """
 
 
 class SequenceGrid(GridFrames):
@@ -81,8 +89,12 @@ class SequenceGrid(GridFrames):
         """Return (X, Y, Z) labels."""
         return self.sequence.read(f"{self.grid}/labels", frame)
 
-    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (X, Y, Z) bool, the voxels with votes, or those that a camera also sees; None if the grid has no such fields."""
+    def known(
+        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
+    ) -> NDArray[np.bool_] | None:
+        """Return (X, Y, Z) bool, the voxels with votes, or those that a camera also sees; None if
+        the grid has no such fields.
+        """
         fields = [f"{self.grid}/counts"] + ([f"{self.grid}/seen"] if seen_by == "camera" else [])
         if not set(fields) <= self.sequence.fields():
             return None
@@ -92,9 +104,11 @@ class SequenceGrid(GridFrames):
 class LabelFolder(GridFrames):
     """A folder of `000000.label` files without params.json, as other tools write it.
 
-    The folder may also have counts (`000000.bin`, float32), or masks of SemanticKITTI or SSCBench (`000000.invalid`, one bit or one byte per
-    voxel). Labels are uint32, as in the layout, or uint16, as in these benchmarks; the type follows from the file size and the number of
-    voxels. In these benchmarks, `000000.bin` is the occupancy of a scan as bits; it is distinguished from counts by its size.
+    The folder may also have counts (`000000.bin`, float32), or masks of SemanticKITTI or SSCBench
+    (`000000.invalid`, one bit or one byte per voxel). Labels are uint32, as in the layout, or
+    uint16, as in these benchmarks; the type follows from the file size and the number of voxels. In
+    these benchmarks, `000000.bin` is the occupancy of a scan as bits; it is distinguished from
+    counts by its size.
 
     Attributes:
         voxels: number of voxels per frame; None if it is not known.
@@ -109,19 +123,22 @@ class LabelFolder(GridFrames):
         self.voxels = self._count_voxels(int(self.frames()[0])) if len(self.frames()) else None
 
     def _count_voxels(self, frame: int) -> int | None:
-        """Return the number of voxels from the sizes of the files of a frame; None if only labels exist."""
+        """Return the number of voxels from the sizes of the files of a frame; None if only labels
+        exist.
+        """
         if (counts := self._counts(frame)) is not None:
             return counts.stat().st_size // 4
         if (invalid := self._file(frame, ".invalid")).is_file():
             size = invalid.stat().st_size
-            packed = (
-                self._file(frame, ".label").stat().st_size >= size * _BITS
-            )  # because labels have two or four bytes per voxel
+            # because labels have two or four bytes per voxel
+            packed = self._file(frame, ".label").stat().st_size >= size * _BITS
             return size * _BITS if packed else size
         return None
 
     def _counts(self, frame: int) -> Path | None:
-        """Return the file of counts of a frame, with four bytes per voxel; None if it does not exist."""
+        """Return the file of counts of a frame, with four bytes per voxel; None if it does not
+        exist.
+        """
         counts, labels = self._file(frame, ".bin"), self._file(frame, ".label")
         if not counts.is_file() or self._file(frame, ".invalid").is_file():
             return None
@@ -155,7 +172,9 @@ class LabelFolder(GridFrames):
         width = self._width if self.voxels is None else size / max(self.voxels, 1)
         if width not in types or size % width:
             expected = (
-                f"labels of {self._width} bytes" if self.voxels is None else f"{self.voxels} labels of 2 or 4 bytes"
+                f"labels of {self._width} bytes"
+                if self.voxels is None
+                else f"{self.voxels} labels of 2 or 4 bytes"
             )
             raise FormatError(
                 path,
@@ -163,12 +182,14 @@ class LabelFolder(GridFrames):
                 found=f"{size} bytes",
                 advice="the file may be truncated, of another grid, or of another type",
             )
-        return np.fromfile(
-            path, types[width], int(size // width)
-        )  # with the size of the file, because devices have no size
+        # with the size of the file, because devices have no size
+        return np.fromfile(path, types[width], int(size // width))
 
-    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (X * Y * Z,) bool, the voxels that have votes or are not invalid; None if no such file exists.
+    def known(
+        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
+    ) -> NDArray[np.bool_] | None:
+        """Return (X * Y * Z,) bool, the voxels that have votes or are not invalid; None if no such
+        file exists.
 
         Raises:
             FormatError: the file does not have the size of a grid.
@@ -179,14 +200,19 @@ class LabelFolder(GridFrames):
             return np.fromfile(counts, "<f4") > 0
         if (invalid := self._file(frame, ".invalid")).is_file():
             found = np.fromfile(invalid, np.uint8)
-            if self.voxels is not None and found.size not in (self.voxels, -(-self.voxels // _BITS)):
+            if self.voxels is not None and found.size not in (
+                self.voxels,
+                -(-self.voxels // _BITS),
+            ):
                 raise FormatError(
                     invalid,
                     expected=f"{self.voxels} bytes, or {-(-self.voxels // _BITS)} of packed bits",
                     found=str(found.size),
                     advice="the file may be truncated, or of another grid",
                 )
-            return (found if found.size == self.voxels else np.unpackbits(found, count=self.voxels)) == 0
+            return (
+                found if found.size == self.voxels else np.unpackbits(found, count=self.voxels)
+            ) == 0
         return None
 
     def _file(self, frame: int, suffix: str) -> Path:
@@ -213,7 +239,8 @@ def compare_grids(prediction: Grid, truth: Grid) -> NDArray[np.uint8]:
 
     Args:
         prediction: predicted grid, with the same class table as the ground truth.
-        truth: true grid. Voxels with count 0 are unknown and are not compared; without counts, all voxels are known.
+        truth: true grid. Voxels with count 0 are unknown and are not compared; without counts, all
+            voxels are known.
 
     Returns:
         (X, Y, Z) uint8, a `VoxelOutcome` per voxel.
@@ -224,19 +251,34 @@ def compare_grids(prediction: Grid, truth: Grid) -> NDArray[np.uint8]:
     check_same_geometry(prediction.spec, truth.spec)
     predicted, occupied = prediction.labels > 0, truth.labels > 0
     outcomes = np.select(
-        [~truth.known, occupied & (prediction.labels == truth.labels), occupied & predicted, occupied, predicted],
-        [VoxelOutcome.NOT_COMPARED, VoxelOutcome.RIGHT, VoxelOutcome.WRONG, VoxelOutcome.MISSED, VoxelOutcome.INVENTED],
+        [
+            ~truth.known,
+            occupied & (prediction.labels == truth.labels),
+            occupied & predicted,
+            occupied,
+            predicted,
+        ],
+        [
+            VoxelOutcome.NOT_COMPARED,
+            VoxelOutcome.RIGHT,
+            VoxelOutcome.WRONG,
+            VoxelOutcome.MISSED,
+            VoxelOutcome.INVENTED,
+        ],
         default=VoxelOutcome.NOT_COMPARED,
     )
     return outcomes.astype(np.uint8)
 
 
 def check_same_geometry(prediction: GridSpec, truth: GridSpec) -> None:
-    """Raise ArgumentError if the grids of prediction and ground truth have different sizes, bounds or coordinates."""
+    """Raise ArgumentError if the grids of prediction and ground truth have different sizes, bounds
+    or coordinates.
+    """
     if prediction != truth:
         raise ArgumentError(
             "truth",
-            expected=f"the geometry of the predicted grid ({prediction}, {prediction.lower} to {prediction.upper})",
+            expected=f"the geometry of the predicted grid ({prediction}, {prediction.lower} to "
+            f"{prediction.upper})",
             found=f"{truth}, {truth.lower} to {truth.upper}",
             advice="choose another grid with `grid` or `truth_grid`",
         )
@@ -258,7 +300,11 @@ class CarlaOccGrids(GridFrames):
 
     def __init__(self, folder: Path, grid: str) -> None:
         self.path, self.location = sequence_name(folder), str(folder / "occupancy" / grid)
-        self.files = {int(file.stem): file for file in Path(self.location).glob("[0-9]*.npz") if file.stem.isdecimal()}
+        self.files = {
+            int(file.stem): file
+            for file in Path(self.location).glob("[0-9]*.npz")
+            if file.stem.isdecimal()
+        }
         self.spec = read_geometry(self.files[min(self.files)]) if self.files else None
 
     def frames(self) -> NDArray[np.int64]:
@@ -270,22 +316,36 @@ class CarlaOccGrids(GridFrames):
         return self._read(frame)[0]
 
     def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_]:
-        """Return (X, Y, Z) bool, the voxels that have a class or are free. Occupied voxels without a class are unknown."""
+        """Return (X, Y, Z) bool, the voxels that have a class or are free.
+
+        Occupied voxels without a class are unknown.
+        """
         return self._read(frame)[1]
 
     def _read(self, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         file = self.files[frame]
         if (spec := read_geometry(file)) != self.spec:
-            raise FormatError(file, expected=f"the geometry of the first frame: {self.spec}", found=str(spec))
+            raise FormatError(
+                file, expected=f"the geometry of the first frame: {self.spec}", found=str(spec)
+            )
         return read_voxels(file, spec)
 
 
 def find_carlaocc(folder: Path, grid: str | None) -> list[CarlaOccGrids]:
-    """Return the grids of a sequence folder, or of all sequences in a folder. With None, the first existing name of `CARLAOCC_GRIDS` is used."""
+    """Return the grids of a sequence folder, or of all sequences in a folder.
+
+    With None, the first existing name of `CARLAOCC_GRIDS` is used.
+    """
     found = []
     for sequence in (folder, *sorted(path for path in folder.glob("*") if path.is_dir())):
-        existing = sorted(path.name for path in (sequence / "occupancy").glob("*") if any(path.glob("[0-9]*.npz")))
-        names = [name for name in (*CARLAOCC_GRIDS, *existing) if name in existing and grid in (None, name)]
+        existing = sorted(
+            path.name for path in (sequence / "occupancy").glob("*") if any(path.glob("[0-9]*.npz"))
+        )
+        names = [
+            name
+            for name in (*CARLAOCC_GRIDS, *existing)
+            if name in existing and grid in (None, name)
+        ]
         found += [CarlaOccGrids(sequence, name) for name in names[:1]]
     return found
 
@@ -296,15 +356,21 @@ def sequence_name(folder: Path) -> str:
 
 
 def read_voxels(path: str | Path, spec: GridSpec) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return (X, Y, Z) tags of a grid, and (X, Y, Z) bool, the known voxels. Occupied voxels without a class are unknown.
+    """Return (X, Y, Z) tags of a grid, and (X, Y, Z) bool, the known voxels.
+
+    Occupied voxels without a class are unknown.
 
     Raises:
         FormatError: the file is not a grid of this geometry.
     """
-    rows = _read_arrays(path, {"occupancy": ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)})[0]
+    rows = _read_arrays(path, {"occupancy": ArrayFormat(("<u2",), (None, 4), 4 * spec.num_voxels)})[
+        0
+    ]
     cells = rows[:, :3].astype(np.int64)
     if outside := int((cells >= spec.size).any(axis=1).sum()):
-        raise FormatError(path, expected=f"voxels inside of {spec}", found=f"{outside} voxels outside")
+        raise FormatError(
+            path, expected=f"voxels inside of {spec}", found=f"{outside} voxels outside"
+        )
     semantic = semantic_ids(rows[:, 3])
     labels, known = np.zeros(spec.size, np.uint8), np.ones(spec.size, np.bool_)
     labels[tuple(cells.T)] = semantic
@@ -315,10 +381,14 @@ def read_voxels(path: str | Path, spec: GridSpec) -> tuple[NDArray[np.uint8], ND
 def semantic_ids(codes: NDArray[np.unsignedinteger]) -> NDArray[np.uint8]:
     """Return the classes of voxel labels, which combine class and instance.
 
-    The documentation has `1000 * class + instance`, the code that made the files `2048 * class + instance`. Most voxels belong to classes
-    whose instance is always 0, and no label above 0 is a multiple of both numbers, so the formula can be determined from the labels.
+    The documentation has `1000 * class + instance`, the code that made the files `2048 * class +
+    instance`. Most voxels belong to classes whose instance is always 0, and no label above 0 is a
+    multiple of both numbers, so the formula can be determined from the labels.
     """
-    decimal, binary = int(np.count_nonzero(codes % 1000 == 0)), int(np.count_nonzero(codes % 2048 == 0))
+    decimal, binary = (
+        int(np.count_nonzero(codes % 1000 == 0)),
+        int(np.count_nonzero(codes % 2048 == 0)),
+    )
     return (codes // (1000 if decimal > binary else 2048)).astype(np.uint8)
 
 
@@ -329,19 +399,25 @@ def read_geometry(path: str | Path) -> GridSpec:
         FormatError: the file does not describe a grid.
     """
     few = ArrayFormat(NUMBERS, None, 3)
-    step, origin, size = _read_arrays(path, dict.fromkeys(("voxel_size", "voxel_origin", "volume_size"), few))
+    step, origin, size = _read_arrays(
+        path, dict.fromkeys(("voxel_size", "voxel_origin", "volume_size"), few)
+    )
     try:
         lower = np.asarray(origin, np.float64).reshape(3)
         cells = np.asarray(size, np.int64).reshape(3)
         x, y, z = cells.tolist()
         check_size((x, y, z), np.dtype(np.uint8), str(path))
-        # Rounded to decimals first, because the origin is float32 and the voxel size is not: the bounds are then those of the
-        # documentation in float32, as with `--bounds`.
+        # Rounded to decimals first, because the origin is float32 and the voxel size is not: the
+        # bounds are then those of the documentation in float32, as with `--bounds`.
         low, up = np.round(lower, 4).tolist(), np.round(lower + cells * float(step), 4).tolist()
-        return GridSpec("cartesian", (x, y, z), (low[0], low[1], low[2]), (up[0], up[1], up[2])).with_bounds(low, up)
+        return GridSpec(
+            "cartesian", (x, y, z), (low[0], low[1], low[2]), (up[0], up[1], up[2])
+        ).with_bounds(low, up)
     except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(
-            path, expected="voxel_size, and 3 values of voxel_origin and volume_size", found=str(error)
+            path,
+            expected="voxel_size, and 3 values of voxel_origin and volume_size",
+            found=str(error),
         ) from error
 
 

@@ -1,4 +1,6 @@
-"""A table of several results, as Markdown, LaTeX, or HTML with a small chart of the IoU of each class."""
+"""A table of several results, as Markdown, LaTeX, or HTML with a small chart of the IoU of each
+class.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,13 @@ from carlasc.storage.files import parse_json
 if TYPE_CHECKING:
     import pandas
 
-_FIGURES = {"miou": "mIoU", "iou": "IoU", "precision": "Precision", "recall": "Recall", "false_free": "False free"}
+_FIGURES = {
+    "miou": "mIoU",
+    "iou": "IoU",
+    "precision": "Precision",
+    "recall": "Recall",
+    "false_free": "False free",
+}
 _REQUIRED = ("name", "convention", "frames", "class_iou", *_FIGURES)
 _BAR, _HEIGHT = 7, 24  # pixels: width of a bar, and height of the chart
 
@@ -54,21 +62,31 @@ class ScoreTable:
         )
         rows: list[tuple[Cell, ...]] = []
         for result in self.results:
-            values = [result["class_iou"].get(name) for name in names] + [result[figure] for figure in _FIGURES]
+            values = [result["class_iou"].get(name) for name in names] + [
+                result[figure] for figure in _FIGURES
+            ]
             values += [result.get("rayiou")] if rayed else []
             cells = [math.nan if value is None else 100 * value for value in values]
-            rows.append((str(result["name"]), *([str(result["convention"])] if mixed else []), *cells))
-        return FigureTable(f"Scores by the convention {self.convention} (percent)", header, tuple(rows))
+            rows.append(
+                (str(result["name"]), *([str(result["convention"])] if mixed else []), *cells)
+            )
+        return FigureTable(
+            f"Scores by the convention {self.convention} (percent)", header, tuple(rows)
+        )
 
     def to_markdown(self) -> str:
         """Return a Markdown table."""
         table = self.table()
         lines = [table.header, ["---"] + ["---:"] * (len(table.header) - 1), *table.texts()]
-        rows = ("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+        rows = (
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
         return f"{table.title}\n\n" + "\n".join(rows) + "\n"
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return one row per result, with the columns of `table`. Scores are fractions, NaN if undefined.
+        """Return one row per result, with the columns of `table`.
+
+        Scores are fractions, NaN if undefined.
 
         Raises:
             DependencyError: pandas is not installed.
@@ -76,7 +94,13 @@ class ScoreTable:
         table = self.table()
         rows = (dict(zip(table.header, row, strict=True)) for row in table.rows)
         return data_frame(
-            ({name: cell / 100 if isinstance(cell, float) else cell for name, cell in row.items()} for row in rows),
+            (
+                {
+                    name: cell / 100 if isinstance(cell, float) else cell
+                    for name, cell in row.items()
+                }
+                for row in rows
+            ),
             table.header[0],
         )
 
@@ -85,9 +109,13 @@ class ScoreTable:
         return self.table().to_latex()
 
     def to_html(self) -> str:
-        """Return a self-contained HTML page: the scores, and a bar chart of classes for each result."""
+        """Return a self-contained HTML page: the scores, and a bar chart of classes for each
+        result.
+        """
         table = self.table(classes=False)
-        header = "".join(f"<th>{html.escape(name)}</th>" for name in (*table.header, "IoU of each class"))
+        header = "".join(
+            f"<th>{html.escape(name)}</th>" for name in (*table.header, "IoU of each class")
+        )
         rows = ""
         for cells, result in zip(table.texts(), self.results, strict=True):
             shown = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
@@ -101,7 +129,8 @@ class ScoreTable:
             height = 0.0 if iou is None else iou * _HEIGHT
             text = f"{name}: {'-' if iou is None else f'{100 * iou:.1f}'}"
             bars += (
-                f'<rect x="{place * _BAR}" y="{_HEIGHT - height:.1f}" width="{_BAR - 2}" height="{max(height, 0.6):.1f}">'
+                f'<rect x="{place * _BAR}" y="{_HEIGHT - height:.1f}" width="{_BAR - 2}" '
+                f'height="{max(height, 0.6):.1f}">'
                 f"<title>{html.escape(text)}</title></rect>"
             )
         width = len(self.class_names) * _BAR
@@ -116,20 +145,24 @@ def scores(files: Iterable[str | os.PathLike[str]], *, mixed: bool = False) -> S
         mixed: allow different conventions, and show the convention of each result.
 
     Raises:
-        ArgumentError: the conventions differ, so the results cannot be compared, and `mixed` is not given.
+        ArgumentError: the conventions differ, so the results cannot be compared, and `mixed` is not
+            given.
         FormatError: a file is not a result of an evaluation.
         MissingDataError: a file does not exist, or none was given.
     """
     results = tuple(_read(Path(file)) for file in files)
     if not results:
-        raise MissingDataError("files", expected="results of `carlasc evaluate --json`", found="none")
+        raise MissingDataError(
+            "files", expected="results of `carlasc evaluate --json`", found="none"
+        )
     conventions = sorted({str(result["convention"]) for result in results})
     if len(conventions) > 1 and not mixed:
         raise ArgumentError(
             "files",
             expected="results by one convention",
             found=", ".join(conventions),
-            advice="score them by the same convention, or give `mixed=True` to print them side by side",
+            advice="score them by the same convention, or give `mixed=True` to print them side by "
+            "side",
         )
     return ScoreTable(", ".join(conventions), results)
 
@@ -138,7 +171,9 @@ def _read(file: Path) -> dict[str, Any]:
     try:
         values = parse_json(file.read_bytes(), str(file))
     except FileNotFoundError as error:
-        raise MissingDataError(file, expected="a result of `carlasc evaluate --json`", found="nothing") from error
+        raise MissingDataError(
+            file, expected="a result of `carlasc evaluate --json`", found="nothing"
+        ) from error
     except OSError as error:
         raise FormatError(file, problem=f"cannot be read: {error.strerror}") from error
     if missing := [key for key in _REQUIRED if key not in values]:
@@ -151,11 +186,17 @@ def _read(file: Path) -> dict[str, Any]:
         if not isinstance(values[key], str):
             raise FormatError(file, expected=f"text under {key}", found=type(values[key]).__name__)
     if not isinstance(values["class_iou"], dict):
-        raise FormatError(file, expected="an IoU by class", found=type(values["class_iou"]).__name__)
+        raise FormatError(
+            file, expected="an IoU by class", found=type(values["class_iou"]).__name__
+        )
     figures = {figure: values.get(figure) for figure in (*_FIGURES, "rayiou")} | values["class_iou"]
     for name, value in figures.items():
         if value is not None and not (isinstance(value, int | float) and 0 <= value <= 1):
-            raise FormatError(file, expected=f"a fraction from 0 to 1, or null, for {name}", found=repr(value)[:40])
+            raise FormatError(
+                file,
+                expected=f"a fraction from 0 to 1, or null, for {name}",
+                found=repr(value)[:40],
+            )
     return values
 
 

@@ -1,6 +1,8 @@
-"""Opening grids to score, also in file formats of other benchmarks, and matching predicted with true grids.
+"""Opening grids to score, also in file formats of other benchmarks, and matching predicted with
+true grids.
 
-The other formats are `.npz` of Occ3D and CarlaOcc, `.npy` of OpenOccupancy, and the folders of SemanticKITTI and SSCBench.
+The other formats are `.npz` of Occ3D and CarlaOcc, `.npy` of OpenOccupancy, and the folders of
+SemanticKITTI and SSCBench.
 """
 
 from __future__ import annotations
@@ -34,12 +36,16 @@ _LABELS = (
     "semantics",
     "pred",
     "occ_pred",
-)  # possible names of the array of classes in an .npz: the name of the benchmark, and other common names
+    # possible names of the array of classes in an .npz: the name of the benchmark, and other common
+    # names
+)
 _NOISE = 255
 
 
 class TokenFrames(GridFrames):
-    """A scene with tokens as names of frames. Frames are numbered in the order of the tokens of the ground truth.
+    """A scene with tokens as names of frames.
+
+    Frames are numbered in the order of the tokens of the ground truth.
 
     Attributes:
         files: file of each frame, by token.
@@ -84,8 +90,12 @@ class Occ3dScene(TokenFrames):
             raise FormatError(file, expected=f"class ids 0..{_NOISE}", found=found)
         return labels.astype(np.uint8, copy=False)
 
-    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_] | None:
-        """Return (200, 200, 16) bool, the voxels that the LiDAR or a camera observed; None if the file does not contain the mask."""
+    def known(
+        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
+    ) -> NDArray[np.bool_] | None:
+        """Return (200, 200, 16) bool, the voxels that the LiDAR or a camera observed; None if the
+        file does not contain the mask.
+        """
         name = f"mask_{seen_by}"
         with open_npz(self._file(frame)) as arrays:
             if name not in arrays.names:
@@ -94,7 +104,9 @@ class Occ3dScene(TokenFrames):
 
 
 class OpenOccupancyScene(TokenFrames):
-    """A scene of OpenOccupancy-nuScenes: `scene_{token}/occupancy/{lidar_token}.npy` with rows z, y, x, ..., class of occupied voxels."""
+    """A scene of OpenOccupancy-nuScenes: `scene_{token}/occupancy/{lidar_token}.npy` with rows z,
+    y, x, ..., class of occupied voxels.
+    """
 
     spec, classes, benchmark = OPENOCCUPANCY_SPEC, OPENOCCUPANCY, "openoccupancy"
 
@@ -103,16 +115,24 @@ class OpenOccupancyScene(TokenFrames):
         file = self._file(frame)
         rows = read_npy(file, ArrayFormat(NUMBERS, (None, None)))
         if rows.shape[1] not in (4, 7):
-            raise FormatError(file, expected="rows of 4 or 7 columns (z, y, x, ..., class)", found=str(rows.shape))
+            raise FormatError(
+                file, expected="rows of 4 or 7 columns (z, y, x, ..., class)", found=str(rows.shape)
+            )
         if not np.isfinite(rows).all():
             raise FormatError(file, expected="finite numbers", found="NaN or infinity")
         z, y, x = rows[:, :3].astype(np.int64).T
         classes = rows[:, -1].astype(np.int64)
         size = np.array(self.spec.size)[:, None]
         if (np.array([x, y, z]) >= size).any() or rows[:, :3].min(initial=0) < 0:
-            raise FormatError(file, expected=f"voxels inside {self.spec}", found=f"({x.max()}, {y.max()}, {z.max()})")
+            raise FormatError(
+                file,
+                expected=f"voxels inside {self.spec}",
+                found=f"({x.max()}, {y.max()}, {z.max()})",
+            )
         if len(classes) and not (classes.min() >= 0 and classes.max() <= _NOISE):
-            raise FormatError(file, expected=f"class ids 0..{_NOISE}", found=f"{classes.min()} to {classes.max()}")
+            raise FormatError(
+                file, expected=f"class ids 0..{_NOISE}", found=f"{classes.min()} to {classes.max()}"
+            )
         labels = np.zeros(self.spec.size, np.uint8)
         labels[x, y, z] = np.where(classes == 0, _NOISE, classes)
         return labels
@@ -140,22 +160,33 @@ class KittiFolder(LabelFolder):
             self.spec = KITTI_SPEC
 
 
-def foreign_grids(folder: Path, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
-    """Yield the grids of a folder in the layout of another benchmark; nothing if the folder has another layout."""
+def foreign_grids(
+    folder: Path, grid: str | None, role: Literal["prediction", "truth"]
+) -> Iterator[GridFrames]:
+    """Yield the grids of a folder in the layout of another benchmark; nothing if the folder has
+    another layout.
+    """
     for scene in sorted(path for path in folder.glob("*") if path.is_dir()):
         if files := {file.parent.name: file for file in scene.glob("*/labels.npz")}:
             yield Occ3dScene(scene, scene.name, files)
-        elif scene.name.startswith("scene_") and (files := {f.stem: f for f in scene.glob("occupancy/*.npy")}):
+        elif scene.name.startswith("scene_") and (
+            files := {f.stem: f for f in scene.glob("occupancy/*.npy")}
+        ):
             yield OpenOccupancyScene(scene, scene.name, files)
     if (folder / "gts").is_dir():
         yield from foreign_grids(folder / "gts", grid, role)
     yield from find_carlaocc(folder, grid)
-    # without a folder of predictions, the folder itself is scored, such as an export or another ground truth
-    names = (grid,) if grid else {"prediction": ("predictions", "voxels"), "truth": ("voxels",)}[role]
+    # without a folder of predictions, the folder itself is scored, such as an export or another
+    # ground truth
+    names = (
+        (grid,) if grid else {"prediction": ("predictions", "voxels"), "truth": ("voxels",)}[role]
+    )
     for pattern, benchmark in (("sequences/*", "semantickitti"), ("data_2d_raw/*", "sscbench")):
         for sequence in sorted(folder.glob(pattern)):
             found = (
-                KittiFolder(sequence / name, sequence.name, benchmark) for name in names if (sequence / name).is_dir()
+                KittiFolder(sequence / name, sequence.name, benchmark)
+                for name in names
+                if (sequence / name).is_dir()
             )
             yield from islice((grids for grids in found if len(grids.frames())), 1)
 
@@ -176,7 +207,9 @@ class Pair:
 def pair_grids(
     source: Place, truth: Place, grid: str | None, truth_grid: str | None
 ) -> tuple[list[Pair], tuple[str, ...]]:
-    """Match predictions with ground truth by the paths of sequences. If each side has only one sequence, they match.
+    """Match predictions with ground truth by the paths of sequences.
+
+    If each side has only one sequence, they match.
 
     Args:
         source: the predictions, as for `evaluate`.
@@ -188,7 +221,8 @@ def pair_grids(
         The pairs, and notes about true sequences without a prediction.
 
     Raises:
-        MissingDataError: prediction or ground truth has no grid, or a predicted sequence has no ground truth.
+        MissingDataError: prediction or ground truth has no grid, or a predicted sequence has no
+            ground truth.
     """
     truths = {grids.path: grids for grids in open_grids(truth, truth_grid, "truth")}
     predictions = list(open_grids(source, grid or truth_grid, "prediction"))
@@ -199,8 +233,14 @@ def pair_grids(
         for prediction in predictions:
             pairs.append(Pair(prediction, _truth_of(prediction, truths)))
     for pair in pairs:
-        if isinstance(pair.prediction, KittiFolder) and pair.prediction.location == pair.truth.location:
-            expected, found = "predictions in another folder than the ground truth", "the ground truth itself"
+        if (
+            isinstance(pair.prediction, KittiFolder)
+            and pair.prediction.location == pair.truth.location
+        ):
+            expected, found = (
+                "predictions in another folder than the ground truth",
+                "the ground truth itself",
+            )
             raise MissingDataError(pair.truth.location, expected=expected, found=found)
         pair.prediction.follow(pair.truth)
     left = sorted(set(truths) - {pair.truth.path for pair in pairs})
@@ -209,7 +249,9 @@ def pair_grids(
 
 
 def _truth_of(prediction: GridFrames, truths: Mapping[str, GridFrames]) -> GridFrames:
-    """Return the true grid with the same path, otherwise the only one with the same name, because other benchmarks have no split in the path."""
+    """Return the true grid with the same path, otherwise the only one with the same name, because
+    other benchmarks have no split in the path.
+    """
     if prediction.path in truths:
         return truths[prediction.path]
     name = identity_of(prediction.path)[1:]
@@ -219,25 +261,30 @@ def _truth_of(prediction: GridFrames, truths: Mapping[str, GridFrames]) -> GridF
             prediction.location,
             expected=f"ground truth for the sequence {prediction.path!r}",
             found=first_names(truths, 3),
-            advice="sequences are matched by path or by name; if names differ, give single sequences",
+            advice="sequences are matched by path or by name; if names differ, give single "
+            "sequences",
         )
     return same_name[0]
 
 
-def open_grids(place: Place, grid: str | None, role: Literal["prediction", "truth"]) -> Iterator[GridFrames]:
+def open_grids(
+    place: Place, grid: str | None, role: Literal["prediction", "truth"]
+) -> Iterator[GridFrames]:
     """Yield the grids at a place: a data set, the folder of a grid, or files of another benchmark.
 
     Args:
         place: path, URL or source of the grids.
         grid: name of the grid; None takes `evaluation`, or the only grid of a sequence.
-        role: whether to look for predictions or ground truth, which are in different folders of some benchmarks.
+        role: whether to look for predictions or ground truth, which are in different folders of
+            some benchmarks.
 
     Raises:
         MissingDataError: no grid exists.
     """
     if not isinstance(place, Source):
         folder = Path(place)
-        if (folder / layout.PARAMS).is_file():  # folder of one grid; the folder above is the sequence
+        # folder of one grid; the folder above is the sequence
+        if (folder / layout.PARAMS).is_file():
             place, grid = folder.absolute().parent, folder.absolute().name
         elif folder.is_dir() and len((plain := LabelFolder(folder)).frames()):
             yield plain
@@ -253,12 +300,16 @@ def open_grids(place: Place, grid: str | None, role: Literal["prediction", "trut
             yield SequenceGrid(sequence, name)
     if not found:
         raise MissingDataError(
-            source.location, expected=f"a grid {grid or 'with labels'} in at least one sequence", found="none"
+            source.location,
+            expected=f"a grid {grid or 'with labels'} in at least one sequence",
+            found="none",
         )
 
 
 def _choose_grid(sequence: Sequence, grid: str | None) -> str | None:
-    """Return `grid`, or by default `evaluation` or the only grid; None if the sequence has no such grid."""
+    """Return `grid`, or by default `evaluation` or the only grid; None if the sequence has no such
+    grid.
+    """
     names = [name for name in sequence.grids if f"{name}/labels" in sequence.fields()]
     if grid is not None:
         return grid if grid in names else None

@@ -1,4 +1,6 @@
-"""Panoptic quality: recognition and segmentation of objects and of stuff classes (Kirillov et al., CVPR 2019)."""
+"""Panoptic quality: recognition and segmentation of objects and of stuff classes (Kirillov et al.,
+CVPR 2019).
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ class PanopticScore:
     """Panoptic quality of every class.
 
     Attributes:
-        pq: (K,) panoptic quality, `sq * rq`; NaN for a class without any segment, and for free space.
+        pq: (K,) panoptic quality, `sq * rq`; NaN for a class without any segment, and for free
+            space.
         sq: (K,) segmentation quality: mean IoU of the matched segments.
         rq: (K,) recognition quality: F1 score of finding segments.
         iou: (K,) IoU of each class over elements, for PQ-dagger.
@@ -37,16 +40,26 @@ class PanopticScore:
     iou: NDArray[np.float64]
     things: frozenset[int]
 
-    def mean(self, what: Literal["pq", "sq", "rq"] = "pq", which: Literal["all", "things", "stuff"] = "all") -> float:
-        """Return the mean over the occurring classes: all, only things, or only stuff; NaN if none occurs."""
+    def mean(
+        self,
+        what: Literal["pq", "sq", "rq"] = "pq",
+        which: Literal["all", "things", "stuff"] = "all",
+    ) -> float:
+        """Return the mean over the occurring classes: all, only things, or only stuff; NaN if none
+        occurs.
+        """
         values = getattr(self, what)
         is_thing = np.isin(np.arange(len(values)), sorted(self.things))
-        keep = {"all": np.ones_like(is_thing), "things": is_thing, "stuff": ~is_thing}[which] & ~np.isnan(self.pq)
+        keep = {"all": np.ones_like(is_thing), "things": is_thing, "stuff": ~is_thing}[
+            which
+        ] & ~np.isnan(self.pq)
         return float(values[keep].mean()) if keep.any() else float("nan")
 
     @property
     def pq_dagger(self) -> float:
-        """PQ-dagger: the mean over classes of PQ for things and of IoU for stuff (Porzi et al., CVPR 2019)."""
+        """PQ-dagger: the mean over classes of PQ for things and of IoU for stuff (Porzi et al.,
+        CVPR 2019).
+        """
         is_thing = np.isin(np.arange(len(self.pq)), sorted(self.things))
         values = np.where(is_thing, self.pq, self.iou)[~np.isnan(self.pq)]
         return float(values.mean()) if len(values) else float("nan")
@@ -61,7 +74,8 @@ class Segments:
         pred_size: (P,) number of elements of each predicted segment.
         true_class: (T,) class of each true segment.
         true_size: (T,) number of elements of each true segment.
-        overlaps: (M, 3) predicted segment, true segment, and number of common elements; only pairs with equal classes.
+        overlaps: (M, 3) predicted segment, true segment, and number of common elements; only pairs
+            with equal classes.
     """
 
     pred_class: NDArray[np.int64]
@@ -74,33 +88,54 @@ class Segments:
 class PanopticQuality(Summed):
     """Accumulates matched segments of predictions and ground truth.
 
-    A predicted and a true segment match if they have the same class and an IoU above 0.5. Free elements belong to no segment.
+    A predicted and a true segment match if they have the same class and an IoU above 0.5. Free
+    elements belong to no segment.
 
     Attributes:
         num_classes: K; ids are 0..K-1.
-        things: ids of classes with separate instances; for other classes, all elements of a frame are one segment.
+        things: ids of classes with separate instances; for other classes, all elements of a frame
+            are one segment.
         free: id of free space.
-        variant: "standard", or "pasco": as in the evaluation script of PaSCo, a stuff segment matches the true segment of its class at any
-            overlap. Stuff is then never a false positive if its class occurs in the ground truth.
+        variant: "standard", or "pasco": as in the evaluation script of PaSCo, a stuff segment
+            matches the true segment of its class at any overlap. Stuff is then never a false
+            positive if its class occurs in the ground truth.
     """
 
-    _SETTINGS, _SUMS = ("num_classes", "things", "free", "variant"), ("counts", "iou_sum", "elements")
+    _SETTINGS, _SUMS = (
+        ("num_classes", "things", "free", "variant"),
+        ("counts", "iou_sum", "elements"),
+    )
 
     def __init__(
-        self, num_classes: int, things: frozenset[int], *, free: int = 0, variant: Variant = "standard"
+        self,
+        num_classes: int,
+        things: frozenset[int],
+        *,
+        free: int = 0,
+        variant: Variant = "standard",
     ) -> None:
         if variant not in ("standard", "pasco"):
             raise ArgumentError("variant", expected="standard or pasco", found=repr(variant))
-        if not 0 <= free < num_classes or any(not 0 <= thing < num_classes or thing == free for thing in things):
+        if not 0 <= free < num_classes or any(
+            not 0 <= thing < num_classes or thing == free for thing in things
+        ):
             raise ArgumentError(
-                "things", expected=f"class ids below {num_classes} other than free", found=str(sorted(things))
+                "things",
+                expected=f"class ids below {num_classes} other than free",
+                found=str(sorted(things)),
             )
-        self.num_classes, self.things, self.free, self.variant = num_classes, frozenset(things), free, variant
+        self.num_classes, self.things, self.free, self.variant = (
+            num_classes,
+            frozenset(things),
+            free,
+            variant,
+        )
         self.reset()
 
     def reset(self) -> None:
         """Set all sums to zero."""
-        self.counts = np.zeros((3, self.num_classes), np.int64)  # true positives, false positives, false negatives
+        # true positives, false positives, false negatives
+        self.counts = np.zeros((3, self.num_classes), np.int64)
         self.iou_sum = np.zeros(self.num_classes)
         self.elements = np.zeros((3, self.num_classes), np.int64)  # common, predicted, true
 
@@ -113,7 +148,8 @@ class PanopticQuality(Summed):
         """Add a frame.
 
         Args:
-            prediction: class ids and instance ids, of equal shape. Instance ids of stuff are ignored.
+            prediction: class ids and instance ids, of equal shape. Instance ids of stuff are
+                ignored.
             truth: true class ids and instance ids, of the same shape.
             mask: the same shape, bool: only these elements are scored; None scores all.
 
@@ -139,7 +175,10 @@ class PanopticQuality(Summed):
         return self
 
     def add(self, segments: Segments, *, fewest: int = 0) -> None:
-        """Add the segments of a frame. Unmatched segments with fewer than `fewest` elements are ignored."""
+        """Add the segments of a frame.
+
+        Unmatched segments with fewer than `fewest` elements are ignored.
+        """
         pred, true, common = segments.overlaps.T
         iou = common / (segments.pred_size[pred] + segments.true_size[true] - common)
         is_stuff = ~np.isin(segments.true_class[true], sorted(self.things))
@@ -157,9 +196,15 @@ class PanopticQuality(Summed):
             missed = size >= fewest
             missed[matched] = False
             self.counts[row] += np.bincount(classes[missed], minlength=k)
-        self.elements[0] += np.bincount(segments.true_class[true], common, minlength=k).astype(np.int64)
-        self.elements[1] += np.bincount(segments.pred_class, segments.pred_size, minlength=k).astype(np.int64)
-        self.elements[2] += np.bincount(segments.true_class, segments.true_size, minlength=k).astype(np.int64)
+        self.elements[0] += np.bincount(segments.true_class[true], common, minlength=k).astype(
+            np.int64
+        )
+        self.elements[1] += np.bincount(
+            segments.pred_class, segments.pred_size, minlength=k
+        ).astype(np.int64)
+        self.elements[2] += np.bincount(
+            segments.true_class, segments.true_size, minlength=k
+        ).astype(np.int64)
 
     def compute(self) -> PanopticScore:
         """Return the score of all added frames."""
@@ -170,7 +215,11 @@ class PanopticQuality(Summed):
         pq = np.where(occurs, np.nan_to_num(sq) * np.nan_to_num(rq), np.nan)
         common, predicted, true = self.elements
         return PanopticScore(
-            pq, np.where(occurs, np.nan_to_num(sq), np.nan), rq, ratio(common, predicted + true - common), self.things
+            pq,
+            np.where(occurs, np.nan_to_num(sq), np.nan),
+            rq,
+            ratio(common, predicted + true - common),
+            self.things,
         )
 
 
@@ -187,18 +236,23 @@ def match_segments(
     Args:
         prediction: (N,) class ids and (N,) instance ids; equal pairs are one segment.
         truth: (N,) true class ids and (N,) true instance ids.
-        things: ids of classes with separate instances; for other classes, all elements are one segment. None: all classes are things.
+        things: ids of classes with separate instances; for other classes, all elements are one
+            segment. None: all classes are things.
         overlap: (N,) bool: elements that can be common elements; None for all.
         free: class id of elements without a segment.
 
     Returns:
         The segments, without the free class.
     """
-    sides = [np.ascontiguousarray(array).reshape(-1) for side in (prediction, truth) for array in side]
+    sides = [
+        np.ascontiguousarray(array).reshape(-1) for side in (prediction, truth) for array in side
+    ]
     may_overlap = np.ones(1, np.bool_) if overlap is None else overlap
     is_thing = np.ones(1, np.bool_)
     if things is not None:
-        is_thing = np.zeros(1 + max((int(side.max(initial=0)) for side in sides[::2]), default=0), np.bool_)
+        is_thing = np.zeros(
+            1 + max((int(side.max(initial=0)) for side in sides[::2]), default=0), np.bool_
+        )
         is_thing[[thing for thing in things if thing < len(is_thing)]] = True
     pred_keys, pred_size, true_keys, true_size, overlaps = _match(
         sides[0], sides[1], sides[2], sides[3], is_thing, may_overlap, free
@@ -209,9 +263,11 @@ def match_segments(
 
 @cached(error_model="python")
 def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, free):  # type: ignore[no-untyped-def]
-    """Number the segments of both sides in order of occurrence, and count elements and overlaps, in one pass.
+    """Number the segments of both sides in order of occurrence, and count elements and overlaps, in
+    one pass.
 
-    Neighbouring elements mostly belong to few segments. Small tables of recent segments, indexed by the key, avoid most look-ups.
+    Neighbouring elements mostly belong to few segments. Small tables of recent segments, indexed by
+    the key, avoid most look-ups.
     """
     numbers = {np.int64(-1): np.int64(-1)}  # number of a segment by side and key
     keys = [[np.int64(0) for _ in range(0)] for _ in range(2)]
@@ -228,7 +284,9 @@ def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, fr
         for side in range(2):
             if not (has_pred if side == 0 else has_true):
                 continue
-            label, instance = (pred_class[n], pred_ids[n]) if side == 0 else (true_class[n], true_ids[n])
+            label, instance = (
+                (pred_class[n], pred_ids[n]) if side == 0 else (true_class[n], true_ids[n])
+            )
             key = np.int64(label) << 32
             if all_things or is_thing[label]:
                 key |= np.int64(instance)
@@ -247,7 +305,9 @@ def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, fr
             slot = (number[0] + 7 * number[1]) & (_SLOTS - 1)
             if open_pairs[slot] != pair:
                 if open_pairs[slot] >= 0:
-                    pairs[open_pairs[slot]] = pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
+                    pairs[open_pairs[slot]] = (
+                        pairs.get(open_pairs[slot], np.int64(0)) + open_counts[slot]
+                    )
                 open_pairs[slot], open_counts[slot] = pair, np.int64(0)
             open_counts[slot] += np.int64(1)
     for slot in np.arange(_SLOTS):
@@ -257,6 +317,10 @@ def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, fr
     row = 0
     for pair, count in pairs.items():
         if pair >= 0:
-            overlaps[row, 0], overlaps[row, 1], overlaps[row, 2] = pair >> 32, pair & 0xFFFFFFFF, count
+            overlaps[row, 0], overlaps[row, 1], overlaps[row, 2] = (
+                pair >> 32,
+                pair & 0xFFFFFFFF,
+                count,
+            )
             row += 1
     return np.array(keys[0]), np.array(sizes[0]), np.array(keys[1]), np.array(sizes[1]), overlaps

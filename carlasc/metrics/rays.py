@@ -1,7 +1,8 @@
-"""RayIoU and RayPQ (SparseOcc): comparison of grids by the first surface on each ray instead of voxel by voxel.
+"""RayIoU and RayPQ (SparseOcc): comparison of grids by the first surface on each ray instead of
+voxel by voxel.
 
-A wall that is predicted too thick reduces the IoU of voxels, although its visible surface is correct. Rays from sensor positions along the
-trajectory compare only the first surface.
+A wall that is predicted too thick reduces the IoU of voxels, although its visible surface is
+correct. Rays from sensor positions along the trajectory compare only the first surface.
 """
 
 from __future__ import annotations
@@ -23,14 +24,17 @@ from carlasc.metrics.scoring import Summed
 
 THRESHOLDS_M = (1.0, 2.0, 4.0)
 _MOST_ORIGINS = 8
-_MARGIN_M = (
-    1.0  # minimum distance of origins from the sides of the grid: up to 39 m in the grid of Occ3D, which ends at 40 m
-)
+# minimum distance of origins from the sides of the grid: up to 39 m in the grid of Occ3D, which
+# ends at 40 m
+_MARGIN_M = 1.0
 _FEWEST_RAYS = 10  # segments with fewer rays are not counted as false negatives or false positives
 
 
-def ray_origins(world_T_sensors: NDArray[np.float64], frame: int, spec: GridSpec) -> NDArray[np.float64]:
-    """Return the ray origins of a frame: sensor positions along the trajectory that are inside the grid of the frame.
+def ray_origins(
+    world_T_sensors: NDArray[np.float64], frame: int, spec: GridSpec
+) -> NDArray[np.float64]:
+    """Return the ray origins of a frame: sensor positions along the trajectory that are inside the
+    grid of the frame.
 
     Args:
         world_T_sensors: (F, 4, 4) poses of the (key) frames of the sequence.
@@ -38,8 +42,8 @@ def ray_origins(world_T_sensors: NDArray[np.float64], frame: int, spec: GridSpec
         spec: the grid of the frame.
 
     Returns:
-        (O, 3) metres, in the sensor frame of the scored frame. At most 8 positions, evenly selected from those that are at least 1 m from
-        the sides of the grid in x and y.
+        (O, 3) metres, in the sensor frame of the scored frame. At most 8 positions, evenly selected
+        from those that are at least 1 m from the sides of the grid in x and y.
     """
     here: Transform = invert(world_T_sensors[frame])
     places = (here @ world_T_sensors)[:, :3, 3]
@@ -56,7 +60,8 @@ class RayScore:
     """RayIoU of all rays.
 
     Attributes:
-        class_iou: (T, K) IoU of each class at each depth threshold; NaN for classes that do not occur in prediction or ground truth.
+        class_iou: (T, K) IoU of each class at each depth threshold; NaN for classes that do not
+            occur in prediction or ground truth.
         thresholds_m: (T,) metres.
         free: id of free space, which is not scored.
     """
@@ -80,18 +85,22 @@ class RayScore:
 class RayIoU(Summed):
     """Accumulates the first surfaces on rays through predicted and true grids.
 
-    A ray is correct if the first voxels of prediction and ground truth have the same class, and their distances differ by less than a
-    threshold. Rays without a surface in the ground truth are left out. IoU is computed from counts summed over all frames.
+    A ray is correct if the first voxels of prediction and ground truth have the same class, and
+    their distances differ by less than a threshold. Rays without a surface in the ground truth are
+    left out. IoU is computed from counts summed over all frames.
 
     Attributes:
         num_classes: K; ids are 0..K-1.
         free: id of free space.
         thresholds_m: maximum differences of distances, metres.
-        skip_unknown: leave out rays that cross an unknown voxel before the first surface of the ground truth. In the original metric, unknown
-            voxels count as free.
+        skip_unknown: leave out rays that cross an unknown voxel before the first surface of the
+            ground truth. In the original metric, unknown voxels count as free.
     """
 
-    _SETTINGS, _SUMS = ("num_classes", "free", "thresholds_m", "skip_unknown"), ("true", "predicted", "hits")
+    _SETTINGS, _SUMS = (
+        ("num_classes", "free", "thresholds_m", "skip_unknown"),
+        ("true", "predicted", "hits"),
+    )
 
     def __init__(
         self,
@@ -102,12 +111,17 @@ class RayIoU(Summed):
         skip_unknown: bool = False,
         directions: ArrayLike | None = None,
     ) -> None:
-        """Create an empty metric. `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`."""
+        """Create an empty metric.
+
+        `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
+        """
         if not 0 <= free < num_classes:
             raise ArgumentError("free", expected=f"a class id below {num_classes}", found=str(free))
         self.num_classes, self.free, self.thresholds_m = num_classes, free, tuple(thresholds_m)
         self.skip_unknown = skip_unknown
-        self.directions = rayiou_directions() if directions is None else np.asarray(directions, np.float64)
+        self.directions = (
+            rayiou_directions() if directions is None else np.asarray(directions, np.float64)
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -127,7 +141,8 @@ class RayIoU(Summed):
         """Add a frame.
 
         Args:
-            prediction: (X, Y, Z) class ids, NumPy or a torch tensor; rays are cast on the device of a tensor.
+            prediction: (X, Y, Z) class ids, NumPy or a torch tensor; rays are cast on the device of
+                a tensor.
             truth: (X, Y, Z) class ids, NumPy or a torch tensor.
             spec: geometry of both, Cartesian.
             origins: (O, 3) ray origins, metres, in the frame of the grid (see `ray_origins`).
@@ -145,9 +160,12 @@ class RayIoU(Summed):
         grids = [pred, true]
         if self.skip_unknown:
             if known is None:
-                raise ArgumentError("known", expected="the known voxels of the ground truth", found="None")
+                raise ArgumentError(
+                    "known", expected="the known voxels of the ground truth", found="None"
+                )
             seen = np.asarray(known, np.bool_)
-            grids.append(np.where(seen, true, self.num_classes).astype(np.uint16))  # unknown voxels stop a ray here
+            # unknown voxels stop a ray here
+            grids.append(np.where(seen, true, self.num_classes).astype(np.uint16))
         voxels, depths = self._cast(np.stack(grids), spec, np.asarray(origins), device)
         valid = voxels[1] >= 0
         if self.skip_unknown:
@@ -160,7 +178,9 @@ class RayIoU(Summed):
         self.predicted += np.bincount(flat_pred, minlength=self.num_classes)
         same = flat_pred == flat_true
         for row, threshold in enumerate(self.thresholds_m):
-            self.hits[row] += np.bincount(flat_true[same & (off < threshold)], minlength=self.num_classes)
+            self.hits[row] += np.bincount(
+                flat_true[same & (off < threshold)], minlength=self.num_classes
+            )
         return self
 
     def _cast(
@@ -172,7 +192,9 @@ class RayIoU(Summed):
         import torch
 
         on_device = torch.from_numpy(grids.astype(np.int32)).to(device)
-        voxels, depths = cast_rays_on_device(on_device, spec, origins, self.directions, free=self.free)
+        voxels, depths = cast_rays_on_device(
+            on_device, spec, origins, self.directions, free=self.free
+        )
         return voxels.cpu().numpy(), depths.cpu().numpy()
 
     def compute(self) -> RayScore:
@@ -184,17 +206,25 @@ class RayIoU(Summed):
         array = to_numpy(labels)
         if array.shape != spec.size:
             raise FormatError(name, expected=f"shape {spec.size}", found=str(array.shape))
-        if array.dtype.kind not in "ui" or (array.size and (array.min() < 0 or array.max() >= self.num_classes)):
-            found = f"{array.dtype} from {array.min()} to {array.max()}" if array.size else str(array.dtype)
+        if array.dtype.kind not in "ui" or (
+            array.size and (array.min() < 0 or array.max() >= self.num_classes)
+        ):
+            found = (
+                f"{array.dtype} from {array.min()} to {array.max()}"
+                if array.size
+                else str(array.dtype)
+            )
             raise FormatError(name, expected=f"class ids 0..{self.num_classes - 1}", found=found)
         return array.astype(np.uint16, copy=False)
 
 
 class RayPQ:
-    """Panoptic quality of rays (SparseOcc): segments are sets of rays, and rays are common only if their depths agree within a threshold.
+    """Panoptic quality of rays (SparseOcc): segments are sets of rays, and rays are common only if
+    their depths agree within a threshold.
 
-    Segments match at an IoU above 0.5. Each stuff class of the ground truth is one segment. Segments with fewer than 10 rays are not counted as false
-    negatives or false positives. The arguments are those of `RayIoU`; `things` are the ids of classes with separate instances.
+    Segments match at an IoU above 0.5. Each stuff class of the ground truth is one segment.
+    Segments with fewer than 10 rays are not counted as false negatives or false positives. The
+    arguments are those of `RayIoU`; `things` are the ids of classes with separate instances.
     """
 
     def __init__(
@@ -206,14 +236,27 @@ class RayPQ:
         thresholds_m: tuple[float, ...] = THRESHOLDS_M,
         directions: ArrayLike | None = None,
     ) -> None:
-        """Create an empty metric. `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`."""
-        self.num_classes, self.things, self.free, self.thresholds_m = num_classes, things, free, tuple(thresholds_m)
-        self.directions = rayiou_directions() if directions is None else np.asarray(directions, np.float64)
+        """Create an empty metric.
+
+        `directions` are (R, 3) unit vectors of the rays; None takes `rayiou_directions`.
+        """
+        self.num_classes, self.things, self.free, self.thresholds_m = (
+            num_classes,
+            things,
+            free,
+            tuple(thresholds_m),
+        )
+        self.directions = (
+            rayiou_directions() if directions is None else np.asarray(directions, np.float64)
+        )
         self.reset()
 
     def reset(self) -> None:
         """Set all sums to zero."""
-        self.qualities = [PanopticQuality(self.num_classes, self.things, free=self.free) for _ in self.thresholds_m]
+        self.qualities = [
+            PanopticQuality(self.num_classes, self.things, free=self.free)
+            for _ in self.thresholds_m
+        ]
 
     def update(
         self,
@@ -230,8 +273,12 @@ class RayPQ:
             spec: geometry of both, Cartesian.
             origins: (O, 3) ray origins, metres, in the frame of the grid (see `ray_origins`).
         """
-        (pred, pred_ids), (true, true_ids) = ([to_numpy(a) for a in side] for side in (prediction, truth))
-        voxels, depths = cast_rays(np.stack([pred, true]), spec, np.asarray(origins), self.directions, free=self.free)
+        (pred, pred_ids), (true, true_ids) = (
+            [to_numpy(a) for a in side] for side in (prediction, truth)
+        )
+        voxels, depths = cast_rays(
+            np.stack([pred, true]), spec, np.asarray(origins), self.directions, free=self.free
+        )
         valid = (voxels[1] >= 0) & (true.reshape(-1)[voxels[1]] != self.free)
         near, far = voxels[0][valid], voxels[1][valid]
         classes = pred.reshape(-1)[near], true.reshape(-1)[far]
@@ -246,8 +293,13 @@ class RayPQ:
         return self
 
     def compute(self) -> Mapping[float, PanopticScore]:
-        """Return the panoptic score at each depth threshold, metres; RayPQ is the mean of their `pq`."""
-        return {t: quality.compute() for t, quality in zip(self.thresholds_m, self.qualities, strict=True)}
+        """Return the panoptic score at each depth threshold, metres; RayPQ is the mean of their
+        `pq`.
+        """
+        return {
+            t: quality.compute()
+            for t, quality in zip(self.thresholds_m, self.qualities, strict=True)
+        }
 
     def merge(self, other: RayPQ) -> Self:
         """Add the sums of another metric with the same settings.

@@ -1,4 +1,6 @@
-"""Masks of voxels to score, (X, Y, Z) bool, which can be combined with `&`; and separate scores by distance, height, visibility and motion."""
+"""Masks of voxels to score, (X, Y, Z) bool, which can be combined with `&`; and separate scores by
+distance, height, visibility and motion.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,17 @@ Masks = Mapping[str, NDArray[np.bool_]]
 
 
 def known(counts: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return the voxels with votes (count > 0), bool with the shape of `counts`: the rule of the data set."""
+    """Return the voxels with votes (count > 0), bool with the shape of `counts`: the rule of the
+    data set.
+    """
     return counts > 0
 
 
-def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) -> NDArray[np.bool_]:
-    """Return the voxels whose centre is at a horizontal distance of `near_m <= r < far_m` from the sensor.
+def distance_band(
+    spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf
+) -> NDArray[np.bool_]:
+    """Return the voxels whose centre is at a horizontal distance of `near_m <= r < far_m` from the
+    sensor.
 
     Args:
         spec: geometry of the grid.
@@ -41,7 +48,9 @@ def distance_band(spec: GridSpec, near_m: float = 0.0, far_m: float = math.inf) 
     if not near_m >= 0:
         raise ArgumentError("near_m", expected="0 or more", found=f"{near_m:g}")
     if not far_m > near_m:
-        raise ArgumentError("far_m", expected=f"more than {near_m:g}, the value of `near_m`", found=f"{far_m:g}")
+        raise ArgumentError(
+            "far_m", expected=f"more than {near_m:g}, the value of `near_m`", found=f"{far_m:g}"
+        )
     centers = spec.from_axes(spec.centers())
     distance = np.hypot(centers[..., 0], centers[..., 1])
     return np.asarray((distance >= near_m) & (distance < far_m))
@@ -56,45 +65,66 @@ def field_of_view(
 
     Args:
         spec: geometry of the grid, in the sensor frame.
-        horizontal_rad: horizontal opening angle, centred on the x axis (forward), radians; pi / 2 for a camera of 90 degrees.
-        vertical_rad: lowest and highest elevation, radians. The LiDAR of the data set has -25 to +2 degrees.
+        horizontal_rad: horizontal opening angle, centred on the x axis (forward), radians; pi / 2
+            for a camera of 90 degrees.
+        vertical_rad: lowest and highest elevation, radians. The LiDAR of the data set has -25 to +2
+            degrees.
 
     Raises:
-        ArgumentError: `horizontal_rad` is not in (0, 2 pi], or the lowest elevation is not below the highest.
+        ArgumentError: `horizontal_rad` is not in (0, 2 pi], or the lowest elevation is not below
+            the highest.
     """
     low, high = vertical_rad
     if not 0 < horizontal_rad <= 2 * math.pi:
-        raise ArgumentError("horizontal_rad", expected="an angle in (0, 2 pi]", found=f"{horizontal_rad:g}")
+        raise ArgumentError(
+            "horizontal_rad", expected="an angle in (0, 2 pi]", found=f"{horizontal_rad:g}"
+        )
     if not low < high:
-        raise ArgumentError("vertical_rad", expected="(lowest, highest) elevation", found=f"({low:g}, {high:g})")
+        raise ArgumentError(
+            "vertical_rad", expected="(lowest, highest) elevation", found=f"({low:g}, {high:g})"
+        )
     x, y, z = np.moveaxis(spec.from_axes(spec.centers()), -1, 0)
     elevation = np.arctan2(z, np.hypot(x, y))
-    seen = (np.abs(np.arctan2(y, x)) <= horizontal_rad / 2) & (elevation >= low) & (elevation <= high)
+    seen = (
+        (np.abs(np.arctan2(y, x)) <= horizontal_rad / 2) & (elevation >= low) & (elevation <= high)
+    )
     return np.asarray(seen)
 
 
 def distance_bands(spec: GridSpec, edges_m: Sequence[float] = (0, 10, 20, 30)) -> Masks:
-    """Return a mask for each band of horizontal distance from the sensor, between consecutive edges, metres."""
-    return {f"{near:g}-{far:g} m": distance_band(spec, near, far) for near, far in pairwise(edges_m)}
+    """Return a mask for each band of horizontal distance from the sensor, between consecutive
+    edges, metres.
+    """
+    return {
+        f"{near:g}-{far:g} m": distance_band(spec, near, far) for near, far in pairwise(edges_m)
+    }
 
 
 def height_bands(spec: GridSpec, edges_m: Sequence[float]) -> Masks:
-    """Return a mask for each band of height of voxel centres, between consecutive edges, metres in the sensor frame.
+    """Return a mask for each band of height of voxel centres, between consecutive edges, metres in
+    the sensor frame.
 
     Raises:
         ArgumentError: the edges are not increasing.
     """
     if len(edges_m) < 2 or any(low >= high for low, high in pairwise(edges_m)):
-        raise ArgumentError("edges_m", expected="two or more increasing heights", found=str(list(edges_m)))
+        raise ArgumentError(
+            "edges_m", expected="two or more increasing heights", found=str(list(edges_m))
+        )
     height = spec.centers()[..., 2]
-    return {f"{low:g}-{high:g} m up": (height >= low) & (height < high) for low, high in pairwise(edges_m)}
+    return {
+        f"{low:g}-{high:g} m up": (height >= low) & (height < high)
+        for low, high in pairwise(edges_m)
+    }
 
 
 def visibility(truth: Grid, origin: ArrayLike = (0.0, 0.0, 0.0), *, free: int = 0) -> Masks:
-    """Return masks of the voxels that are visible and hidden from the sensor in this frame, according to the true grid.
+    """Return masks of the voxels that are visible and hidden from the sensor in this frame,
+    according to the true grid.
 
-    A voxel is visible if no occupied voxel of the ground truth is between the sensor and the centre of the voxel. Hidden voxels are not
-    observed by the scan of the frame, so a network has to complete them.
+    A voxel is visible if no occupied voxel of the ground truth is between the sensor and the centre
+    of the voxel. Hidden voxels are not observed by the scan of the frame, so a network has to
+    complete them.
 
     Args:
         truth: the true grid, Cartesian.
@@ -115,7 +145,8 @@ def visibility(truth: Grid, origin: ArrayLike = (0.0, 0.0, 0.0), *, free: int = 
 
 
 def motion(truth: Grid, scan: Scan, movable: Sequence[int], *, min_speed_m_s: float = 0.3) -> Masks:
-    """Return masks of the voxels of moving objects, and of movable objects at rest, from the flow of the scan of the frame.
+    """Return masks of the voxels of moving objects, and of movable objects at rest, from the flow
+    of the scan of the frame.
 
     Args:
         truth: the true grid.
@@ -124,7 +155,8 @@ def motion(truth: Grid, scan: Scan, movable: Sequence[int], *, min_speed_m_s: fl
         min_speed_m_s: minimum speed of moving points, m/s.
 
     Returns:
-        Masks "moving" and "standing", (X, Y, Z) bool. Voxels of movable classes without a point are in neither.
+        Masks "moving" and "standing", (X, Y, Z) bool. Voxels of movable classes without a point are
+        in neither.
 
     Raises:
         ArgumentError: the scan has no flow.
@@ -148,7 +180,13 @@ class Breakdown:
         self.num_classes, self.free = num_classes, free
         self.matrices: dict[str, ConfusionMatrix] = {}
 
-    def update(self, prediction: ArrayLike, truth: ArrayLike, masks: Masks, counted: ArrayLike | None = None) -> Self:
+    def update(
+        self,
+        prediction: ArrayLike,
+        truth: ArrayLike,
+        masks: Masks,
+        counted: ArrayLike | None = None,
+    ) -> Self:
         """Add a frame: for each region, the scored voxels of its mask.
 
         Args:

@@ -1,7 +1,9 @@
-"""The scores of predictions over a data set, confidence intervals, and tables as text, LaTeX and CSV.
+"""The scores of predictions over a data set, confidence intervals, and tables as text, LaTeX and
+CSV.
 
-Confidence intervals are computed by bootstrap over sequences, and a paired test compares two predictions. Both resample sequences instead of
-frames, because the frames of one sequence show nearly the same scene.
+Confidence intervals are computed by bootstrap over sequences, and a paired test compares two
+predictions. Both resample sequences instead of frames, because the frames of one sequence show
+nearly the same scene.
 """
 
 from __future__ import annotations
@@ -52,9 +54,13 @@ class FigureTable:
         return _csv([self.header, *self.texts()])
 
     def to_latex(self) -> str:
-        r"""Return the table as a LaTeX `tabular` with the lines of the package booktabs (\toprule, \midrule, \bottomrule)."""
+        r"""Return the table as a LaTeX `tabular` with the lines of the package booktabs (\toprule,
+        \midrule, \bottomrule).
+        """
         escaped = str.maketrans({letter: f"\\{letter}" for letter in "&%$#_{}"})
-        rows = [[cell.translate(escaped) for cell in row] for row in [list(self.header), *self.texts()]]
+        rows = [
+            [cell.translate(escaped) for cell in row] for row in [list(self.header), *self.texts()]
+        ]
         lines = [" & ".join(row) + r" \\" for row in rows]
         body = "\n".join([r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"])
         columns = "l" + "r" * (len(self.header) - 1)
@@ -90,7 +96,9 @@ class FrameScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The scores of predictions. All scores are computed from the sum of the confusion matrices of all frames.
+    """The scores of predictions.
+
+    All scores are computed from the sum of the confusion matrices of all frames.
 
     Attributes:
         name: name of the predictions: of a network, or of the place where they are stored.
@@ -132,7 +140,9 @@ class Evaluation:
 
     @property
     def class_iou(self) -> dict[str, float]:
-        """IoU by name of each class of the mean; NaN for classes that do not occur in the prediction or the ground truth."""
+        """IoU by name of each class of the mean; NaN for classes that do not occur in the
+        prediction or the ground truth.
+        """
         return dict(self.score.class_iou)
 
     @property
@@ -142,16 +152,23 @@ class Evaluation:
 
     @property
     def miou_without_free(self) -> float:
-        """Mean IoU over the classes of the convention except free. Absent classes count as zero, as in the paper."""
+        """Mean IoU over the classes of the convention except free.
+
+        Absent classes count as zero, as in the paper.
+        """
         free = self.classes.names[self.convention.free]
         values = [0.0 if math.isnan(v) else v for name, v in self.class_iou.items() if name != free]
         return sum(values) / len(values) if values else math.nan
 
     def interval(self, level: float = 0.95) -> Interval | None:
-        """Return the confidence interval of `miou` by bootstrap over sequences; None for fewer than five sequences."""
+        """Return the confidence interval of `miou` by bootstrap over sequences; None for fewer than
+        five sequences.
+        """
         if len(self.sequences) < _FEWEST_SEQUENCES:
             return None
-        return bootstrap(list(self.sequences.values()), lambda m: self.convention.score(m).miou, level=level)
+        return bootstrap(
+            list(self.sequences.values()), lambda m: self.convention.score(m).miou, level=level
+        )
 
     def compare(self, other: Evaluation) -> Comparison:
         """Compare with other predictions of the same sequences by a paired test.
@@ -160,18 +177,29 @@ class Evaluation:
             ArgumentError: the conventions differ, or fewer than five sequences are common.
         """
         if other.convention.name != self.convention.name:
-            raise ArgumentError("other", expected=f"scores by {self.convention.name}", found=other.convention.name)
+            raise ArgumentError(
+                "other", expected=f"scores by {self.convention.name}", found=other.convention.name
+            )
         return compare(self.sequences, other.sequences, lambda m: self.convention.score(m).miou)
 
     def tables(self) -> tuple[FigureTable, ...]:
-        """Return the two tables of the paper, IoU of each class and completeness, and a table of regions if requested."""
+        """Return the two tables of the paper, IoU of each class and completeness, and a table of
+        regions if requested.
+        """
         tables = semantic_table([self]), geometric_table([self]), *self._actor_tables()
         if not self.breakdown:
             return tables
         rows: list[tuple[Cell, ...]] = []
         for name, matrix in self.breakdown.items():
             score = self.convention.score(matrix)
-            rows.append((name, *_percent(score.miou, score.precision, score.recall, score.iou, score.false_free)))
+            rows.append(
+                (
+                    name,
+                    *_percent(
+                        score.miou, score.precision, score.recall, score.iou, score.false_free
+                    ),
+                )
+            )
         header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
         return (*tables, FigureTable("By region", header, tuple(rows)))
 
@@ -183,16 +211,42 @@ class Evaluation:
         found = [label for label in sorted(names) if not math.isnan(score.pq[label])]
         lstq = (self.actors.tracking.lstq, self.actors.tracking.association)
         row = _percent(*score.pq[found].tolist(), score.mean(), score.mean(which="things"), *lstq)
-        header = ("Network", *(names[label] for label in found), "PQ", "PQ of things", "LSTQ", "S_assoc")
-        return (FigureTable("Actors: panoptic quality of each class, and over time", header, ((self.name, *row),)),)
+        header = (
+            "Network",
+            *(names[label] for label in found),
+            "PQ",
+            "PQ of things",
+            "LSTQ",
+            "S_assoc",
+        )
+        return (
+            FigureTable(
+                "Actors: panoptic quality of each class, and over time",
+                header,
+                ((self.name, *row),),
+            ),
+        )
 
     def to_csv(self) -> str:
         """Return the scores of each frame as CSV."""
-        rows = [["sequence", "frame", "miou", "iou", "precision", "recall", "false_free", *self.class_iou]]
+        rows = [
+            [
+                "sequence",
+                "frame",
+                "miou",
+                "iou",
+                "precision",
+                "recall",
+                "false_free",
+                *self.class_iou,
+            ]
+        ]
         for frame in self.frame_scores:
             score = frame.score
             figures = [score.miou, score.iou, score.precision, score.recall, score.false_free]
-            cells = ["" if math.isnan(v) else f"{v:.6f}" for v in (*figures, *score.class_iou.values())]
+            cells = [
+                "" if math.isnan(v) else f"{v:.6f}" for v in (*figures, *score.class_iou.values())
+            ]
             rows.append([frame.sequence, frame.frame, *cells])
         return _csv(rows)
 
@@ -221,8 +275,14 @@ class Evaluation:
             "rayiou": None if self.rays is None else _number(self.rays.rayiou),
             "actors": None if self.actors is None else self.actors.to_dict(self.classes),
             "breakdown": {
-                name: {"miou": _number(part.miou), "iou": _number(part.iou), "false_free": _number(part.false_free)}
-                for name, part in ((name, self.convention.score(matrix)) for name, matrix in self.breakdown.items())
+                name: {
+                    "miou": _number(part.miou),
+                    "iou": _number(part.iou),
+                    "false_free": _number(part.false_free),
+                }
+                for name, part in (
+                    (name, self.convention.score(matrix)) for name, matrix in self.breakdown.items()
+                )
             },
             "confusion": self.matrix.counts.tolist(),
             "notes": list(self.notes),
@@ -239,7 +299,9 @@ def semantic_table(evaluations: Sequence[Evaluation]) -> FigureTable:
     conventions = {evaluation.convention.name for evaluation in evaluations}
     if len(conventions) != 1:
         raise ArgumentError(
-            "evaluations", expected="evaluations by one convention", found=", ".join(sorted(conventions)) or "none"
+            "evaluations",
+            expected="evaluations by one convention",
+            found=", ".join(sorted(conventions)) or "none",
         )
     first = evaluations[0].convention
     with_free = first.free in first.averaged
@@ -252,17 +314,25 @@ def semantic_table(evaluations: Sequence[Evaluation]) -> FigureTable:
         means = [e.miou, *([e.miou_without_free] if with_free else []), e.matrix.accuracy]
         means += [math.nan if e.rays is None else e.rays.rayiou] if rayed else []
         rows.append((e.name, *_percent(*e.class_iou.values(), *means)))
-    return FigureTable(f"Semantic scene completion, IoU of each class, by {first.title}", header, tuple(rows))
+    return FigureTable(
+        f"Semantic scene completion, IoU of each class, by {first.title}", header, tuple(rows)
+    )
 
 
 def geometric_table(evaluations: Sequence[Evaluation]) -> FigureTable:
-    """Return the table of completeness: precision, recall and IoU of occupied against free space, with one row per evaluation."""
+    """Return the table of completeness: precision, recall and IoU of occupied against free space,
+    with one row per evaluation.
+    """
     rows: list[tuple[Cell, ...]] = []
     for evaluation in evaluations:
         score = evaluation.score
-        rows.append((evaluation.name, *_percent(score.precision, score.recall, score.iou, score.false_free)))
+        rows.append(
+            (evaluation.name, *_percent(score.precision, score.recall, score.iou, score.false_free))
+        )
     header = ("Network", "Precision", "Recall", "IoU", "False free")
-    return FigureTable("Scene completion: all classes other than free count as one", header, tuple(rows))
+    return FigureTable(
+        "Scene completion: all classes other than free count as one", header, tuple(rows)
+    )
 
 
 def _percent(*values: float) -> tuple[float, ...]:
@@ -314,8 +384,11 @@ class Comparison:
         }
 
 
-def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score, *, level: float = 0.95) -> Interval:
-    """Return a score with its confidence interval by bootstrap: sequences are resampled with replacement.
+def bootstrap(
+    matrices: Sequence[ConfusionMatrix], score: Score, *, level: float = 0.95
+) -> Interval:
+    """Return a score with its confidence interval by bootstrap: sequences are resampled with
+    replacement.
 
     Args:
         matrices: confusion matrix of each sequence.
@@ -333,16 +406,22 @@ def bootstrap(matrices: Sequence[ConfusionMatrix], score: Score, *, level: float
 
 
 def compare(
-    first: Mapping[str, ConfusionMatrix], second: Mapping[str, ConfusionMatrix], score: Score, *, level: float = 0.95
+    first: Mapping[str, ConfusionMatrix],
+    second: Mapping[str, ConfusionMatrix],
+    score: Score,
+    *,
+    level: float = 0.95,
 ) -> Comparison:
     """Compare two predictions, sequence by sequence.
 
-    For the interval, the same sequences are resampled for both predictions. For the p-value, the predictions are swapped in subsets of the
-    sequences: all subsets for up to twelve sequences, 2,000 random subsets for more.
+    For the interval, the same sequences are resampled for both predictions. For the p-value, the
+    predictions are swapped in subsets of the sequences: all subsets for up to twelve sequences,
+    2,000 random subsets for more.
 
     Args:
         first: confusion matrix of each sequence of the first prediction, by path.
-        second: confusion matrix of each sequence of the second prediction, by path. Only common sequences are used.
+        second: confusion matrix of each sequence of the second prediction, by path. Only common
+            sequences are used.
         score: function that computes the score from a sum of matrices.
         level: confidence level of the interval.
 
@@ -352,7 +431,9 @@ def compare(
     """
     common = tuple(sorted(set(first) & set(second)))
     if not common:
-        raise MissingDataError("second", expected="sequences of the first", found=", ".join(sorted(second)) or "none")
+        raise MissingDataError(
+            "second", expected="sequences of the first", found=", ".join(sorted(second)) or "none"
+        )
     _check_number(len(common))
     like = first[common[0]]
     a, b = (np.stack([side[path].counts for path in common]) for side in (first, second))
@@ -370,7 +451,10 @@ def compare(
         swaps = rng.random((_DRAWS, len(common))) < 0.5
         swaps[0] = False  # the first one is the actual assignment
     swapped = [
-        difference(np.where(s[:, None, None], b, a).sum(axis=0), np.where(s[:, None, None], a, b).sum(axis=0))
+        difference(
+            np.where(s[:, None, None], b, a).sum(axis=0),
+            np.where(s[:, None, None], a, b).sum(axis=0),
+        )
         for s in swaps
     ]
     p_value = float(np.mean(np.abs(swapped) >= abs(found) - 1e-12))
@@ -380,7 +464,9 @@ def compare(
 def _check_number(sequences: int) -> None:
     if sequences < _FEWEST_SEQUENCES:
         raise ArgumentError(
-            "sequences", expected=f"at least {_FEWEST_SEQUENCES} sequences to resample", found=str(sequences)
+            "sequences",
+            expected=f"at least {_FEWEST_SEQUENCES} sequences to resample",
+            found=str(sequences),
         )
 
 

@@ -22,12 +22,16 @@ class Scoring:
     """Voxels to score, and additional scores.
 
     Attributes:
-        voxels: "known" scores the voxels of the convention; "all" also scores unknown voxels of the ground truth.
-        region: function that returns an (X, Y, Z) bool mask for a GridSpec, such as `lambda spec: distance_band(spec, 0, 10)`. Only voxels
-            in the mask are scored. With several processes, it must be picklable. None scores all voxels.
-        by: separate scores by any of "distance", "height", "visibility" (from the sensor in the frame), "motion" and "seen" (by any camera).
+        voxels: "known" scores the voxels of the convention; "all" also scores unknown voxels of the
+            ground truth.
+        region: function that returns an (X, Y, Z) bool mask for a GridSpec, such as `lambda spec:
+            distance_band(spec, 0, 10)`. Only voxels in the mask are scored. With several processes,
+            it must be picklable. None scores all voxels.
+        by: separate scores by any of "distance", "height", "visibility" (from the sensor in the
+            frame), "motion" and "seen" (by any camera).
         rays: also compute RayIoU, which needs poses and a Cartesian grid.
-        actors: also score actors and velocities. Prediction and ground truth need the field `instance`, for velocities also `velocity`.
+        actors: also score actors and velocities. Prediction and ground truth need the field
+            `instance`, for velocities also `velocity`.
 
     Raises:
         ArgumentError: a value is not valid.
@@ -43,7 +47,9 @@ class Scoring:
         if self.voxels not in ("known", "all"):
             raise ArgumentError("voxels", expected="known or all", found=repr(self.voxels))
         if unknown := [name for name in self.by if name not in BREAKDOWNS]:
-            raise ArgumentError("by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0]))
+            raise ArgumentError(
+                "by", expected=f"any of {', '.join(BREAKDOWNS)}", found=repr(unknown[0])
+            )
 
 
 class Summed:
@@ -63,7 +69,9 @@ class Summed:
         for name in self._SETTINGS:
             if (mine := getattr(self, name)) != (theirs := getattr(other, name)):
                 kind = type(self).__name__
-                raise ArgumentError("other", expected=f"a {kind} with {name} {mine}", found=f"one with {theirs}")
+                raise ArgumentError(
+                    "other", expected=f"a {kind} with {name} {mine}", found=f"one with {theirs}"
+                )
         for name in self._SUMS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         return self

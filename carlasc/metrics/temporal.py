@@ -1,4 +1,6 @@
-"""Scores over time: consistency of consecutive frames, and LSTQ for segmentation and tracking of actors (Aygün et al., CVPR 2021)."""
+"""Scores over time: consistency of consecutive frames, and LSTQ for segmentation and tracking of
+actors (Aygün et al., CVPR 2021).
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,17 @@ from carlasc.metrics.scoring import Summed
 
 
 def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
-    """Transform a grid to another frame. Each voxel takes the label of the source voxel that contains its centre.
+    """Transform a grid to another frame.
+
+    Each voxel takes the label of the source voxel that contains its centre.
 
     Args:
         grid: labels and counts in the frame `src`.
         dst_T_src: (4, 4) rigid transform.
 
     Returns:
-        A grid of the same geometry in the frame `dst`; voxels outside the source are unknown (count 0).
+        A grid of the same geometry in the frame `dst`; voxels outside the source are unknown (count
+        0).
     """
     spec = grid.spec
     centers = transform_points(invert(dst_T_src), spec.from_axes(spec.centers()).reshape(-1, 3))
@@ -41,8 +46,8 @@ def moved_grid(grid: Grid, dst_T_src: Transform) -> Grid:
 class Consistency(Summed):
     """Accumulates the agreement of consecutive frames in the static parts of the scene.
 
-    Voxels of frame t with a static class or free space are moved to frame t + 1, and compared with the voxels of that frame that are also
-    known.
+    Voxels of frame t with a static class or free space are moved to frame t + 1, and compared with
+    the voxels of that frame that are also known.
 
     Attributes:
         matrix: confusion matrix with the earlier frame in rows and the later frame in columns.
@@ -61,32 +66,48 @@ class Consistency(Summed):
         self.moving = frozenset(moving)
         self.matrix = ConfusionMatrix(num_classes, free=free)
 
-    def update(self, earlier: Grid, later: Grid, later_T_earlier: Transform, ignored: ArrayLike | None = None) -> Self:
+    def update(
+        self,
+        earlier: Grid,
+        later: Grid,
+        later_T_earlier: Transform,
+        ignored: ArrayLike | None = None,
+    ) -> Self:
         """Add a pair of consecutive frames.
 
         Args:
             earlier: grid of frame t.
             later: grid of frame t + 1, of the same geometry.
             later_T_earlier: (4, 4) transform from the earlier to the later sensor frame.
-            ignored: (X, Y, Z) bool, voxels of the later frame to leave out, such as moving objects of a static class; None for none.
+            ignored: (X, Y, Z) bool, voxels of the later frame to leave out, such as moving objects
+                of a static class; None for none.
 
         Raises:
             FormatError: the geometries differ.
         """
         if earlier.spec != later.spec:
             raise FormatError(
-                "later", expected=f"the geometry of the earlier frame, {earlier.spec}", found=str(later.spec)
+                "later",
+                expected=f"the geometry of the earlier frame, {earlier.spec}",
+                found=str(later.spec),
             )
         before = moved_grid(earlier, later_T_earlier)
         movable = sorted(self.moving)
-        counted = before.known & later.known & ~np.isin(before.labels, movable) & ~np.isin(later.labels, movable)
+        counted = (
+            before.known
+            & later.known
+            & ~np.isin(before.labels, movable)
+            & ~np.isin(later.labels, movable)
+        )
         if ignored is not None:
             counted &= ~np.asarray(ignored, np.bool_)
         self.matrix.update(later.labels, before.labels, counted)
         return self
 
     def compute(self) -> float:
-        """Return the IoU of occupied voxels between consecutive frames; NaN if nothing was compared."""
+        """Return the IoU of occupied voxels between consecutive frames; NaN if nothing was
+        compared.
+        """
         return self.matrix.completeness().iou
 
     def reset(self) -> None:
@@ -95,7 +116,8 @@ class Consistency(Summed):
 
 
 def shape_consistency(earlier: NDArray[np.bool_], later: NDArray[np.bool_]) -> float:
-    """Return the IoU of the shapes of an actor in two frames, both in the reference frame of the actor.
+    """Return the IoU of the shapes of an actor in two frames, both in the reference frame of the
+    actor.
 
     Args:
         earlier: (X, Y, Z) bool, voxels of the actor in the earlier frame.
@@ -122,7 +144,8 @@ class TrackingScore:
 
     Attributes:
         lstq: square root of `association` times `classification`.
-        association: S_assoc, the mean over all true actors of the association with predicted numbers over all frames.
+        association: S_assoc, the mean over all true actors of the association with predicted
+            numbers over all frames.
         classification: S_cls, mean IoU of the occurring classes.
         actors: number of true actors.
     """
@@ -134,7 +157,8 @@ class TrackingScore:
 
 
 class TrackingQuality(Summed):
-    """Accumulates the frames of sequences, as in the evaluation of 4D panoptic segmentation of SemanticKITTI.
+    """Accumulates the frames of sequences, as in the evaluation of 4D panoptic segmentation of
+    SemanticKITTI.
 
     Attributes:
         num_classes: K; ids are 0..K-1.
@@ -158,7 +182,11 @@ class TrackingQuality(Summed):
         unaveraged: Collection[int] = (),
         fewest: int = 0,
     ) -> None:
-        self.num_classes, self.things, self.ignored = num_classes, frozenset(things), frozenset(ignored)
+        self.num_classes, self.things, self.ignored = (
+            num_classes,
+            frozenset(things),
+            frozenset(ignored),
+        )
         self.unaveraged, self.fewest = frozenset(unaveraged), fewest
         self.reset()
 
@@ -191,11 +219,17 @@ class TrackingQuality(Summed):
         if len({array.shape for array in arrays}) > 1:
             found = " and ".join(str(array.shape) for array in arrays)
             raise FormatError(
-                "prediction", expected="classes and numbers with the shape of the ground truth", found=found
+                "prediction",
+                expected="classes and numbers with the shape of the ground truth",
+                found=found,
             )
         for name, classes in (("prediction", arrays[0]), ("truth", arrays[2])):
             check_ids(name, classes, self.num_classes)
-        counted = np.ones(len(arrays[0]), np.bool_) if mask is None else to_numpy(mask).astype(np.bool_).reshape(-1)
+        counted = (
+            np.ones(len(arrays[0]), np.bool_)
+            if mask is None
+            else to_numpy(mask).astype(np.bool_).reshape(-1)
+        )
         counted = counted & ~np.isin(arrays[2], sorted(self.ignored))
         pred_class, pred, true_class, true = (array[counted].astype(np.int64) for array in arrays)
         k = self.num_classes
@@ -207,7 +241,9 @@ class TrackingQuality(Summed):
             for number, size in _counts(true[of_class]):
                 if size > self.fewest:
                     self.true[sequence, label, number] += size
-                    for predicted_number, common in _counts(pred[of_class & (true == number) & (pred > 0)]):
+                    for predicted_number, common in _counts(
+                        pred[of_class & (true == number) & (pred > 0)]
+                    ):
                         self.common[sequence, label, number, predicted_number] += common
         return self
 
@@ -224,7 +260,9 @@ class TrackingQuality(Summed):
         iou = ratio(hit, self.confusion.sum(axis=0) + self.confusion.sum(axis=1) - hit)
         iou = np.delete(iou, sorted(self.unaveraged | self.ignored))
         classification = float(np.nanmean(iou)) if (~np.isnan(iou)).any() else float("nan")
-        return TrackingScore(float(np.sqrt(association * classification)), association, classification, len(quality))
+        return TrackingScore(
+            float(np.sqrt(association * classification)), association, classification, len(quality)
+        )
 
 
 def _counts(numbers: NDArray[np.int64]) -> list[tuple[int, int]]:

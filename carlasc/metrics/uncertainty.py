@@ -1,4 +1,6 @@
-"""Scores of predicted probabilities: calibration error, likelihood and reliability diagrams (as PaSCo reports them)."""
+"""Scores of predicted probabilities: calibration error, likelihood and reliability diagrams (as
+PaSCo reports them).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from carlasc.metrics.confusion import check_ids, to_numpy
 from carlasc.metrics.scoring import Summed
 
 _BINS = 15
-_TOLERANCE = 1e-3  # maximum deviation of the sum of the probabilities of a voxel from 1; half precision has 5e-4
+# maximum deviation of the sum of the probabilities of a voxel from 1; half precision has 5e-4
+_TOLERANCE = 1e-3
 _EPSILON = 1e-12  # added in the argument of the logarithm
 
 
@@ -33,7 +36,9 @@ class Reliability:
 
     @property
     def ece(self) -> float:
-        """Expected calibration error: mean of |confidence - accuracy| over voxels; NaN without voxels."""
+        """Expected calibration error: mean of |confidence - accuracy| over voxels; NaN without
+        voxels.
+        """
         if not self.count.sum():
             return float("nan")
         gap = np.nan_to_num(np.abs(self.confidence - self.accuracy))
@@ -47,8 +52,10 @@ class UncertaintyScore:
     Attributes:
         ece_empty: calibration error of voxels that are predicted free, mean over frames.
         ece_occupied: calibration error of voxels that are predicted occupied, mean over frames.
-        nll_empty: negative log-likelihood of the true class, mean over all voxels that are predicted free.
-        nll_occupied: negative log-likelihood of the true class, mean over all voxels that are predicted occupied.
+        nll_empty: negative log-likelihood of the true class, mean over all voxels that are
+            predicted free.
+        nll_occupied: negative log-likelihood of the true class, mean over all voxels that are
+            predicted occupied.
         empty: reliability of voxels that are predicted free, over all frames.
         occupied: reliability of voxels that are predicted occupied, over all frames.
     """
@@ -64,8 +71,8 @@ class UncertaintyScore:
 class Uncertainty(Summed):
     """Accumulates the confidence and the accuracy of predictions.
 
-    As in PaSCo, calibration errors are averaged over frames, likelihoods over voxels, and both are separate for voxels that are predicted
-    free and occupied.
+    As in PaSCo, calibration errors are averaged over frames, likelihoods over voxels, and both are
+    separate for voxels that are predicted free and occupied.
 
     Attributes:
         num_classes: K.
@@ -85,9 +92,11 @@ class Uncertainty(Summed):
 
     def reset(self) -> None:
         """Set all sums to zero."""
-        self.sums = np.zeros((2, 3, self.bins))  # (free or occupied prediction; count, confidence, correct; bin)
+        # (free or occupied prediction; count, confidence, correct; bin)
+        self.sums = np.zeros((2, 3, self.bins))
         self.nll = np.zeros((2, 2))  # (free or occupied prediction; sum, count)
-        self.ece = np.zeros((2, 2))  # (free or occupied prediction; sum over frames, number of frames)
+        # (free or occupied prediction; sum over frames, number of frames)
+        self.ece = np.zeros((2, 2))
 
     def update(self, probabilities: Any, truth: ArrayLike, mask: ArrayLike | None = None) -> Self:
         """Add a frame.
@@ -107,9 +116,13 @@ class Uncertainty(Summed):
         target = to_numpy(truth)
         if prob.shape != (*target.shape, self.num_classes):
             raise FormatError(
-                "probabilities", expected=f"shape {(*target.shape, self.num_classes)}", found=str(prob.shape)
+                "probabilities",
+                expected=f"shape {(*target.shape, self.num_classes)}",
+                found=str(prob.shape),
             )
-        counted = np.ones(target.shape, np.bool_) if mask is None else to_numpy(mask).astype(np.bool_)
+        counted = (
+            np.ones(target.shape, np.bool_) if mask is None else to_numpy(mask).astype(np.bool_)
+        )
         prob, target = prob[counted].astype(np.float64), target[counted]
         off = np.abs(prob.sum(axis=1) - 1)
         if not (off <= _TOLERANCE).all() or (prob < 0).any():
@@ -127,9 +140,13 @@ class Uncertainty(Summed):
         occupied = predicted != self.free
         for row, chosen in enumerate((~occupied, occupied)):
             # Bins are (low, high], so a confidence of exactly 1 is in the last bin.
-            bins = np.clip(np.ceil(confidence[chosen] * self.bins).astype(int) - 1, 0, self.bins - 1)
+            bins = np.clip(
+                np.ceil(confidence[chosen] * self.bins).astype(int) - 1, 0, self.bins - 1
+            )
             weights = None, confidence[chosen], right[chosen]
-            sums: NDArray[np.float64] = np.stack([np.bincount(bins, weight, self.bins) for weight in weights])
+            sums: NDArray[np.float64] = np.stack(
+                [np.bincount(bins, weight, self.bins) for weight in weights]
+            )
             self.sums[row] += sums
             if chosen.any():
                 self.ece[row] += _reliability(sums).ece, 1
@@ -141,10 +158,14 @@ class Uncertainty(Summed):
         with np.errstate(invalid="ignore"):
             ece, nll = self.ece[:, 0] / self.ece[:, 1], self.nll[:, 0] / self.nll[:, 1]
         empty, occupied = map(_reliability, self.sums)
-        return UncertaintyScore(float(ece[0]), float(ece[1]), float(nll[0]), float(nll[1]), empty, occupied)
+        return UncertaintyScore(
+            float(ece[0]), float(ece[1]), float(nll[0]), float(nll[1]), empty, occupied
+        )
 
 
 def _reliability(sums: NDArray[np.float64]) -> Reliability:
     count = sums[0]
-    confidence, accuracy = np.divide(sums[1:], count, out=np.full((2, len(count)), np.nan), where=count > 0)
+    confidence, accuracy = np.divide(
+        sums[1:], count, out=np.full((2, len(count)), np.nan), where=count > 0
+    )
     return Reliability(count.astype(np.int64), confidence, accuracy)

@@ -1,4 +1,5 @@
-"""The motion of actors: moving points are grouped into segments in each scan, and segments are linked into tracks over time.
+"""The motion of actors: moving points are grouped into segments in each scan, and segments are
+linked into tracks over time.
 
 "World" is the frame of the poses, which is the sensor frame of the first scan.
 """

@@ -1,8 +1,9 @@
 """Bodies: the size and the surface of an actor, completed where no scan saw it.
 
-A scan sees only the faces of an actor that are turned to the sensor. All observations of a track together show some of its faces: of a car
-ahead, only the rear. Length and width are known if the visible faces show them. Otherwise they are taken from similar actors of the same
-data, or from a table, and the body extends from the visible face away from the sensor.
+A scan sees only the faces of an actor that are turned to the sensor. All observations of a track
+together show some of its faces: of a car ahead, only the rear. Length and width are known if the
+visible faces show them. Otherwise they are taken from similar actors of the same data, or from a
+table, and the body extends from the visible face away from the sensor.
 """
 
 from __future__ import annotations
@@ -14,20 +15,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TRIM = 0.01  # share of points that may be outside the body: outliers, points of a neighbour
-_FACE_POINTS, _FACE_SHARE = 12, 0.02  # a face is visible if scans with so many points, and this share, see it
+# a face is visible if scans with so many points, and this share, see it
+_FACE_POINTS, _FACE_SHARE = (
+    12,
+    0.02,
+)
 _FACE_SINE = 0.26  # a scan sees a face if its rays meet the face at 15 degrees or more
 _ALIKE = 0.15  # actors are similar if their known sizes differ by this fraction
-_SHORTEST = 0.6, 0.85  # no vehicle is shorter, or narrower, than these shares of the usual size of its kind
+# no vehicle is shorter, or narrower, than these shares of the usual size of its kind
+_SHORTEST = (
+    0.6,
+    0.85,
+)
 _HIGHER = 1.6  # the height may grow by less than this factor
 _EXAMPLES = 3  # a size is learned from at least so many actors, and a shape from at most so many
-_CELL_M, _BIN_M = 0.1, 0.2  # cells of surfaces, and cells in which surfaces of several actors are compared
+# cells of surfaces, and cells in which surfaces of several actors are compared
+_CELL_M, _BIN_M = (
+    0.1,
+    0.2,
+)
 _ACTORS_WIDE_M, _ACTORS_LONG_M = 1.3, 2.6  # narrower or shorter vehicles have two wheels
 _WIDEST_M = 2.4, 2.8  # of cars, and of longer vehicles: wider ones have points of a neighbour
 _LOWEST_M = 1.0  # of lower ones, only a part was seen
 
 BODY_MARGIN_M = 0.1  # margin of the box of an actor around its body
 _CLEARANCE_M, _SPACING_M = 0.15, 0.1
-_INSET_M = 0.22  # depth of the usual shell inside the box: an occupied voxel holds some depth of the body
+_INSET_M = (
+    0.22  # depth of the usual shell inside the box: an occupied voxel holds some depth of the body
+)
 # Of a car, as fractions: the height of its body, the ends and the width of its cabin.
 _BELT, _CABIN, _CABIN_WIDE = 0.62, (0.08, 0.75), 0.85
 
@@ -42,9 +57,11 @@ class Extent:
     """The size of an actor, as its observations show it.
 
     Attributes:
-        lower: (3,) metres, lower corner of the box around its points, actor frame (x forward, y to the side).
+        lower: (3,) metres, lower corner of the box around its points, actor frame (x forward, y to
+            the side).
         upper: (3,) metres, upper corner.
-        faces: whether the rear, the front, the side of low y and the side of high y are visible in some scan.
+        faces: whether the rear, the front, the side of low y and the side of high y are visible in
+            some scan.
         points: number of points of the observations.
         seen_from: x and y of the sensor, metres, actor frame: mean over the points.
     """
@@ -62,19 +79,28 @@ class Extent:
 
     @property
     def known(self) -> tuple[bool, bool]:
-        """Whether length and width are known: a side shows the length, front and rear show the width, and two ends show their distance."""
+        """Whether length and width are known: a side shows the length, front and rear show the
+        width, and two ends show their distance.
+        """
         rear, front, low, high = self.faces
         return (rear and front) or low or high, (low and high) or rear or front
 
     @property
     def plausible(self) -> tuple[bool, bool]:
-        """Whether length and width are large enough for a vehicle of this width or length, and this height; smaller ones are of a part of it."""
-        length, width = (bool(self.size[axis] > share * _table(self, axis)) for axis, share in enumerate(_SHORTEST))
+        """Whether length and width are large enough for a vehicle of this width or length, and this
+        height; smaller ones are of a part of it.
+        """
+        length, width = (
+            bool(self.size[axis] > share * _table(self, axis))
+            for axis, share in enumerate(_SHORTEST)
+        )
         return length, width
 
     @property
     def exemplary(self) -> bool:
-        """Whether its shape can complete similar actors: its front, its rear and one side are visible."""
+        """Whether its shape can complete similar actors: its front, its rear and one side are
+        visible.
+        """
         rear, front, low, high = self.faces
         return rear and front and (low or high) and all(self.plausible)
 
@@ -88,11 +114,16 @@ def measure(observations: Sequence[NDArray[np.float64]], sensors: NDArray[np.flo
     """
     points = np.concatenate(list(observations))
     lower, upper = np.quantile(points, _TRIM, axis=0), np.quantile(points, 1 - _TRIM, axis=0)
-    return seen_from(lower, upper, np.array([len(observation) for observation in observations]), sensors)
+    return seen_from(
+        lower, upper, np.array([len(observation) for observation in observations]), sensors
+    )
 
 
 def seen_from(
-    lower: NDArray[np.float64], upper: NDArray[np.float64], counts: NDArray[np.integer], sensors: NDArray[np.float64]
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    counts: NDArray[np.integer],
+    sensors: NDArray[np.float64],
 ) -> Extent:
     """Return the extent of a box, with the faces that sensors saw.
 
@@ -117,16 +148,25 @@ class Sizes:
     """The lengths, widths and shapes of actors with many visible faces, by class."""
 
     def __init__(self, examples: Sequence[tuple[int, Extent, NDArray[np.float32]]]) -> None:
-        """Learn from the classes of actors, their extents, and the (P, 3) points of their surfaces, metres, actor frame; P may be 0."""
+        """Learn from the classes of actors, their extents, and the (P, 3) points of their surfaces,
+        metres, actor frame; P may be 0.
+        """
         self._known: dict[int, NDArray[np.float64]] = {}
-        self._shapes = {label: list[tuple[Extent, NDArray[np.float32]]]() for label, _, _ in examples}
+        self._shapes = {
+            label: list[tuple[Extent, NDArray[np.float32]]]() for label, _, _ in examples
+        }
         for label, shapes in self._shapes.items():
             own = [(e, surface) for other, e, surface in examples if other == label]
-            self._known[label] = np.array([e.size for e, _ in own if all(e.known + e.plausible)]).reshape(-1, 3)
+            self._known[label] = np.array(
+                [e.size for e, _ in own if all(e.known + e.plausible)]
+            ).reshape(-1, 3)
             shapes += [(e, surface) for e, surface in own if e.exemplary and len(surface)]
 
-    def complete(self, label: int, extent: Extent) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of the whole body: unknown lengths and widths are taken from similar actors.
+    def complete(
+        self, label: int, extent: Extent
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the corners of the whole body: unknown lengths and widths are taken from similar
+        actors.
 
         A body is never smaller than its visible part, unless that is wider than any vehicle.
 
@@ -146,14 +186,18 @@ class Sizes:
                 upper[axis] += missing
             else:
                 lower[axis] -= missing
-        if not extent.exemplary:  # other things may hide the wheels, or the lowest ray may pass above them
+        # other things may hide the wheels, or the lowest ray may pass above them
+        if not extent.exemplary:
             lower[2] -= max(self._height(label, upper - lower) - (upper[2] - lower[2]), 0.0)
-        if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:  # the top of a lorry may be above the highest ray
+        # the top of a lorry may be above the highest ray
+        if upper[LENGTH] - lower[LENGTH] > _LORRY_LONG_M:
             upper[2] = max(upper[2], lower[2] + _LORRY_TOP_M)
         return lower, upper
 
     def _expected(self, label: int, extent: Extent, axis: int) -> float:
-        """Return the length or the width of actors like `extent` in the other size, and in the height if some are."""
+        """Return the length or the width of actors like `extent` in the other size, and in the
+        height if some are.
+        """
         other = 1 - axis
         sizes = self._known.get(label, np.empty((0, 3)))
         far = (sizes - extent.size) / np.maximum(extent.size, _CELL_M)
@@ -164,15 +208,21 @@ class Sizes:
         return _table(extent, axis)
 
     def _height(self, label: int, size: NDArray[np.float64]) -> float:
-        """Return the height of actors that are as long and as wide as `size`, (3,) metres; without such actors, its own height."""
+        """Return the height of actors that are as long and as wide as `size`, (3,) metres; without
+        such actors, its own height.
+        """
         sizes = self._known.get(label, np.empty((0, 3)))
-        alike = sizes[(np.abs(sizes - size) < _ALIKE * size)[:, :2].all(axis=1) & (sizes[:, 2] < _HIGHER * size[2])]
+        alike = sizes[
+            (np.abs(sizes - size) < _ALIKE * size)[:, :2].all(axis=1)
+            & (sizes[:, 2] < _HIGHER * size[2])
+        ]
         return float(np.median(alike[:, 2])) if len(alike) >= _EXAMPLES else float(size[2])
 
     def surface(
         self, label: int, lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
     ) -> NDArray[np.float32]:
-        """Return points on the surface of a vehicle of this size: from the most similar actors, otherwise the usual shell.
+        """Return points on the surface of a vehicle of this size: from the most similar actors,
+        otherwise the usual shell.
 
         Args:
             label: its class.
@@ -184,7 +234,10 @@ class Sizes:
             (P, 3) float32, metres, actor frame.
         """
         size = np.maximum(upper - lower, _CELL_M)
-        unlike = [np.abs(np.log(np.maximum(other.size, _CELL_M) / size)) for other, _ in self._shapes.get(label, [])]
+        unlike = [
+            np.abs(np.log(np.maximum(other.size, _CELL_M) / size))
+            for other, _ in self._shapes.get(label, [])
+        ]
         best = np.argsort([far.sum() for far in unlike], kind="stable")[:_EXAMPLES].tolist()
         chosen = [self._shapes[label][row] for row in best if unlike[row].max() < _ALIKE]
         if not chosen or not any(extent.known):
@@ -193,24 +246,34 @@ class Sizes:
         bins, points = list[NDArray[np.int64]](), list[NDArray[np.float64]]()
         for own in fitted:
             whole = np.concatenate([own, own * (1, -1, 1) + (0, size[1], 0)])
-            cells, place = np.unique(np.floor(whole / _BIN_M).astype(np.int64), axis=0, return_inverse=True)
+            cells, place = np.unique(
+                np.floor(whole / _BIN_M).astype(np.int64), axis=0, return_inverse=True
+            )
             count = np.bincount(place.reshape(-1))
             sums = [np.bincount(place.reshape(-1), whole[:, axis]) for axis in range(3)]
             bins.append(cells)
             points.append(np.stack(sums, axis=1) / count[:, None])
-        _, place, count = np.unique(np.concatenate(bins), axis=0, return_inverse=True, return_counts=True)
+        _, place, count = np.unique(
+            np.concatenate(bins), axis=0, return_inverse=True, return_counts=True
+        )
         found = np.concatenate(points)[2 * count[place.reshape(-1)] > len(chosen)]
         return (found[found[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
 
 
 def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the (P, 3) float32 centres of the cells that hold two or more of (M, 3) points, metres."""
-    cells, count = np.unique(np.round(points / _CELL_M).astype(np.int32), axis=0, return_counts=True)
+    """Return the (P, 3) float32 centres of the cells that hold two or more of (M, 3) points,
+    metres.
+    """
+    cells, count = np.unique(
+        np.round(points / _CELL_M).astype(np.int32), axis=0, return_counts=True
+    )
     return (cells[count > 1] * _CELL_M).astype(np.float32)
 
 
 def _without_neighbours(extent: Extent) -> Extent:
-    """Return the extent, cut to the greatest width of a vehicle of its length; the side towards the sensor stays."""
+    """Return the extent, cut to the greatest width of a vehicle of its length; the side towards the
+    sensor stays.
+    """
     length, wide, height = extent.size.tolist()
     if wide <= _WIDEST_M[length > _LORRY_LONG_M or not extent.known[LENGTH]]:
         return extent
@@ -237,10 +300,14 @@ def _table(extent: Extent, axis: int) -> float:
     return _TWO_WHEELS[axis]
 
 
-def usual_shell(lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent) -> NDArray[np.float32]:
-    """Return points on the surface that a vehicle of this size usually has; none for vehicles with two wheels.
+def usual_shell(
+    lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
+) -> NDArray[np.float32]:
+    """Return points on the surface that a vehicle of this size usually has; none for vehicles with
+    two wheels.
 
-    A car has a body of 60 % of its height, and a narrower cabin above its rear three quarters. Lorries and buses are boxes.
+    A car has a body of 60 % of its height, and a narrower cabin above its rear three quarters.
+    Lorries and buses are boxes.
 
     Args:
         lower: (3,) lower corner of the body's box, metres, actor frame.
@@ -268,10 +335,15 @@ def usual_shell(lower: NDArray[np.float64], upper: NDArray[np.float64], extent: 
 
 def _box_surface(lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return points on the sides and the top of a box, `_SPACING_M` apart."""
-    x, y, z = (np.linspace(a, b, max(2, round((b - a) / _SPACING_M) + 1)) for a, b in zip(lower, upper, strict=True))
+    x, y, z = (
+        np.linspace(a, b, max(2, round((b - a) / _SPACING_M) + 1))
+        for a, b in zip(lower, upper, strict=True)
+    )
     faces = [
         np.meshgrid(x, y, upper[2:]),
         np.meshgrid(x, [lower[1], upper[1]], z),
         np.meshgrid([lower[0], upper[0]], y, z),
     ]
-    return np.concatenate([np.stack(face, axis=-1).reshape(-1, 3) for face in faces]).astype(np.float32)
+    return np.concatenate([np.stack(face, axis=-1).reshape(-1, 3) for face in faces]).astype(
+        np.float32
+    )

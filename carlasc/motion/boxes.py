@@ -1,8 +1,10 @@
-"""Tracks from annotated boxes: the boxes of one object over time, smoothed, and the points of a scan that are in them.
+"""Tracks from annotated boxes: the boxes of one object over time, smoothed, and the points of a
+scan that are in them.
 
-Each drawn box is wrong by some centimetres and a degree, which blurs merged scans. Boxes are therefore corrected by the points in them: the
-observations of a moving object are registered, as for actors without boxes, and each stays near the smoothed box of its scan. Objects with
-few points keep their drawn poses.
+Each drawn box is wrong by some centimetres and a degree, which blurs merged scans. Boxes are
+therefore corrected by the points in them: the observations of a moving object are registered, as
+for actors without boxes, and each stays near the smoothed box of its scan. Objects with few points
+keep their drawn poses.
 """
 
 from __future__ import annotations
@@ -25,10 +27,18 @@ from carlasc.motion.tracks import Track
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
 _FILLED_IN = 0.3  # weight of a box that was not annotated in its frame
 _STATIC_M = 1.0  # boxes of a static object may move this far, but not steadily
-_STEADY_M, _STEADY = 0.3, 5.0  # a shorter displacement counts if it is so many times its deviation from a line
+# a shorter displacement counts if it is so many times its deviation from a line
+_STEADY_M, _STEADY = (
+    0.3,
+    5.0,
+)
 _HOLD_S = 1.0  # an object that is static for this time is static in all frames
 _EXTRAPOLATE_S = 0.5  # time by which a track extends beyond its first and its last box
-_JUMP_M, _MAX_SPEED_M_S = 1.5, 40.0  # boxes that are farther apart belong to different objects with one number
+# boxes that are farther apart belong to different objects with one number
+_JUMP_M, _MAX_SPEED_M_S = (
+    1.5,
+    40.0,
+)
 _ROUNDING_M = 0.01  # more than the rounding of a position
 
 
@@ -65,9 +75,10 @@ def tracks_from_boxes(
 ) -> list[Track]:
     """Return the tracks of annotated boxes.
 
-    All boxes of an object together decide whether it is static, because annotated boxes of a parked car move by some decimetres. A
-    static object has one pose, the median of its boxes, and velocity 0 in all frames of `times`. The poses of moving objects are
-    smoothed, and interpolated where boxes are missing. No points are used.
+    All boxes of an object together decide whether it is static, because annotated boxes of a parked
+    car move by some decimetres. A static object has one pose, the median of its boxes, and velocity
+    0 in all frames of `times`. The poses of moving objects are smoothed, and interpolated where
+    boxes are missing. No points are used.
 
     Args:
         boxes: the boxes of each annotated frame, sensor frame.
@@ -76,8 +87,8 @@ def tracks_from_boxes(
         deformable: classes whose objects change their shape.
 
     Returns:
-        The tracks in order of their numbers, without members: `segment_by_boxes` finds the members in a scan. An object whose boxes jump
-        has several tracks with the same number.
+        The tracks in order of their numbers, without members: `segment_by_boxes` finds the members
+        in a scan. An object whose boxes jump has several tracks with the same number.
     """
     found: dict[int, list[tuple[int, int]]] = {}  # frames and rows by track
     for frame in sorted(boxes):
@@ -89,7 +100,9 @@ def tracks_from_boxes(
     return [
         _make_track(track, part, known, seconds, deformable)
         for track in sorted(found)
-        for part in _split_at_jumps(_boxes_of([(frame, world[frame], row) for frame, row in found[track]], times))
+        for part in _split_at_jumps(
+            _boxes_of([(frame, world[frame], row) for frame, row in found[track]], times)
+        )
     ]
 
 
@@ -104,7 +117,8 @@ def segment_by_boxes(
 ) -> list[Segment]:
     """Return the points of a scan that are in the boxes of tracks.
 
-    Points of ground classes belong to no track. A point in the boxes of several tracks belongs to the smallest one.
+    Points of ground classes belong to no track. A point in the boxes of several tracks belongs to
+    the smallest one.
 
     Args:
         frame: frame number.
@@ -112,11 +126,12 @@ def segment_by_boxes(
         world_T_sensor: (4, 4) pose of the scan.
         tracks: the tracks. Tracks that do not extend to the frame have no segment.
         ground: ids of the ground classes.
-        floor_m: points of other classes than the track's count as ground up to this height above the bottom of its box, metres.
+        floor_m: points of other classes than the track's count as ground up to this height above
+            the bottom of its box, metres.
 
     Returns:
-        The segments of the tracks that have points in the scan, in the order of the tracks. Each has the label, the number and the
-        velocity of its track.
+        The segments of the tracks that have points in the scan, in the order of the tracks. Each
+        has the label, the number and the velocity of its track.
     """
     owners = np.full(len(scan), -1, np.int64)
     usable = finite(scan.points)
@@ -130,11 +145,16 @@ def segment_by_boxes(
         track = tracks[index]
         pose = track.pose(frame)
         if pose is not None:
-            reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0) + _ROUNDING_M
+            reach = (
+                np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
+                + _ROUNDING_M
+            )
             there = transform_points(sensor_T_world, pose[:3, 3])
             near = np.flatnonzero((np.abs(x - there[0]) <= reach) & (np.abs(y - there[1]) <= reach))
             points = transform_points(world_T_sensor, scan.points[candidates[near]])
-            members = near[_inside(track, pose, points, None if labels is None else labels[near], floor_m)]
+            members = near[
+                _inside(track, pose, points, None if labels is None else labels[near], floor_m)
+            ]
             owners[candidates[members]] = index
     segments = []
     for index, track in enumerate(tracks):
@@ -142,7 +162,9 @@ def segment_by_boxes(
         if len(members):
             own = transform_points(world_T_sensor, scan.points[members])
             velocity, origin = track.velocity_at(frame), world_T_sensor[:3, 3]
-            segments.append(Segment(frame, track.label, members, own, velocity, track.instance, origin))
+            segments.append(
+                Segment(frame, track.label, members, own, velocity, track.instance, origin)
+            )
     return segments
 
 
@@ -153,7 +175,9 @@ def _inside(
     labels: NDArray[np.unsignedinteger] | None,
     floor_m: float,
 ) -> NDArray[np.int64]:
-    """Return the indices of the (M, 3) points, world, that are in a track's box at a pose and above its ground."""
+    """Return the indices of the (M, 3) points, world, that are in a track's box at a pose and above
+    its ground.
+    """
     reach = np.linalg.norm(np.maximum(np.abs(track.lower), np.abs(track.upper)), axis=0)
     near = np.flatnonzero(np.abs(points[:, 1] - pose[1, 3]) <= reach)
     body = transform_points(invert(pose), points[near])
@@ -192,7 +216,9 @@ def _make_track(
     known_seconds: NDArray[np.float64],
     deformable: Collection[int],
 ) -> Track:
-    """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence, increasing, and their times."""
+    """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence,
+    increasing, and their times.
+    """
     seconds, centers = boxes.seconds, boxes.poses[:, :3, 3]
     headings, tilt = _headings_and_tilt(boxes.poses[:, :3, :3])
     frames, at = known, known_seconds
@@ -211,10 +237,15 @@ def _make_track(
     if static:  # all frames share the memory of one pose
         pose = multiply(rotation_z(turns[0]), tilt)
         pose[:3, 3] = path[0]
-        poses, speed = np.broadcast_to(pose, (len(every), 4, 4)), np.broadcast_to(speed[0], (len(every), 3))
+        poses, speed = (
+            np.broadcast_to(pose, (len(every), 4, 4)),
+            np.broadcast_to(speed[0], (len(every), 3)),
+        )
     else:
         path, speed = resample(at, seconds, path, speed)
-        poses = np.stack([multiply(rotation_z(angle), tilt) for angle in np.interp(at, seconds, turns)])
+        poses = np.stack(
+            [multiply(rotation_z(angle), tilt) for angle in np.interp(at, seconds, turns)]
+        )
         poses[:, :3, 3] = path
     half, label = np.median(boxes.sizes, axis=0) / 2, int(np.bincount(boxes.labels).argmax())
     return Track(
@@ -232,9 +263,11 @@ def _make_track(
 
 
 def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float64], Transform]:
-    """Return the (F,) headings of boxes, radians, unwrapped, and the mean of their (F, 3, 3) rotations without the headings.
+    """Return the (F,) headings of boxes, radians, unwrapped, and the mean of their (F, 3, 3)
+    rotations without the headings.
 
-    Annotators confuse the front of a box with its back. Headings that differ by half a turn therefore count as equal, and the majority decides.
+    Annotators confuse the front of a box with its back. Headings that differ by half a turn
+    therefore count as equal, and the majority decides.
     """
     angles = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
     headings = np.unwrap(angles, period=np.pi)
@@ -246,8 +279,12 @@ def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float
     return headings, tilt
 
 
-def _is_static(path: NDArray[np.float64], centers: NDArray[np.float64], seconds: NDArray[np.float64]) -> bool:
-    """Return whether an object is static, from its (F, 3) smoothed path and the (F, 3) centres of its boxes, metres, world."""
+def _is_static(
+    path: NDArray[np.float64], centers: NDArray[np.float64], seconds: NDArray[np.float64]
+) -> bool:
+    """Return whether an object is static, from its (F, 3) smoothed path and the (F, 3) centres of
+    its boxes, metres, world.
+    """
     duration = float(seconds[-1] - seconds[0])
     if duration <= 0:
         return True
@@ -255,7 +292,9 @@ def _is_static(path: NDArray[np.float64], centers: NDArray[np.float64], seconds:
     velocity = (offsets * centers[:, :2]).sum(axis=0) / np.square(offsets).sum()
     length = float(np.hypot(*velocity)) * duration
     deviation = centers[:, :2] - line - offsets * velocity
-    steady = length > max(_STEADY_M, _STEADY * float(np.sqrt(np.square(deviation).sum(axis=1).mean())))
+    steady = length > max(
+        _STEADY_M, _STEADY * float(np.sqrt(np.square(deviation).sum(axis=1).mean()))
+    )
     if steady and length / duration > MIN_SPEED_M_S:
         return False
     extent = float(np.hypot(*np.ptp(path[:, :2], axis=0)))
@@ -264,7 +303,9 @@ def _is_static(path: NDArray[np.float64], centers: NDArray[np.float64], seconds:
 
 
 def _fastest(path: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
-    """Return the greatest mean speed over `_HOLD_S` along a path, in m/s; over the whole path if it is shorter."""
+    """Return the greatest mean speed over `_HOLD_S` along a path, in m/s; over the whole path if it
+    is shorter.
+    """
     then = np.minimum(np.searchsorted(seconds, seconds + _HOLD_S), len(seconds) - 1)
     elapsed = seconds[then] - seconds
     whole = (elapsed >= min(_HOLD_S, float(seconds[-1] - seconds[0])) - 1e-9) & (elapsed > 0)
@@ -272,27 +313,35 @@ def _fastest(path: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
     return float((length[whole] / elapsed[whole]).max(initial=0.0))
 
 
-_DRAWN = np.array([0.05, 0.05, 0.03, 0.01])  # error of a smoothed box: x, y, z in metres, yaw in radians
+# error of a smoothed box: x, y, z in metres, yaw in radians
+_DRAWN = np.array([0.05, 0.05, 0.03, 0.01])
 _MIN_OBSERVATIONS = 5  # with fewer, boxes are not corrected
 
 
 def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int, float]) -> Track:
     """Return the track of an object's boxes with poses under which its observations align.
 
-    The mean of all boxes does not change, in the frame of the object. Tracks of static and of deformable objects do not change.
+    The mean of all boxes does not change, in the frame of the object. Tracks of static and of
+    deformable objects do not change.
 
     Args:
         track: the track of the boxes.
         segments: the points in its boxes, one segment per scan, in order of frames.
         times: seconds by frame.
     """
-    hit = {s.frame: s for s in segments if len(s.points) >= MIN_POINTS and track.pose(s.frame) is not None}
+    hit = {
+        s.frame: s
+        for s in segments
+        if len(s.points) >= MIN_POINTS and track.pose(s.frame) is not None
+    }
     if not (track.moves and track.rigid) or len(hit) < _MIN_OBSERVATIONS:
         return track
     rows, seconds = np.array([*hit]) - track.first, np.array([times[frame] for frame in hit])
     points = [segment.points for segment in hit.values()]
     poses = track.world_T_actor
-    drawn = np.column_stack([poses[rows, :3, 3], np.unwrap(np.arctan2(poses[rows, 1, 0], poses[rows, 0, 0]))])
+    drawn = np.column_stack(
+        [poses[rows, :3, 3], np.unwrap(np.arctan2(poses[rows, 1, 0], poses[rows, 0, 0]))]
+    )
     change, rates = corrections(points, seconds, drawn, _DRAWN, best_observation(points))
     axes = np.stack([rotation_z(-yaw)[:3, :3] for yaw in drawn[:, 3].tolist()])
     own = np.column_stack([multiply(axes, change[:, :3, None])[:, :, 0], change[:, 3]])
@@ -301,5 +350,7 @@ def register_boxes(track: Track, segments: Sequence[Segment], times: Mapping[int
     x, y, z, yaw = (np.interp(every, rows, own[:, axis]) for axis in range(4))
     moved = np.stack([rotation_z(angle) for angle in yaw])
     moved[:, :3, 3] = np.column_stack([x, y, z])
-    faster = np.column_stack([np.interp(every, rows, rates[:, axis], left=0, right=0) for axis in range(3)])
+    faster = np.column_stack(
+        [np.interp(every, rows, rates[:, axis], left=0, right=0) for axis in range(3)]
+    )
     return replace(track, world_T_actor=multiply(poses, moved), velocity=track.velocity + faster)

@@ -1,8 +1,11 @@
-"""Evidence of motion: points at places that were free space at other times. It needs no flow, instances or labels.
+"""Evidence of motion: points at places that were free space at other times.
 
-Each point that is not ground is looked up in scans up to `HORIZON_S` before and after. A point moved if rays passed through its place more
-often than they ended there, or if all scans on one side in time saw it free. Such points are grouped into clusters. A cluster also gets the
-points around it that are not known to be static.
+It needs no flow, instances or labels.
+
+Each point that is not ground is looked up in scans up to `HORIZON_S` before and after. A point
+moved if rays passed through its place more often than they ended there, or if all scans on one side
+in time saw it free. Such points are grouped into clusters. A cluster also gets the points around it
+that are not known to be static.
 """
 
 from __future__ import annotations
@@ -31,7 +34,9 @@ _IN_A_ROW = 4  # the same, if all scans on one side in time, from the farthest i
 _CELL_M = 0.35  # points of one object are in neighbouring cells of this size, seen from above
 _MIN_POINTS = 3  # smaller clusters are noise
 _JUDGED_CELL_M = 0.15  # one point per cell of this size is looked up, and decides for the others
-_BAND_M = 0.3  # static points so far below or above a cluster, in its cells or beside them, are around it
+_BAND_M = (
+    0.3  # static points so far below or above a cluster, in its cells or beside them, are around it
+)
 _FLAGGED_SHARE = 0.6  # a cluster with this share of moved points moved as a whole
 _PERIOD_S = 0.1  # period of scans whose times do not increase
 
@@ -47,8 +52,10 @@ class EvidenceScan:
         seconds: time of the scan.
         ground: (N,) bool, which points are ground; None: found from their positions.
         labels: (N,) class ids; None if the scan has none.
-        explained: (N,) bool, points of known actors, which are never evidence; None if there are none.
-        origins: (N, 3) origins of the rays, metres, sensor frame; None: at the sensor. Points with one origin follow each other.
+        explained: (N,) bool, points of known actors, which are never evidence; None if there are
+            none.
+        origins: (N, 3) origins of the rays, metres, sensor frame; None: at the sensor. Points with
+            one origin follow each other.
     """
 
     frame: int
@@ -66,7 +73,9 @@ class EvidenceScan:
         for name in ("ground", "labels", "explained"):
             values = getattr(self, name)
             if values is not None and values.shape != (len(self.points),):
-                raise FormatError(name, expected=f"shape ({len(self.points)},)", found=str(values.shape))
+                raise FormatError(
+                    name, expected=f"shape ({len(self.points)},)", found=str(values.shape)
+                )
 
 
 @dataclass(frozen=True)
@@ -81,7 +90,8 @@ class FreeSpaceEvidence:
         points: (M, 3) float64 of the same points, metres, world.
         labels: most frequent class of each cluster; 0 without labels.
         freed: number of points of each cluster at places that were free at other times.
-        around: number of static points around each cluster, at its height. It is large for pieces of static objects.
+        around: number of static points around each cluster, at its height. It is large for pieces
+            of static objects.
         world_T_sensor: (4, 4) pose of the scan.
     """
 
@@ -96,7 +106,9 @@ class FreeSpaceEvidence:
     world_T_sensor: Transform
 
     def thinned(self, most: int = 400) -> FreeSpaceEvidence:
-        """Return the same with at most `most` of the `points` of each cluster; `clusters` stay complete."""
+        """Return the same with at most `most` of the `points` of each cluster; `clusters` stay
+        complete.
+        """
         return replace(self, points=tuple(thin(points, most) for points in self.points))
 
     @property
@@ -121,17 +133,23 @@ class _Kept:
         """Sort the points of each sensor of a scan by their directions."""
         if scan.origins is None:
             return cls(scan, seconds, (SortedReturns.of(scan.points),))
-        views = (SortedReturns.of(scan.points[own], scan.origins[own]) for own in _sensors(scan.origins))
+        views = (
+            SortedReturns.of(scan.points[own], scan.origins[own]) for own in _sensors(scan.origins)
+        )
         return cls(scan, seconds, tuple(views))
 
 
-def find_evidence(scans: Iterable[EvidenceScan], *, movable: Collection[int] = ()) -> Iterator[FreeSpaceEvidence]:
-    """Yield the evidence of each scan of a drive, when the scans of the `HORIZON_S` after it were read.
+def find_evidence(
+    scans: Iterable[EvidenceScan], *, movable: Collection[int] = ()
+) -> Iterator[FreeSpaceEvidence]:
+    """Yield the evidence of each scan of a drive, when the scans of the `HORIZON_S` after it were
+    read.
 
     Only scans within this time are held, so memory does not grow with the drive.
 
     Args:
-        scans: the scans in order of time. Times that do not increase are replaced by 0.1 s per scan.
+        scans: the scans in order of time. Times that do not increase are replaced by 0.1 s per
+            scan.
         movable: classes of actors. Points of different movable classes are not grouped together.
 
     Yields:
@@ -140,7 +158,11 @@ def find_evidence(scans: Iterable[EvidenceScan], *, movable: Collection[int] = (
     window: deque[_Kept] = deque()
     current, last = 0, -np.inf
     for scan in scans:
-        seconds = scan.seconds if scan.seconds > last else (last + _PERIOD_S if np.isfinite(last) else 0.0)
+        seconds = (
+            scan.seconds
+            if scan.seconds > last
+            else (last + _PERIOD_S if np.isfinite(last) else 0.0)
+        )
         last = seconds
         window.append(_Kept.of(scan, seconds))
         while window[-1].seconds - window[current].seconds > HORIZON_S:
@@ -162,7 +184,9 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     before, after = _others(window, current)
     world = transform_points(scan.world_T_sensor, scan.points[candidates].astype(np.float64))
     asked_first, same = numbered(np.floor(world / _JUDGED_CELL_M).astype(np.int64))
-    verdict = _judge(scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after])
+    verdict = _judge(
+        scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after]
+    )
     moved, left, static = (answers[same] for answers in verdict)
     kind = np.zeros(len(candidates), np.int64)
     if scan.labels is not None and movable:
@@ -171,18 +195,30 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     groups = _clusters(world, kind, moved, left, static)
     freed = tuple(int((moved | left)[group].sum()) for group in groups)
     clusters = [candidates[group] for group in groups]
-    points = [transform_points(scan.world_T_sensor, scan.points[members].astype(np.float64)) for members in clusters]
-    classes = [0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax()) for own in clusters]
+    points = [
+        transform_points(scan.world_T_sensor, scan.points[members].astype(np.float64))
+        for members in clusters
+    ]
+    classes = [
+        0 if scan.labels is None else int(np.bincount(scan.labels[own]).argmax())
+        for own in clusters
+    ]
     around = _count_around(world, groups, static)
     found = (tuple(clusters), tuple(points), tuple(classes), freed, around)
     return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *found, scan.world_T_sensor)
 
 
 def _sensors(origins: NDArray[np.float32]) -> list[NDArray[np.int64]]:
-    """Return the points of each sensor, by the (N, 3) origins of their rays, metres: origins of one moving sensor are close to each other."""
+    """Return the points of each sensor, by the (N, 3) origins of their rays, metres: origins of one
+    moving sensor are close to each other.
+    """
     found: list[tuple[list[NDArray[np.float32]], list[NDArray[np.int64]]]] = []
     for part, origin in runs_of_origins(origins, len(origins)):
-        near = (own for own in found if np.linalg.norm(np.array(own[0]) - origin, axis=1).min() < SAME_PLACE_M)
+        near = (
+            own
+            for own in found
+            if np.linalg.norm(np.array(own[0]) - origin, axis=1).min() < SAME_PLACE_M
+        )
         places, members = next(near, ([], []))
         if not places:
             found.append((places, members))
@@ -206,7 +242,9 @@ def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
 def _judge(
     scan: EvidenceScan, candidates: NDArray[np.int64], before: list[_Kept], after: list[_Kept]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which candidates are at places that were free most of the time, free on one side in time, and occupied (static)."""
+    """Return which candidates are at places that were free most of the time, free on one side in
+    time, and occupied (static).
+    """
     points = np.ascontiguousarray(scan.points[candidates], np.float32)
     free, hit = np.zeros((2, 2, len(points)), np.uint32)
     asked, left = np.arange(len(points), dtype=np.int32), [len(before), len(after)]
@@ -238,14 +276,15 @@ def _clusters(
     left: NDArray[np.bool_],
     static: NDArray[np.bool_],
 ) -> list[NDArray[np.int64]]:
-    """Group moved points by cells, seen from above, and add the points around them that are not static.
+    """Group moved points by cells, seen from above, and add the points around them that are not
+    static.
 
     Args:
         world: (N, 3) metres.
         kind: (N,) points of different kinds are not grouped.
         moved: (N,) points at places that were free most of the time.
-        left: (N,) points at places that were free before or after only. A cell needs a large share of them, because a thin surface may
-            be invisible from one side.
+        left: (N,) points at places that were free before or after only. A cell needs a large share
+            of them, because a thin surface may be invisible from one side.
         static: (N,) points at places that were occupied at other times.
 
     Returns:
@@ -263,7 +302,9 @@ def _clusters(
     cells = int((high[0] - low[0] + 1) * width)
     place = kind[inside] * cells + (cell[inside, 0] - low[0]) * width + (cell[inside, 1] - low[1])
     keys, flat = distinct(place)
-    share = np.bincount(flat, either[inside], minlength=len(keys)) / np.bincount(flat, minlength=len(keys))
+    share = np.bincount(flat, either[inside], minlength=len(keys)) / np.bincount(
+        flat, minlength=len(keys)
+    )
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
     component = _join(keys, seeds, int(width))[flat]
     groups: list[NDArray[np.int64]] = []
@@ -286,7 +327,9 @@ def _clusters(
 def _count_around(
     world: NDArray[np.float64], groups: list[NDArray[np.int64]], static: NDArray[np.bool_]
 ) -> tuple[int, ...]:
-    """Return the number of static points, of (N, 3) points in metres, around each group: in its cells or beside them, at its height."""
+    """Return the number of static points, of (N, 3) points in metres, around each group: in its
+    cells or beside them, at its height.
+    """
     cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
     key = (cell[:, 0] << 21) | cell[:, 1]
     rows = np.flatnonzero(static)
@@ -298,7 +341,9 @@ def _count_around(
         cells = np.unique(np.unique(key[group])[:, None] + steps)
         begin, end = np.searchsorted(keys, cells), np.searchsorted(keys, cells, side="right")
         lower, upper = world[group, 2].min() - _BAND_M, world[group, 2].max() + _BAND_M
-        near = np.concatenate([heights[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)])
+        near = np.concatenate(
+            [heights[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
+        )
         # static points of the group itself count too
         counts.append(int(((near >= lower) & (near <= upper)).sum()))
     return tuple(counts)
@@ -306,7 +351,8 @@ def _count_around(
 
 @cached
 def _join(keys: NDArray[np.int64], seeds: NDArray[np.bool_], width: int) -> NDArray[np.int64]:
-    """Return the component of each cell: seeds that touch are one component, and other cells belong to a seed beside them; -1 without one.
+    """Return the component of each cell: seeds that touch are one component, and other cells belong
+    to a seed beside them; -1 without one.
 
     Args:
         keys: (C,) row times width plus column of each cell, increasing.

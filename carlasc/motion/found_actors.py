@@ -1,4 +1,7 @@
-"""Found actors: moving actors that free space shows, and no box, instance or flow. They are followed from scan to scan."""
+"""Found actors: moving actors that free space shows, and no box, instance or flow.
+
+They are followed from scan to scan.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,11 @@ from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
 
 _MAX_GAP_S = 1.0  # an actor may be hidden for this long
-_REACH_M, _MAX_SPEED_M_S = 1.0, 25.0  # maximum gap to the prediction, and maximum speed where there is no prediction
+# maximum gap to the prediction, and maximum speed where there is no prediction
+_REACH_M, _MAX_SPEED_M_S = (
+    1.0,
+    25.0,
+)
 _FAR_M = 15.0  # fast first test: no actor moves farther between two observations
 _HISTORY = 6  # observations that the prediction is made from
 _MIN_OBSERVATIONS, _MIN_PATH_M, _MIN_SPEED_M_S = 5, 1.0, 0.5  # an actor needs so much for a track
@@ -24,13 +31,19 @@ _STRAIGHT = 0.35  # least extent of a path over its length: noise moves back and
 _MAX_JUMP_M_S = 4.0  # greatest median deviation of the observations' steps from the path's
 _PARTS_M = 1.0  # parts of one vehicle are closer to each other
 _PERSON_M = (1.5, 2.3)  # actors that are narrower and lower change their shape as they move
-_SHIFT_M = 0.5  # observations are shifted along their path by so much, to test whether they still align
+_SHIFT_M = (
+    0.5  # observations are shifted along their path by so much, to test whether they still align
+)
 _OBSERVATIONS, _MANY_OBSERVATIONS = 10, 30  # more than the latter do not raise the confidence
 _WEIGHTS = (1.0, 1.5, -12.5, 5.0, 1.5, -4.5)  # of 1 and of the terms of `_confidence`
 _LEAST_CONFIDENCE = 0.5  # of an actor
 _STAYS_M, _SENSOR_PATH_M = 0.5, 1.0  # points that move with the sensor, while it drives so far
 _LINE_SLOPE = 0.004  # a quarter of a degree: the points of one scan line differ by less
-_OWN_HALF_M, _OWN_REACH_M = 1.3, 3.5  # half the width of the recording vehicle, and how far from the sensor it reaches
+# half the width of the recording vehicle, and how far from the sensor it reaches
+_OWN_HALF_M, _OWN_REACH_M = (
+    1.3,
+    3.5,
+)
 _OWN_MARGIN_M = 0.2  # around most of its points
 _SAMPLES = 300  # points of an observation that its path is estimated from
 
@@ -40,7 +53,8 @@ class FoundActor:
     """A moving actor that free space shows, over time.
 
     Attributes:
-        segments: its points in each scan, in order of frames. `velocity` is estimated, and `instance` is its number.
+        segments: its points in each scan, in order of frames. `velocity` is estimated, and
+            `instance` is its number.
         rigid: whether it keeps its shape, as vehicles do.
         confidence: probability that it is real, from 0 to 1: see `_confidence`.
     """
@@ -59,15 +73,18 @@ def follow_actors(
     default_label: int = 0,
     own: list[NDArray[np.float64]] | None = None,
 ) -> Iterator[FoundActor]:
-    """Follow what moved from scan to scan, and yield each actor that has enough evidence, after its last observation.
+    """Follow what moved from scan to scan, and yield each actor that has enough evidence, after its
+    last observation.
 
     Args:
         evidence: the evidence of each scan, in order of time.
         moved: filled with the (M,) indices of the points that moved, tracked or not, by frame.
-        deformable: classes of actors that change their shape as they move. Without labels, small actors do.
+        deformable: classes of actors that change their shape as they move. Without labels, small
+            actors do.
         first_instance: number of the first actor; others follow.
         default_label: class of actors without labels.
-        own: filled with the (6,) lower and upper corners of the parts of the recording vehicle, metres, sensor frame.
+        own: filled with the (6,) lower and upper corners of the parts of the recording vehicle,
+            metres, sensor frame.
 
     Yields:
         The actors, numbered in the order of their last observations.
@@ -93,7 +110,9 @@ def _tracked(
     default_label: int,
     own: list[NDArray[np.float64]],
 ) -> Iterator[FoundActor]:
-    """Yield the actors of the chains with enough evidence, numbered from `number`, and add parts of the recording vehicle to `own`."""
+    """Yield the actors of the chains with enough evidence, numbered from `number`, and add parts of
+    the recording vehicle to `own`.
+    """
     for chain in chains:
         part = chain.own_vehicle()
         if part is not None:
@@ -123,7 +142,9 @@ class _Link:
         pose, freed, around = evidence.world_T_sensor, evidence.freed[index], evidence.around[index]
         members, label = evidence.clusters[index], evidence.labels[index]
         segment = Segment(evidence.frame, label, members, points, None, origin=pose[:3, 3])
-        return cls(evidence.seconds, segment, points.min(axis=0), points.max(axis=0), freed, around, pose)
+        return cls(
+            evidence.seconds, segment, points.min(axis=0), points.max(axis=0), freed, around, pose
+        )
 
     @property
     def middle(self) -> NDArray[np.float64]:
@@ -151,7 +172,9 @@ class _ActorChain:
 
     def __init__(self, first: _Link) -> None:
         self.links = [first]
-        self.velocity: NDArray[np.float64] | None = None  # (3,) m/s over the last observations; None for a single one
+        self.velocity: NDArray[np.float64] | None = (
+            None  # (3,) m/s over the last observations; None for a single one
+        )
 
     def append(self, link: _Link) -> None:
         """Continue the chain."""
@@ -165,7 +188,8 @@ class _ActorChain:
     def _velocity(self) -> NDArray[np.float64]:
         recent = self.links[-_HISTORY:]
         seconds = np.array([link.seconds for link in recent])
-        # The visible faces change: the velocities of the lower corner, the middle and the upper corner are compared, and the lowest one counts.
+        # The visible faces change: the velocities of the lower corner, the middle and the upper
+        # corner are compared, and the lowest one counts.
         offsets = seconds - seconds.mean()
         corners = np.stack([[link.lower, link.middle, link.upper] for link in recent])
         slopes = (offsets[:, None, None] * corners).sum(axis=0) / np.square(offsets).sum()
@@ -179,7 +203,9 @@ class _ActorChain:
             return None
         elapsed = link.seconds - last.seconds
         shift = np.zeros(3) if velocity is None else velocity * elapsed
-        gap = np.maximum(np.maximum(last.lower + shift - link.upper, link.lower - last.upper - shift), 0.0)
+        gap = np.maximum(
+            np.maximum(last.lower + shift - link.upper, link.lower - last.upper - shift), 0.0
+        )
         offset = link.middle - last.middle - shift
         reach = _REACH_M + (min(_MAX_SPEED_M_S * elapsed, 4.0) if velocity is None else 0.0)
         if (
@@ -189,7 +215,11 @@ class _ActorChain:
         ):
             return None
         sizes = np.abs((link.upper - link.lower) - (last.upper - last.lower))
-        return float(np.linalg.norm(gap, axis=0) + 0.3 * np.linalg.norm(offset[:2], axis=0) + 0.2 * sizes.sum())
+        return float(
+            np.linalg.norm(gap, axis=0)
+            + 0.3 * np.linalg.norm(offset[:2], axis=0)
+            + 0.2 * sizes.sum()
+        )
 
     def covers(self, link: _Link) -> bool:
         """Return whether an observation is inside the place where the chain's next one is expected."""
@@ -198,8 +228,12 @@ class _ActorChain:
         lower, upper = self.last.lower + shift - 0.3, self.last.upper + shift + 0.3
         return bool(((link.middle > lower) & (link.middle < upper))[:2].all())
 
-    def actor(self, deformable: Collection[int], instance: int, default_label: int) -> FoundActor | None:
-        """Return the actor; None unless its observations align better along a path than without motion."""
+    def actor(
+        self, deformable: Collection[int], instance: int, default_label: int
+    ) -> FoundActor | None:
+        """Return the actor; None unless its observations align better along a path than without
+        motion.
+        """
         if len(self.links) < _MIN_OBSERVATIONS:
             return None
         seconds = np.array([link.seconds for link in self.links])
@@ -211,13 +245,18 @@ class _ActorChain:
         samples = [thin(s.points, _SAMPLES) for s in segments]
         positions, velocities, headings = estimate_path(samples, seconds, rigid=rigid)
         speeds = np.linalg.norm(velocities[:, :2], axis=1)
-        if np.ptp(positions[:, :2], axis=0).max() < _MIN_PATH_M or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S:
+        if (
+            np.ptp(positions[:, :2], axis=0).max() < _MIN_PATH_M
+            or np.quantile(speeds, 0.9) < _MIN_SPEED_M_S
+        ):
             return None
         length = np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1).sum()
         if np.ptp(positions[:, :2], axis=0).max() < _STRAIGHT * length:
             return None
         middles = np.stack([link.middle for link in self.links])
-        steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(seconds)
+        steps = np.linalg.norm(np.diff(middles - positions, axis=0)[:, :2], axis=1) / np.diff(
+            seconds
+        )
         if np.median(steps) > _MAX_JUMP_M_S or is_static(samples, positions, headings, seconds):
             return None
         confidence = self._confidence(samples, positions, headings, seconds)
@@ -236,31 +275,58 @@ class _ActorChain:
         headings: NDArray[np.float64],
         seconds: NDArray[np.float64],
     ) -> float:
-        """Return the probability that the actor is real, from 0 to 1; the arguments are those of `misalignment`.
+        """Return the probability that the actor is real, from 0 to 1; the arguments are those of
+        `misalignment`.
 
-        It is the logistic function of a weighted sum of these terms: the share of its points at places that were seen free; the share of
-        static points among all points around it; the share by which its observations align better than shifted along its path; the
-        logarithm of their number; and whether it is a scan line. The second and the third term reject pieces of rails, fences and
-        hedges: these have static neighbours, and align as well after any shift.
+        It is the logistic function of a weighted sum of these terms: the share of its points at
+        places that were seen free; the share of static points among all points around it; the share
+        by which its observations align better than shifted along its path; the logarithm of their
+        number; and whether it is a scan line. The second and the third term reject pieces of rails,
+        fences and hedges: these have static neighbours, and align as well after any shift.
         """
-        _, best, *shifted = misalignment(samples, positions, headings, seconds, (0.0, -_SHIFT_M, _SHIFT_M))
-        counts = np.array([(len(link.segment.members), link.freed, link.around) for link in self.links])
+        _, best, *shifted = misalignment(
+            samples, positions, headings, seconds, (0.0, -_SHIFT_M, _SHIFT_M)
+        )
+        counts = np.array(
+            [(len(link.segment.members), link.freed, link.around) for link in self.links]
+        )
         points, freed, around = counts.sum(axis=0).tolist()
         gain = 1.0 - best / max(min(shifted), 1e-3)
         support = float(np.log(min(len(self.links), _MANY_OBSERVATIONS) / _OBSERVATIONS))
-        terms = (1.0, freed / points, around / (points + around), gain, support, float(self._is_scan_line()))
-        return 1.0 / (1.0 + float(np.exp(-sum(weight * term for weight, term in zip(_WEIGHTS, terms, strict=True)))))
+        terms = (
+            1.0,
+            freed / points,
+            around / (points + around),
+            gain,
+            support,
+            float(self._is_scan_line()),
+        )
+        return 1.0 / (
+            1.0
+            + float(
+                np.exp(-sum(weight * term for weight, term in zip(_WEIGHTS, terms, strict=True)))
+            )
+        )
 
     def _in_sensor(self) -> list[NDArray[np.float64]] | None:
-        """Return the (M, 3) points of each observation, metres, sensor frame; None unless they stay in place there while the sensor moves."""
+        """Return the (M, 3) points of each observation, metres, sensor frame; None unless they stay
+        in place there while the sensor moves.
+        """
         driven = np.ptp([link.world_T_sensor[:3, 3] for link in self.links], axis=0).max()
-        local = [transform_points(invert(link.world_T_sensor), link.segment.points) for link in self.links]
+        local = [
+            transform_points(invert(link.world_T_sensor), link.segment.points)
+            for link in self.links
+        ]
         middles = middles_of(local)
         stays = np.median(np.abs(middles - np.median(middles, axis=0)), axis=0).max() < _STAYS_M
-        return local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
+        return (
+            local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
+        )
 
     def own_vehicle(self) -> NDArray[np.float64] | None:
-        """Return the (6,) lower and upper corner, metres, sensor frame, of a part of the recording vehicle; None if it is none."""
+        """Return the (6,) lower and upper corner, metres, sensor frame, of a part of the recording
+        vehicle; None if it is none.
+        """
         local = self._in_sensor()
         if local is None:
             return None
@@ -274,12 +340,16 @@ class _ActorChain:
         return np.concatenate([low - _OWN_MARGIN_M, high + _OWN_MARGIN_M])
 
     def _is_scan_line(self) -> bool:
-        """Return whether its points are of one scan line and move with the sensor, as where a scan line meets a rail."""
+        """Return whether its points are of one scan line and move with the sensor, as where a scan
+        line meets a rail.
+        """
         local = self._in_sensor()
         if local is None:
             return False
         x, y, z = np.concatenate(local).T
-        return bool(np.ptp(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))) < _LINE_SLOPE)
+        return bool(
+            np.ptp(np.quantile(z / np.maximum(np.hypot(x, y), 1e-3), (0.05, 0.95))) < _LINE_SLOPE
+        )
 
 
 def _is_small(size: NDArray[np.float64]) -> bool:
@@ -287,7 +357,10 @@ def _is_small(size: NDArray[np.float64]) -> bool:
 
 
 def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
-    """Join clusters of one vehicle. Rays that meet a side at a grazing angle are far apart, and split it."""
+    """Join clusters of one vehicle.
+
+    Rays that meet a side at a grazing angle are far apart, and split it.
+    """
     joined = list(links)
     i = 0
     while i < len(joined):
@@ -304,7 +377,10 @@ def _join_parts(links: list[_Link], deformable: Collection[int]) -> list[_Link]:
 
 def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     label = one.segment.label
-    if label != other.segment.label or (np.maximum(one.lower - other.upper, other.lower - one.upper) > _PARTS_M).any():
+    if (
+        label != other.segment.label
+        or (np.maximum(one.lower - other.upper, other.lower - one.upper) > _PARTS_M).any()
+    ):
         return False
     if label in deformable or (not (label and deformable) and one.is_small and other.is_small):
         return False
@@ -312,9 +388,15 @@ def _are_parts(one: _Link, other: _Link, deformable: Collection[int]) -> bool:
     return bool(nearest_points(*samples)[1].min() < _PARTS_M**2)
 
 
-def _link(evidence: FreeSpaceEvidence, alive: list[_ActorChain], deformable: Collection[int]) -> None:
-    """Continue chains with the clusters of a scan, best pairs first; join further parts to them; start new chains with the rest."""
-    links = _join_parts([_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable)
+def _link(
+    evidence: FreeSpaceEvidence, alive: list[_ActorChain], deformable: Collection[int]
+) -> None:
+    """Continue chains with the clusters of a scan, best pairs first; join further parts to them;
+    start new chains with the rest.
+    """
+    links = _join_parts(
+        [_Link.of(evidence, index) for index in range(len(evidence.clusters))], deformable
+    )
     costs = []
     ends = np.array([chain.last.middle for chain in alive]).reshape(-1, 3)
     for i, link in enumerate(links):

@@ -1,8 +1,9 @@
 """Ground without labels: the points of a scan on the road and on other ground.
 
-The area around the sensor is divided into sectors and rings. A plane through the lowest points nearby gives the height of the ground below the
-sensor, and its slope, or the tilt of the sensor. In each sector the ground is then followed outwards over the lowest points: the next ring
-is ground if the step from this slope is possible for a road or a kerb. Elsewhere the ground is interpolated.
+The area around the sensor is divided into sectors and rings. A plane through the lowest points
+nearby gives the height of the ground below the sensor, and its slope, or the tilt of the sensor. In
+each sector the ground is then followed outwards over the lowest points: the next ring is ground if
+the step from this slope is possible for a road or a kerb. Elsewhere the ground is interpolated.
 """
 
 from __future__ import annotations
@@ -35,11 +36,13 @@ _MIN_CELLS, _MIN_SHARE = 20, 0.2  # least number of cells on the plane, and thei
 def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return which points of a scan lie on the ground.
 
-    Points more than half a metre below the ground (returns of mirror images) and points that are not finite are not ground. Without a plane
-    below the sensor, as in a scan of few points, no point is ground.
+    Points more than half a metre below the ground (returns of mirror images) and points that are
+    not finite are not ground. Without a plane below the sensor, as in a scan of few points, no
+    point is ground.
 
     Args:
-        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first.
+        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some
+            degrees: x, y, z first.
 
     Returns:
         (N,) bool.
@@ -58,14 +61,16 @@ def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def ground_height(points: NDArray[np.floating]) -> float:
-    """Return z of the ground below the sensor: minus the height of the sensor, in the sensor's own frame.
+    """Return z of the ground below the sensor: minus the height of the sensor, in the sensor's own
+    frame.
 
-    It is the height of the plane through most of the lowest points at 2 to 15 m, so a tilted sensor, a slope, and points below the ground
-    do not change it. On a curved road, its error is the curve within some 10 m.
+    It is the height of the plane through most of the lowest points at 2 to 15 m, so a tilted
+    sensor, a slope, and points below the ground do not change it. On a curved road, its error is
+    the curve within some 10 m.
 
     Args:
-        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some degrees: x, y, z first. Points
-            that are not finite are ignored.
+        points: (N, 3 or more) float, metres, in the frame of a sensor that is upright within some
+            degrees: x, y, z first. Points that are not finite are ignored.
 
     Returns:
         Metres; NaN if no plane is found.
@@ -76,15 +81,24 @@ def ground_height(points: NDArray[np.floating]) -> float:
 
 
 @cached
-def _lowest(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """Return the (N,) sector and the (N,) ring of each point, and the (S, R) index of the lowest point of each cell, -1 without one."""
+def _lowest(
+    points: NDArray[np.float32],
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+    """Return the (N,) sector and the (N,) ring of each point, and the (S, R) index of the lowest
+    point of each cell, -1 without one.
+    """
     lowest = np.full((_SECTORS, _RINGS), -1, np.int64)
     sector, ring = np.empty(len(points), np.int32), np.empty(len(points), np.int32)
     for i in range(len(points)):
         x, y = float(points[i, 0]), float(points[i, 1])
         flat = math.sqrt(x * x + y * y)
-        s = int((fast_azimuth(x, y) + math.pi) * (_SECTORS / (2 * math.pi))) % _SECTORS if flat > 0 else 0
-        r = int(min(flat / _RING_M, _RINGS - 1.0))  # minimum first: the ring of a far point may exceed an int
+        s = (
+            int((fast_azimuth(x, y) + math.pi) * (_SECTORS / (2 * math.pi))) % _SECTORS
+            if flat > 0
+            else 0
+        )
+        # minimum first: the ring of a far point may exceed an int
+        r = int(min(flat / _RING_M, _RINGS - 1.0))
         sector[i], ring[i] = s, r
         if flat > _BLIND_M and (lowest[s, r] < 0 or points[i, 2] < points[lowest[s, r], 2]):
             lowest[s, r] = i
@@ -92,29 +106,39 @@ def _lowest(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.
 
 
 def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Return (slope along x, slope along y, z at the sensor) of the plane through most of the lowest points nearby; None without one."""
+    """Return (slope along x, slope along y, z at the sensor) of the plane through most of the
+    lowest points nearby; None without one.
+    """
     near = lowest[:, _PLANE_RINGS]
     chosen = points[near[near >= 0]].astype(np.float64)
     if len(chosen) < _MIN_CELLS:
         return None
     rows = np.column_stack([chosen[:, :2], np.ones(len(chosen))])
     samples = np.random.default_rng(0).integers(0, len(chosen), (_TRIALS, 3))
-    x, y, z = np.moveaxis(chosen[samples[:, 1:]] - chosen[samples[:, :1]], 2, 0)  # from the first point to the others
+    # from the first point to the others
+    x, y, z = np.moveaxis(chosen[samples[:, 1:]] - chosen[samples[:, :1]], 2, 0)
     area = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]  # twice the area of the triangle, square metres
     wide = np.abs(area) > 1.0
     x, y, z, area, corner = x[wide], y[wide], z[wide], area[wide], chosen[samples[wide, 0]]
     along_x = (z[:, 0] * y[:, 1] - z[:, 1] * y[:, 0]) / area
     along_y = (x[:, 0] * z[:, 1] - x[:, 1] * z[:, 0]) / area
-    planes = np.column_stack([along_x, along_y, corner[:, 2] - along_x * corner[:, 0] - along_y * corner[:, 1]])
+    planes = np.column_stack(
+        [along_x, along_y, corner[:, 2] - along_x * corner[:, 0] - along_y * corner[:, 1]]
+    )
     planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < _STEEPEST]
     if not len(planes):
         return None
     weight = 1.0 / np.maximum(np.hypot(chosen[:, 0], chosen[:, 1]) / _NEAR_M, 1.0)
     best = planes[int(_support(planes, chosen, weight).argmax())]
-    on = np.abs(best[0] * chosen[:, 0] + best[1] * chosen[:, 1] + best[2] - chosen[:, 2]) < _ON_PLANE_M
+    on = (
+        np.abs(best[0] * chosen[:, 0] + best[1] * chosen[:, 1] + best[2] - chosen[:, 2])
+        < _ON_PLANE_M
+    )
     if on.sum() < max(_MIN_CELLS, _MIN_SHARE * len(chosen)):
         return None
-    found: NDArray[np.float64] = least_squares(rows[on] * weight[on, None], (chosen[on, 2] * weight[on])[:, None])[:, 0]
+    found: NDArray[np.float64] = least_squares(
+        rows[on] * weight[on, None], (chosen[on, 2] * weight[on])[:, None]
+    )[:, 0]
     return found
 
 
@@ -122,7 +146,9 @@ def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np
 def _support(
     planes: NDArray[np.float64], points: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return, for each of (P, 3) planes, the sum of the (N,) weights of the (N, 3) points that are on it."""
+    """Return, for each of (P, 3) planes, the sum of the (N,) weights of the (N, 3) points that are
+    on it.
+    """
     support = np.zeros(len(planes))
     for p in range(len(planes)):
         for i in range(len(points)):
@@ -152,8 +178,11 @@ def _ground(
         # The median with the neighbours corrects a sector that was followed onto an object.
         a, b, c = heights[s - 1, r], heights[s, r], heights[(s + 1) % _SECTORS, r]
         middle = max(min(a, b), min(max(a, b), c))
-        # The cell of a kerb has the height of the road, and holds points of the pavement too, which has the height of the next ring.
-        step = min(max(heights[s, r - 1] if r else b, b, heights[s, min(r + 1, _RINGS - 1)]) - b, _KERB_M)
+        # The cell of a kerb has the height of the road, and holds points of the pavement too, which
+        # has the height of the next ring.
+        step = min(
+            max(heights[s, r - 1] if r else b, b, heights[s, min(r + 1, _RINGS - 1)]) - b, _KERB_M
+        )
         ground[i] = -_BELOW_M < _above(points[i], plane) - middle < _ABOVE_M + step
     return ground
 
@@ -166,7 +195,9 @@ def _above(point: NDArray[np.float32], plane: NDArray[np.float64]) -> float:
 
 @cached
 def _follow(lowest: NDArray[np.float64], heights: NDArray[np.float64]) -> None:
-    """Fill the (R,) heights of the ground in the rings of one sector, from (R,) lowest points, both above the plane below the sensor."""
+    """Fill the (R,) heights of the ground in the rings of one sector, from (R,) lowest points, both
+    above the plane below the sensor.
+    """
     last, at, slope = -1, 0.0, 0.0
     for r in range(_RINGS):
         if lowest[r] == np.inf:

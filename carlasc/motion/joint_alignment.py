@@ -1,13 +1,17 @@
-"""Joint alignment: the poses of many scans, estimated at once, so that the points of all scans on a surface lie on one plane.
+"""Joint alignment: the poses of many scans, estimated at once, so that the points of all scans on a
+surface lie on one plane.
 
-The points of each scan are grouped into the cells of a grid in the world. A group is a cluster, and is kept as the sums of its points. The
-clusters of several scans in one cell give a plane if they are flat together. The poses then move the clusters towards these planes: all
-poses are in one linear system, from which the positions of the planes are eliminated. This is repeated, first with large cells, then with
-small ones. (Liu et al., "Efficient and Consistent Bundle Adjustment on Lidar Point Clouds", T-RO 2023, use the second derivative. With
-fixed normals the first one is enough, as the errors here are small.)
+The points of each scan are grouped into the cells of a grid in the world. A group is a cluster, and
+is kept as the sums of its points. The clusters of several scans in one cell give a plane if they
+are flat together. The poses then move the clusters towards these planes: all poses are in one
+linear system, from which the positions of the planes are eliminated. This is repeated, first with
+large cells, then with small ones. (Liu et al., "Efficient and Consistent Bundle Adjustment on Lidar
+Point Clouds", T-RO 2023, use the second derivative. With fixed normals the first one is enough, as
+the errors here are small.)
 
-A plane is made of the scans of one block, which are 60 consecutive ones, and blocks overlap by half. Scans that are farther apart in time,
-and may have drifted, are therefore not aligned to each other.
+A plane is made of the scans of one block, which are 60 consecutive ones, and blocks overlap by
+half. Scans that are farther apart in time, and may have drifted, are therefore not aligned to each
+other.
 """
 
 from __future__ import annotations
@@ -23,14 +27,18 @@ from carlasc.core.compiling import cached, jit
 from carlasc.motion.solving import principal_axes, solve_positive
 
 HALF_BLOCK = 30
-"""Half of the number of scans in a block. Scans that are at most so far apart are always compared."""
+"""Half of the number of scans in a block.
+
+Scans that are at most so far apart are always compared.
+"""
 
 _MIN_SCANS, _MIN_POINTS = 3, 8  # least numbers of a plane
 _WIDE_M2 = 0.02  # least variance of a plane along its second axis: narrower clusters are lines
 POINT_M = 0.03  # error of a point
 _EQUAL = 4  # greatest number of points of a cluster that count
 _INDEPENDENT = 0.1  # share of the clusters whose errors are independent
-_OUTLIER = 9.0  # squared distance to a plane, in standard deviations, above which a cluster has less weight
+# squared distance to a plane, in standard deviations, above which a cluster has less weight
+_OUTLIER = 9.0
 _DETERMINED = 0.003  # least share of the planes, by weight, that determine a direction
 _STEEP, _SLANTED = 0.8, 0.3  # |z| of the normals of ground, and of slopes
 _PER_DIRECTION = 300  # greatest number of planes per direction: more add little
@@ -59,7 +67,8 @@ class Pass(NamedTuple):
         cell_m: size of a cell.
         repeats: number of steps.
         thick_m: greatest standard deviation of a plane along its normal.
-        flat: greatest variance of a plane along its normal, as a share of the variance along its second axis.
+        flat: greatest variance of a plane along its normal, as a share of the variance along its
+            second axis.
     """
 
     cell_m: float
@@ -77,7 +86,8 @@ class Clusters(NamedTuple):
     Attributes:
         start: (G + 1,) the first cluster of each cell.
         scan: (C,) row in the poses of the scan of each cluster.
-        sums: (C, 10) sums of the points of each cluster, metres, from its sensor, on the axes of the world.
+        sums: (C, 10) sums of the points of each cluster, metres, from its sensor, on the axes of
+            the world.
     """
 
     start: NDArray[np.int64]
@@ -96,7 +106,8 @@ def align(
 
     Args:
         points: (N, 3) of each scan, metres, frame of the sensor.
-        start: (F, 4, 4) initial world_T_sensor of the scans, in order of time, with errors of at most some decimetres.
+        start: (F, 4, 4) initial world_T_sensor of the scans, in order of time, with errors of at
+            most some decimetres.
         given: (F, 4, 4) poses of the prior, which hold where the scans do not determine a pose.
         fixed: number of scans at the beginning whose poses stay.
         pull: the standard deviations of the prior.
@@ -115,7 +126,14 @@ def align(
                 chosen = _choose(normals, thickness)
                 slopes = _determined(normals, thickness, chosen)
                 add_planes(found, poses, normals, slopes, thickness, chosen, fixed, matrix, right)
-            add_given(poses, given, np.array([*pull.to_given, *pull.to_neighbour]) ** -2.0, fixed, matrix, right)
+            add_given(
+                poses,
+                given,
+                np.array([*pull.to_given, *pull.to_neighbour]) ** -2.0,
+                fixed,
+                matrix,
+                right,
+            )
             move(poses, solve_positive(matrix, right).reshape(-1, 6), fixed)
     return poses
 
@@ -138,7 +156,9 @@ def blocks(
 
 
 def _choose(normals: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the planes that are used: about the same number for each of six directions, spread over the scene."""
+    """Return the planes that are used: about the same number for each of six directions, spread
+    over the scene.
+    """
     found = np.flatnonzero(thickness >= 0)
     x, y, upright = normals[found, 0], normals[found, 1], np.abs(normals[found, 2])
     wall = 2 + 2 * (np.abs(x) > np.abs(y)) + (x * y > 0)
@@ -176,7 +196,9 @@ def cell_key(x: float, y: float, z: float) -> int:
 def clusters(
     points: NDArray[np.float32], pose: NDArray[np.float64], cell_m: float, shift: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the (C,) keys of the cells in which a scan has points, and the (C, 10) sums of these points."""
+    """Return the (C,) keys of the cells in which a scan has points, and the (C, 10) sums of these
+    points.
+    """
     size = 16
     while size < 2 * len(points):
         size *= 2
@@ -185,7 +207,9 @@ def clusters(
     seen, at = np.empty(3), np.empty(3)
     for i in range(len(points)):
         for a in range(3):
-            seen[a] = pose[a, 0] * points[i, 0] + pose[a, 1] * points[i, 1] + pose[a, 2] * points[i, 2]
+            seen[a] = (
+                pose[a, 0] * points[i, 0] + pose[a, 1] * points[i, 1] + pose[a, 2] * points[i, 2]
+            )
             at[a] = (seen[a] + pose[a, 3]) / cell_m + shift
         key = cell_key(at[0], at[1], at[2])
         place = ((key * _MIX) >> 20) & (size - 1)
@@ -200,8 +224,12 @@ def clusters(
     return keys[:count].copy(), sums[:count].copy()
 
 
-def planes(found: Clusters, poses: NDArray[np.float64], how: Pass) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the (G, 3) normals of the planes in cells, and their (G,) variances along the normals, metres squared; -1 without a plane."""
+def planes(
+    found: Clusters, poses: NDArray[np.float64], how: Pass
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the (G, 3) normals of the planes in cells, and their (G,) variances along the normals,
+    metres squared; -1 without a plane.
+    """
     enough, covariances = spread_of(found, poses, _MIN_SCANS)
     values, vectors = principal_axes(covariances)
     flat = enough & (values[:, 0] < how.thick_m**2) & (values[:, 0] < how.flat * values[:, 1])
@@ -210,8 +238,12 @@ def planes(found: Clusters, poses: NDArray[np.float64], how: Pass) -> tuple[NDAr
 
 
 @cached
-def spread_of(found: Clusters, poses: NDArray[np.float64], scans: int) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return (G,) whether a cell has points of enough scans, and the (G, 3, 3) covariances of its points. The weight of a scan is limited."""
+def spread_of(
+    found: Clusters, poses: NDArray[np.float64], scans: int
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return (G,) whether a cell has points of enough scans, and the (G, 3, 3) covariances of its
+    points. The weight of a scan is limited.
+    """
     start, scan, sums = found
     cells = len(start) - 1
     enough, covariances = np.zeros(cells, np.bool_), np.zeros((cells, 3, 3))
@@ -232,7 +264,12 @@ def spread_of(found: Clusters, poses: NDArray[np.float64], scans: int) -> tuple[
                 total[1 + a] += weight * (sums[r, 1 + a] + sums[r, 0] * to[a])
                 for b in range(a, 3):
                     k = _SQUARES[a, b]
-                    moved = sums[r, k] + to[a] * sums[r, 1 + b] + to[b] * sums[r, 1 + a] + sums[r, 0] * to[a] * to[b]
+                    moved = (
+                        sums[r, k]
+                        + to[a] * sums[r, 1 + b]
+                        + to[b] * sums[r, 1 + a]
+                        + sums[r, 0] * to[a] * to[b]
+                    )
                     total[k] += weight * moved
         enough[g] = total[0] >= _MIN_POINTS
         for a in range(3):
@@ -250,7 +287,9 @@ def to_plane(
     normal: NDArray[np.float64],
     variance: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the (C,) distances of clusters from their plane, along its normal, and their (C,) weights; outliers have less."""
+    """Return the (C,) distances of clusters from their plane, along its normal, and their (C,)
+    weights; outliers have less.
+    """
     off, weight = np.empty(len(scan)), np.empty(len(scan))
     for i in range(len(scan)):
         off[i] = 0.0
@@ -280,7 +319,8 @@ def add_planes(
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
-    """Add the chosen planes to the normal equations of the poses from `fixed` on: `right`, and the lower half of `matrix`.
+    """Add the chosen planes to the normal equations of the poses from `fixed` on: `right`, and the
+    lower half of `matrix`.
 
     `slopes` are the normals without their undetermined components: see `_determined`.
     """
@@ -315,7 +355,9 @@ def add_planes(
 
 @jit
 def _turn_between(one: NDArray[np.float64], other: NDArray[np.float64], axis: int) -> float:
-    """Return one component of the small rotation vector between the rotations of two poses, on the axes of the world."""
+    """Return one component of the small rotation vector between the rotations of two poses, on the
+    axes of the world.
+    """
     low, high = (axis + 1) % 3, (axis + 2) % 3
     value = 0.0
     for k in range(3):
@@ -332,7 +374,9 @@ def add_given(
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
-    """Add the prior to the normal equations: each pose is near the given one, and its change near the change of the previous one."""
+    """Add the prior to the normal equations: each pose is near the given one, and its change near
+    the change of the previous one.
+    """
     count = len(poses)
     change = np.empty((count, 6))
     for i in range(count):
@@ -357,7 +401,9 @@ def add_given(
 
 @cached
 def move(poses: NDArray[np.float64], steps: NDArray[np.float64], fixed: int) -> None:
-    """Change the poses from `fixed` on by (F - fixed, 6) small translations and rotation vectors on the axes of the world."""
+    """Change the poses from `fixed` on by (F - fixed, 6) small translations and rotation vectors on
+    the axes of the world.
+    """
     for i in range(len(steps)):
         pose, (x, y, z) = poses[fixed + i], steps[i, 3:]
         for a in range(3):

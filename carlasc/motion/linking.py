@@ -1,7 +1,7 @@
 """Linking: the segments of each actor, linked from scan to scan into chains.
 
-Scans are added to a `Linker` in order of time. A chain ends when its actor was not seen for some time, so memory does not grow with the
-length of a drive.
+Scans are added to a `Linker` in order of time. A chain ends when its actor was not seen for some
+time, so memory does not grow with the length of a drive.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ Chain = list[Segment]
 class Linker:
     """Links segments, scan by scan.
 
-    Numbered actors are linked by their numbers where possible, and all other actors by prediction: a segment continues the chain whose
-    predicted position is nearest, also after the actor was hidden for some time. Chains of its class come first.
+    Numbered actors are linked by their numbers where possible, and all other actors by prediction:
+    a segment continues the chain whose predicted position is nearest, also after the actor was
+    hidden for some time. Chains of its class come first.
     """
 
     def __init__(self) -> None:
@@ -47,7 +48,11 @@ class Linker:
         self._static: deque[tuple[float, StaticPoints]] = deque()
 
     def add(
-        self, frame: int, seconds: float, segments: Sequence[Segment], static: StaticPoints | None = None
+        self,
+        frame: int,
+        seconds: float,
+        segments: Sequence[Segment],
+        static: StaticPoints | None = None,
     ) -> list[Chain]:
         """Add the segments of the next scan, and return the chains that ended.
 
@@ -55,7 +60,8 @@ class Linker:
             frame: frame number.
             seconds: time of the scan.
             segments: the actors of the scan.
-            static: its static points. An actor that stops, as at a crossing, is found in them until it continues.
+            static: its static points. An actor that stops, as at a crossing, is found in them until
+                it continues.
         """
         self._seconds[frame] = seconds
         ended = self._end(seconds)
@@ -89,15 +95,23 @@ class Linker:
         over = [chain for chain in self._chains if since[chain[-1].frame] > _MAX_GAP_S]
         over += [chain for chain in self._numbered if since[chain[-1].frame] > _NUMBERED_GAP_S]
         self._chains = [chain for chain in self._chains if since[chain[-1].frame] <= _MAX_GAP_S]
-        self._numbered = [chain for chain in self._numbered if since[chain[-1].frame] <= _NUMBERED_GAP_S]
+        self._numbered = [
+            chain for chain in self._numbered if since[chain[-1].frame] <= _NUMBERED_GAP_S
+        ]
         kept_s = _NUMBERED_GAP_S + _MAX_GAP_S
-        self._seconds = {frame: then for frame, then in self._seconds.items() if seconds - then <= kept_s}
+        self._seconds = {
+            frame: then for frame, then in self._seconds.items() if seconds - then <= kept_s
+        }
         return over
 
     def _link_numbers(self, segments: list[Segment], seconds: float) -> None:
-        """Continue the chains of numbered actors: by number where possible, otherwise by predicted position."""
+        """Continue the chains of numbered actors: by number where possible, otherwise by predicted
+        position.
+        """
         linked: dict[int, int] = {}
-        for i, j, is_other in self._candidates(segments, seconds) if segments and self._numbered else ():
+        for i, j, is_other in (
+            self._candidates(segments, seconds) if segments and self._numbered else ()
+        ):
             if i not in linked and not (is_other and j in linked.values()):
                 linked[i] = j
         for j, chain in enumerate(self._numbered):
@@ -107,7 +121,9 @@ class Linker:
         self._numbered += [[segment] for i, segment in enumerate(segments) if i not in linked]
 
     def _candidates(self, segments: list[Segment], seconds: float) -> list[tuple[int, int, bool]]:
-        """Return (segment, chain, whether the number changes) of the possible links of numbered actors, the best first."""
+        """Return (segment, chain, whether the number changes) of the possible links of numbered
+        actors, the best first.
+        """
         elapsed = np.array([seconds - self._seconds[chain[-1].frame] for chain in self._numbered])
         velocity = np.stack([self._velocity(chain) for chain in self._numbered])
         velocity[elapsed > _SOON_S] = np.nan
@@ -117,7 +133,9 @@ class Linker:
         change = np.nan_to_num(_lengths(_velocities(segments)[:, None] - velocity))
         numbers = np.array([segment.instance for segment in segments])
         is_other = numbers[:, None] != np.array([chain[0].instance for chain in self._numbered])
-        far = _NUMBERED_GATE_M + np.where(elapsed > _SOON_S, np.inf, np.where(is_lost, _MAX_SPEED_M_S * elapsed, 0.0))
+        far = _NUMBERED_GATE_M + np.where(
+            elapsed > _SOON_S, np.inf, np.where(is_lost, _MAX_SPEED_M_S * elapsed, 0.0)
+        )
         possible = gap < np.where(is_other, np.where(is_lost, 0.0, _GATE_M), far)
         cost = gap + change + is_other * _OTHER_NUMBER
         found = sorted((float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist())
@@ -137,7 +155,9 @@ class Linker:
         return _UNKNOWN
 
     def _before(self, segment: Segment) -> Chain:
-        """Return the segments of earlier scans in which the actor of a new chain was static at the start of the chain."""
+        """Return the segments of earlier scans in which the actor of a new chain was static at the
+        start of the chain.
+        """
         found: Chain = []
         for _, static in reversed(self._static):
             rest = static.segment_at(segment) if _is_slow(segment) else None
@@ -147,33 +167,46 @@ class Linker:
             found.append(rest)
         return found[::-1]
 
-    def _match(self, found: list[Segment], alive: list[Chain]) -> list[tuple[Segment, Chain | None]]:
-        """Pair the segments of one scan with the chains that they continue: the nearest prediction first, each chain once."""
+    def _match(
+        self, found: list[Segment], alive: list[Chain]
+    ) -> list[tuple[Segment, Chain | None]]:
+        """Pair the segments of one scan with the chains that they continue: the nearest prediction
+        first, each chain once.
+        """
         if not found or not alive:
             return [(segment, None) for segment in found]
         last = [chain[-1] for chain in alive]
-        elapsed = np.array([self._seconds[found[0].frame] - self._seconds[end.frame] for end in last])
+        elapsed = np.array(
+            [self._seconds[found[0].frame] - self._seconds[end.frame] for end in last]
+        )
         centers, velocity, before = (
             np.stack([s.center for s in found])[:, None],
             _velocities(found)[:, None],
             _velocities(last),
         )
         shift = (before + velocity) / 2 * elapsed[:, None]
-        # The visible part of an actor changes: the gap between boxes counts most, and their centres have little weight.
+        # The visible part of an actor changes: the gap between boxes counts most, and their centres
+        # have little weight.
         gap, change = _gaps(found, last, shift), _lengths(velocity - before)
         offset = _lengths(np.stack([end.points.mean(axis=0) for end in last]) + shift - centers)
-        is_other = np.array([s.label for s in found])[:, None] != np.array([end.label for end in last])
+        is_other = np.array([s.label for s in found])[:, None] != np.array(
+            [end.label for end in last]
+        )
         reach = _FARTHEST_M + _MAX_SPEED_M_S * elapsed
         possible = (gap <= _GATE_M) & (change <= LINKED_M_S)
         possible &= _lengths(np.stack([end.center for end in last]) - centers) < reach
         cost = gap + change + 0.1 * offset + is_other * _OTHER_CLASS
         candidates = [(float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist()]
         taken = best_pairs(candidates)
-        return [(segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(found)]
+        return [
+            (segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(found)
+        ]
 
 
 def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
-    """Pair first and second numbers by (cost, first, second), the lowest cost first, each number once; return the second by the first."""
+    """Pair first and second numbers by (cost, first, second), the lowest cost first, each number
+    once; return the second by the first.
+    """
     taken: dict[int, int] = {}
     for _, i, j in sorted(costs):
         if i not in taken and j not in taken.values():
@@ -183,26 +216,43 @@ def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
 
 def _velocities(segments: list[Segment]) -> NDArray[np.float64]:
     """Return the (S, 3) velocities of segments, m/s, world; NaN where the scan has no flow."""
-    return np.stack([_UNKNOWN if segment.velocity is None else segment.velocity for segment in segments])
+    return np.stack(
+        [_UNKNOWN if segment.velocity is None else segment.velocity for segment in segments]
+    )
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    lengths: NDArray[np.float64] = np.linalg.norm(vectors, axis=-1)  # the same sum on every processor
+    # the same sum on every processor
+    lengths: NDArray[np.float64] = np.linalg.norm(vectors, axis=-1)
     return lengths
 
 
 def _is_slow(segment: Segment) -> bool:
-    return segment.velocity is not None and float(np.square(segment.velocity).sum()) < _STOPPING_M_S**2
+    return (
+        segment.velocity is not None and float(np.square(segment.velocity).sum()) < _STOPPING_M_S**2
+    )
 
 
-def _gaps(segments: list[Segment], ends: list[Segment], shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (S, C) gaps, metres, between the bounding boxes of segments and of `ends` moved by (C, 3) or (S, C, 3); 0 if they overlap."""
-    lower, upper = (np.stack([bound(s.points, axis=0) for s in segments])[:, None] for bound in (np.min, np.max))
-    lowest, highest = (np.stack([bound(s.points, axis=0) for s in ends]) + shifts for bound in (np.min, np.max))
+def _gaps(
+    segments: list[Segment], ends: list[Segment], shifts: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the (S, C) gaps, metres, between the bounding boxes of segments and of `ends` moved by
+    (C, 3) or (S, C, 3); 0 if they overlap.
+    """
+    lower, upper = (
+        np.stack([bound(s.points, axis=0) for s in segments])[:, None] for bound in (np.min, np.max)
+    )
+    lowest, highest = (
+        np.stack([bound(s.points, axis=0) for s in ends]) + shifts for bound in (np.min, np.max)
+    )
     return _lengths(np.maximum(np.maximum(lowest - upper, lower - highest), 0.0))
 
 
 def _together(parts: list[Segment]) -> Segment:
-    """Join several segments of one actor in one scan; label, number and velocity are those of the first."""
+    """Join several segments of one actor in one scan; label, number and velocity are those of the
+    first.
+    """
     members = np.concatenate([part.members for part in parts])
-    return replace(parts[0], members=members, points=np.concatenate([part.points for part in parts]))
+    return replace(
+        parts[0], members=members, points=np.concatenate([part.points for part in parts])
+    )

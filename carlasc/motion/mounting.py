@@ -1,9 +1,11 @@
-"""Mounting: the pose of the sensor in the frame of the given poses, and the delay of these poses, estimated from motions.
+"""Mounting: the pose of the sensor in the frame of the given poses, and the delay of these poses,
+estimated from motions.
 
-In turns, poses of an IMU, a camera or the rear axle move differently from those of the sensor. Late poses differ while the speed or the turn
-rate changes. One constant transform and one constant delay are fitted to the motions of the aligned scans (`joint_alignment`) by least
-squares, with a standard error for each number. It is large for what a drive does not determine: the height of the sensor on a flat road,
-and its whole position on a straight road.
+In turns, poses of an IMU, a camera or the rear axle move differently from those of the sensor. Late
+poses differ while the speed or the turn rate changes. One constant transform and one constant delay
+are fitted to the motions of the aligned scans (`joint_alignment`) by least squares, with a standard
+error for each number. It is large for what a drive does not determine: the height of the sensor on
+a flat road, and its whole position on a straight road.
 """
 
 from __future__ import annotations
@@ -20,11 +22,15 @@ from carlasc.motion.solving import solve_positive
 _LAGS = (2, 5, 10, 20)  # scans between the start and the end of a compared motion
 _ROUNDS = 8
 _ROBUST = 4.0  # squared residual, in standard deviations, above which a motion has less weight
-_SAME = 12.0  # number of motions with about the same errors: a scan is in two per lag, and neighbours are similar
-_LEAST = np.array([0.003, 0.003, 0.003, 2e-4, 2e-4, 2e-4])  # least deviation of a motion: metres, radians
+# number of motions with about the same errors: a scan is in two per lag, and neighbours are similar
+_SAME = 12.0
+# least deviation of a motion: metres, radians
+_LEAST = np.array([0.003, 0.003, 0.003, 2e-4, 2e-4, 2e-4])
 _STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # steps of the numerical derivatives
-_DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])  # greatest error of a known value
-_RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])  # smaller values need no correction
+# greatest error of a known value
+_DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])
+# smaller values need no correction
+_RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])
 _CERTAIN = 4.0  # values of fewer standard errors need none either
 _LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values
 _NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "late")
@@ -35,8 +41,9 @@ class Mounting:
     """The pose of the sensor in the frame whose poses are given, and the delay of these poses.
 
     Attributes:
-        values: (7,) x, y, z of the sensor in metres, its rotation vector in radians, and the delay of the poses in seconds: a scan has the
-            pose that the file gives for a later time. Exact poses of the sensor have zeros.
+        values: (7,) x, y, z of the sensor in metres, its rotation vector in radians, and the delay
+            of the poses in seconds: a scan has the pose that the file gives for a later time. Exact
+            poses of the sensor have zeros.
         errors: (7,) standard errors, infinite where a value is not determined.
     """
 
@@ -51,10 +58,16 @@ class Mounting:
     @property
     def wrong(self) -> NDArray[np.bool_]:
         """(7,) bool: which values are certainly not zero, and large enough to matter."""
-        return self.determined & (np.abs(self.values) > np.maximum(_RELEVANT, _CERTAIN * self.errors))
+        return self.determined & (
+            np.abs(self.values) > np.maximum(_RELEVANT, _CERTAIN * self.errors)
+        )
 
-    def correct(self, poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the (F, 4, 4) poses of the sensor from given poses and their (F,) times: the wrong values are applied. The first pose stays."""
+    def correct(
+        self, poses: NDArray[np.float64], seconds: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the (F, 4, 4) poses of the sensor from given poses and their (F,) times: the wrong
+        values are applied. The first pose stays.
+        """
         values = np.where(self.wrong, self.values, 0.0)
         moved = slerp(poses, seconds, seconds + values[6]) if values[6] else poses
         sensor = multiply(moved, _transform(values))
@@ -73,14 +86,17 @@ class Mounting:
 
 
 def find_mounting(
-    poses: NDArray[np.float64], seconds: NDArray[np.float64], runs: Sequence[tuple[int, NDArray[np.float64]]]
+    poses: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    runs: Sequence[tuple[int, NDArray[np.float64]]],
 ) -> Mounting | None:
     """Fit the mounting to the motions of aligned scans; None if there are too few motions.
 
     Args:
         poses: (F, 4, 4) given poses of all scans.
         seconds: (F,) their times, increasing.
-        runs: the aligned poses, in any frame: the row of the first scan, and the (K, 4, 4) poses of this scan and the following ones.
+        runs: the aligned poses, in any frame: the row of the first scan, and the (K, 4, 4) poses of
+            this scan and the following ones.
     """
     parts = [_Motions.of(poses, seconds, first, found) for first, found in runs]
     if sum(len(part.given) for part in parts) < 2 * len(_LEAST) * len(_LAGS):
@@ -89,11 +105,17 @@ def find_mounting(
     for _ in range(_ROUNDS):
         off = _residuals(parts, values)
         scale = np.maximum(1.4826 * np.median(np.abs(off), axis=0), _LEAST)
-        slope = np.stack([(_residuals(parts, values + step) - off) / step.sum() for step in np.diag(_STEP)], axis=2)
+        slope = np.stack(
+            [(_residuals(parts, values + step) - off) / step.sum() for step in np.diag(_STEP)],
+            axis=2,
+        )
         scaled, slope = off / scale, slope / scale[:, None]
         weights = 1.0 / (1.0 + np.square(scaled) / _ROBUST)
-        information = (weights[:, :, None, None] * slope[:, :, :, None] * slope[:, :, None, :]).sum(axis=(0, 1))
-        information += np.diag((10.0 * _DETERMINED) ** -2.0)  # values that are not determined stay zero
+        information = (weights[:, :, None, None] * slope[:, :, :, None] * slope[:, :, None, :]).sum(
+            axis=(0, 1)
+        )
+        # values that are not determined stay zero
+        information += np.diag((10.0 * _DETERMINED) ** -2.0)
         right = -(weights[:, :, None] * slope * scaled[:, :, None]).sum(axis=(0, 1))
         step = solve_positive(information.copy(), right)
         values = np.clip(values + step, -_LIMITS, _LIMITS)
@@ -119,7 +141,11 @@ class _Motions:
 
     @classmethod
     def of(
-        cls, poses: NDArray[np.float64], seconds: NDArray[np.float64], first: int, found: NDArray[np.float64]
+        cls,
+        poses: NDArray[np.float64],
+        seconds: NDArray[np.float64],
+        first: int,
+        found: NDArray[np.float64],
     ) -> _Motions:
         """Pair the scans of a run."""
         rows = np.concatenate(
@@ -135,15 +161,20 @@ class _Motions:
 
 
 def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (P, 6) differences from the expected motions of the sensor to the aligned ones: metres, and rotation vectors.
+    """Return the (P, 6) differences from the expected motions of the sensor to the aligned ones:
+    metres, and rotation vectors.
 
-    The aligned poses are interpolated at the times of the given poses, not the reverse: they are smooth, and interpolation would reduce
-    the errors of the given poses.
+    The aligned poses are interpolated at the times of the given poses, not the reverse: they are
+    smooth, and interpolation would reduce the errors of the given poses.
     """
     mounted, between = _transform(values), []
     for part in parts:
-        one, other = (slerp(part.found, part.seconds, part.at[:, end] - values[6]) for end in (0, 1))
-        between.append(multiply(invert(multiply(invert(mounted), part.given, mounted)), invert(one), other))
+        one, other = (
+            slerp(part.found, part.seconds, part.at[:, end] - values[6]) for end in (0, 1)
+        )
+        between.append(
+            multiply(invert(multiply(invert(mounted), part.given, mounted)), invert(one), other)
+        )
     return small_motions(np.concatenate(between))
 
 

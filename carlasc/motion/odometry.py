@@ -1,4 +1,5 @@
-"""Odometry: the poses of scans, estimated by KISS-ICP (Vizzo et al., RA-L 2023) through its Python API, and deskewing.
+"""Odometry: the poses of scans, estimated by KISS-ICP (Vizzo et al., RA-L 2023) through its Python
+API, and deskewing.
 
 The points of a scan are measured one after the other, while the sensor moves.
 """
@@ -25,8 +26,9 @@ _NEAR_M = 8.0  # farther ground is left out
 _START = 10  # scans from which the motion at the start is estimated
 _PERIOD_S = 0.1  # between scans whose times are not known
 
-# Where scans are far apart, KISS-ICP may find that a vehicle stands that drives from the first scan on. Things above the sensor, seen from
-# above, tell: poles, trees and facades, but no cars that drive along.
+# Where scans are far apart, KISS-ICP may find that a vehicle stands that drives from the first scan
+# on. Things above the sensor, seen from above, tell: poles, trees and facades, but no cars that
+# drive along.
 _TRIED = 4  # scans that are compared
 _CELL_M, _CELLS = 0.5, 256  # of their images from above
 _ABOVE_M = 0.2
@@ -34,7 +36,9 @@ _FASTEST_M_S = 40.0
 _CLEARLY = 1.1  # so many times the overlap make another start the better one
 
 UsableScan = tuple[NDArray[np.floating], NDArray[np.floating] | None]
-"""(N, 3) points that `usable_points` chose, metres, sensor frame, and the (N,) seconds of each after the time of its frame, or None."""
+"""(N, 3) points that `usable_points` chose, metres, sensor frame, and the (N,) seconds of each
+after the time of its frame, or None.
+"""
 
 
 def estimate_poses(
@@ -48,10 +52,12 @@ def estimate_poses(
     total: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> NDArray[np.float64]:
-    """Estimate the pose of every scan of a drive from its usable points, with the method of `follow_scans`.
+    """Estimate the pose of every scan of a drive from its usable points, with the method of
+    `follow_scans`.
 
     Args:
-        scans: (N, 3) points of each scan, metres, sensor frame, right-handed or left-handed; the poses are in the same frame.
+        scans: (N, 3) points of each scan, metres, sensor frame, right-handed or left-handed; the
+            poses are in the same frame.
         seconds: (N,) time of each point of each scan, after the time of its frame.
         times: (F,) seconds, increasing: the time of each frame; None for frames at 10 Hz.
         max_range_m: farther points are not used.
@@ -65,11 +71,14 @@ def estimate_poses(
 
     Raises:
         DependencyError: kiss-icp is not installed.
-        ArgumentError: one of several scans has fewer than `MIN_POINTS` points, or not one time for each of its points.
+        ArgumentError: one of several scans has fewer than `MIN_POINTS` points, or not one time for
+            each of its points.
     """
     poses: list[Transform] = []
     limits = {"max_range_m": max_range_m, "min_range_m": min_range_m}
-    for pose in follow_scans(_usable(scans, seconds), times=times, voxel_size_m=voxel_size_m, **limits):
+    for pose in follow_scans(
+        _usable(scans, seconds), times=times, voxel_size_m=voxel_size_m, **limits
+    ):
         poses.append(pose)
         if progress:
             progress(len(poses), total or len(poses))
@@ -84,23 +93,29 @@ def follow_scans(
     min_range_m: float = 0.0,
     voxel_size_m: float | None = None,
 ) -> Iterator[Transform]:
-    """Yield the pose of every scan of a drive, in order, as soon as it is known. The first one needs ten scans.
+    """Yield the pose of every scan of a drive, in order, as soon as it is known.
 
-    With the times of points, each scan is deskewed to the time of its frame by the motion between the two previous scans, and the poses are
-    for the times of the frames. (KISS-ICP's own deskewing gives poses at the end of each scan, and is not used.) Without them, scans count
-    as instantaneous (CarlaSC) or as deskewed (SemanticKITTI). On simulated scans of a circle of 12 m at 8 m/s, 0.1 s each, the error of the
-    position after 15 m is 0.27 m without the times of points and 0.05 m with them; on straight drives at a steady speed they do not change
-    the poses.
+    The first one needs ten scans.
 
-    Far ground is left out: its rings move with the sensor and hide the motion at the start of a drive. For the same reason the first scans
-    are registered forwards, backwards, and forwards again with the estimated motion: a drive may start at any speed. At 5 Hz and less, this
-    may still find that the vehicle stands, so the motion under which things above the sensor overlap most is tried too. On a straight
-    street without structure the driven distance is not determined, and the estimate is too short.
+    With the times of points, each scan is deskewed to the time of its frame by the motion between
+    the two previous scans, and the poses are for the times of the frames. (KISS-ICP's own deskewing
+    gives poses at the end of each scan, and is not used.) Without them, scans count as
+    instantaneous (CarlaSC) or as deskewed (SemanticKITTI). On simulated scans of a circle of 12 m
+    at 8 m/s, 0.1 s each, the error of the position after 15 m is 0.27 m without the times of points
+    and 0.05 m with them; on straight drives at a steady speed they do not change the poses.
+
+    Far ground is left out: its rings move with the sensor and hide the motion at the start of a
+    drive. For the same reason the first scans are registered forwards, backwards, and forwards
+    again with the estimated motion: a drive may start at any speed. At 5 Hz and less, this may
+    still find that the vehicle stands, so the motion under which things above the sensor overlap
+    most is tried too. On a straight street without structure the driven distance is not determined,
+    and the estimate is too short.
 
     Args:
-        scans: the usable points of each scan, sensor frame, right-handed or left-handed; the poses are in the same frame.
-        times: (F,) seconds, increasing: the time of each frame; None for frames at 10 Hz. A list may grow during the run, if it has
-            the time of a scan before the scan is read.
+        scans: the usable points of each scan, sensor frame, right-handed or left-handed; the poses
+            are in the same frame.
+        times: (F,) seconds, increasing: the time of each frame; None for frames at 10 Hz. A list
+            may grow during the run, if it has the time of a scan before the scan is read.
         max_range_m: farther points are not used.
         min_range_m: nearer points are not used.
         voxel_size_m: voxel size of the map; None for a hundredth of the range, as in KISS-ICP.
@@ -122,11 +137,15 @@ def follow_scans(
     scans = iter(scans)
     start = list(islice(scans, _START))
     begin = partial(pipeline.KissICP, config)
-    yield from _follow(begin(), enumerate(chain(start, scans)), times, _find_start(start, times, begin))
+    yield from _follow(
+        begin(), enumerate(chain(start, scans)), times, _find_start(start, times, begin)
+    )
 
 
 def _find_start(
-    start: Sequence[UsableScan], times: Sequence[float] | NDArray[np.floating] | None, begin: Callable[[], Any]
+    start: Sequence[UsableScan],
+    times: Sequence[float] | NDArray[np.floating] | None,
+    begin: Callable[[], Any],
 ) -> Transform:
     """Return the motion from the first scan to the next one: `first_T_second`.
 
@@ -138,7 +157,9 @@ def _find_start(
     numbered, motion = list(enumerate(start)), np.eye(4)
     for back in (False, True):  # forwards and backwards over the first scans
         odometry = begin()
-        for _ in _follow(odometry, reversed(numbered) if back else numbered, times, motion, back=back):
+        for _ in _follow(
+            odometry, reversed(numbered) if back else numbered, times, motion, back=back
+        ):
             pass  # only the last motion counts
         motion = invert(np.array(odometry.last_delta))
     above = [_cells_above(points) for points, _ in start[:_TRIED]]
@@ -161,7 +182,9 @@ def _follow(
     *,
     back: bool = False,
 ) -> Iterator[Transform]:
-    """Register scans with their numbers one after the other, and yield `first_T_scan` of each; `motion` and `back` are those of `_register`."""
+    """Register scans with their numbers one after the other, and yield `first_T_scan` of each;
+    `motion` and `back` are those of `_register`.
+    """
     first_T_map: Transform | None = None
     for number, scan in numbered:
         motion = _register(odometry, scan, motion, _elapsed(times, number), back=back)
@@ -178,7 +201,9 @@ def _cells_above(points: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def _likely_shift(above: Sequence[NDArray[np.int64]], reach_m: float) -> NDArray[np.float64]:
-    """Return the (x, y) motion in metres between scans under which their cells overlap most, if all move alike without a turn."""
+    """Return the (x, y) motion in metres between scans under which their cells overlap most, if all
+    move alike without a turn.
+    """
     images = np.zeros((len(above), _CELLS, _CELLS))
     for image, cells in zip(images, above, strict=True):
         image[tuple(cells.T)] = 1.0
@@ -190,15 +215,21 @@ def _likely_shift(above: Sequence[NDArray[np.int64]], reach_m: float) -> NDArray
     return np.array([shifts[x], shifts[y]])
 
 
-def _overlap(first: NDArray[np.int64], last: NDArray[np.floating], first_T_last: Transform) -> float:
-    """Return the share of the cells of what is above the sensor in the last scan, (N, 3) points, that are among those of the first scan."""
+def _overlap(
+    first: NDArray[np.int64], last: NDArray[np.floating], first_T_last: Transform
+) -> float:
+    """Return the share of the cells of what is above the sensor in the last scan, (N, 3) points,
+    that are among those of the first scan.
+    """
     cells = _cells_above(transform_points(first_T_last, last[last[:, 2] > _ABOVE_M]))
     both = np.unique(np.concatenate([first, cells]), axis=0)
     return (len(first) + len(cells) - len(both)) / max(len(cells), 1)
 
 
 def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return (N,) bool, which (N, 3 or more) points of a scan odometry uses: finite ones that are not on far ground."""
+    """Return (N,) bool, which (N, 3 or more) points of a scan odometry uses: finite ones that are
+    not on far ground.
+    """
     with np.errstate(invalid="ignore"):
         used = ~ground_points(points) | (np.hypot(points[:, 0], points[:, 1]) < _NEAR_M)
         return used & finite(points[:, :3])
@@ -222,13 +253,17 @@ def _usable(
         own = None if per_point is None else next(per_point, np.empty(0))
         if own is not None and len(own) != len(points):
             raise ArgumentError(
-                "seconds", expected=f"{len(points)} of scan {number}, one per point", found=str(len(own))
+                "seconds",
+                expected=f"{len(points)} of scan {number}, one per point",
+                found=str(len(own)),
             )
         used = usable_points(points)
         yield points[used, :3], None if own is None else np.asarray(own)[used]
 
 
-def _register(odometry: Any, scan: UsableScan, motion: Transform, elapsed_s: float, *, back: bool = False) -> Transform:
+def _register(
+    odometry: Any, scan: UsableScan, motion: Transform, elapsed_s: float, *, back: bool = False
+) -> Transform:
     """Register a scan; the previous motion is the prediction.
 
     Args:
@@ -236,7 +271,8 @@ def _register(odometry: Any, scan: UsableScan, motion: Transform, elapsed_s: flo
         scan: points, and seconds.
         motion: before_T_scan of the previous scan.
         elapsed_s: seconds between two scans.
-        back: whether scans are registered in reverse order, with `motion` from later points to earlier ones.
+        back: whether scans are registered in reverse order, with `motion` from later points to
+            earlier ones.
 
     Returns:
         before_T_scan of this scan.
@@ -244,7 +280,11 @@ def _register(odometry: Any, scan: UsableScan, motion: Transform, elapsed_s: flo
     points, seconds = scan
     if seconds is not None:
         at, tick_of = ticks_of(-seconds if back else seconds)
-        moved = slerp(np.stack([invert(motion), np.eye(4), motion]), np.array([-1.0, 0.0, 1.0]) * elapsed_s, at)
+        moved = slerp(
+            np.stack([invert(motion), np.eye(4), motion]),
+            np.array([-1.0, 0.0, 1.0]) * elapsed_s,
+            at,
+        )
         points = move_each(points, moved, tick_of)
     if not len(odometry.local_map.point_cloud()):
         odometry.last_pose = invert(motion)  # so that the first scan is at the origin
@@ -265,7 +305,9 @@ _TICK_S = 1e-4  # points within this time share a pose: 3 mm at 30 m/s
 
 
 def ticks_of(seconds: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the (T,) distinct rounded times of (N,) points, seconds, increasing, and the (N,) index of the time of each point."""
+    """Return the (T,) distinct rounded times of (N,) points, seconds, increasing, and the (N,)
+    index of the time of each point.
+    """
     ticks, tick_of = distinct(np.round(np.asarray(seconds, np.float64) / _TICK_S).astype(np.int64))
     return np.asarray(ticks * _TICK_S, np.float64), tick_of
 
@@ -288,5 +330,10 @@ def move_each(
     for i in range(len(points)):
         pose = dst_T_then[tick_of[i]]
         for a in range(3):
-            moved[i, a] = pose[a, 0] * points[i, 0] + pose[a, 1] * points[i, 1] + pose[a, 2] * points[i, 2] + pose[a, 3]
+            moved[i, a] = (
+                pose[a, 0] * points[i, 0]
+                + pose[a, 1] * points[i, 1]
+                + pose[a, 2] * points[i, 2]
+                + pose[a, 3]
+            )
     return moved

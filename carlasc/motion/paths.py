@@ -1,11 +1,14 @@
-"""Paths: the positions and velocities of an actor, estimated from its points alone, for scans that number actors and have no flow.
+"""Paths: the positions and velocities of an actor, estimated from its points alone, for scans that
+number actors and have no flow.
 
-An observation is the set of an actor's points in one scan. A rigid actor is followed from scan to scan: its position is predicted from its
-motion so far, and corrected by registering its points to the planes of its earlier observations. The planes correct the prediction only in
-the directions that they determine: across a side, and along the path if the front or the back is visible. Registration of points to points
-would drift along the side of a passing car.
+An observation is the set of an actor's points in one scan. A rigid actor is followed from scan to
+scan: its position is predicted from its motion so far, and corrected by registering its points to
+the planes of its earlier observations. The planes correct the prediction only in the directions
+that they determine: across a side, and along the path if the front or the back is visible.
+Registration of points to points would drift along the side of a passing car.
 
-Paths are smoothed: the acceleration of an actor is limited, and the error of a measured position is not.
+Paths are smoothed: the acceleration of an actor is limited, and the error of a measured position is
+not.
 """
 
 from __future__ import annotations
@@ -26,17 +29,23 @@ _DRIVE_S = 0.5  # the same for a vehicle
 _POINTS = 200  # number of points of an observation that are compared
 _PAIRS, _APART_S = 12, 1.0  # pairs of observations that are compared, and their distance in time
 _MAX_DISTANCE_M, _DOUBT_M = 0.5, 0.02
-_STATIC_M = 0.38  # observations of a static actor are closer to each other, although they show different sides
+# observations of a static actor are closer to each other, although they show different sides
+_STATIC_M = 0.38
 _TURN_S = 1.0  # half width of the window in which directions correct registered turns
 _MIN_TURNS = 4  # least number of such directions
 
 _INITIAL_S = 0.5  # half width of the window for the initial estimate of the motion
 _REGISTERED = 300  # number of points of an observation that are registered to the model
 _SIDE_M = 0.14  # standard deviation of the points of one side, across it
-# Error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in radians.
+# Error of a prediction from one scan to the next: x, y, z in metres (streets are flat), yaw in
+# radians.
 _PREDICTED = np.array([0.2, 0.2, 0.01, 0.02])
 _UNKNOWN = 5.0  # factor of this error while the motion is not known yet
-_SLOW_M_S, _END_POINTS = 1.0, 20  # slower actors and observations with fewer points are not compared by their ends
+# slower actors and observations with fewer points are not compared by their ends
+_SLOW_M_S, _END_POINTS = (
+    1.0,
+    20,
+)
 _SAME_WIDTH_M = 0.12  # greatest difference of the widths of the same ends
 _GAIN = 0.3  # weight of the last correction in the estimate of the motion
 
@@ -46,8 +55,9 @@ def estimate_path(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Estimate the position, the velocity and the heading of an actor at each of its observations.
 
-    Rigid actors are registered, so the result does not depend on the side that is visible. People change their shape as they walk, so the
-    centre of their points is followed. Observations with too few points are interpolated. An actor with one observation has velocity zero.
+    Rigid actors are registered, so the result does not depend on the side that is visible. People
+    change their shape as they walk, so the centre of their points is followed. Observations with
+    too few points are interpolated. An actor with one observation has velocity zero.
 
     Args:
         observations: (M, 3) points of the actor at each time, metres, world.
@@ -55,21 +65,36 @@ def estimate_path(
         rigid: whether the actor keeps its shape.
 
     Returns:
-        (F, 3) centre of the actor, metres, world, its (F, 3) velocity, m/s, world, and its (F,) heading, radians, unwrapped.
+        (F, 3) centre of the actor, metres, world, its (F, 3) velocity, m/s, world, and its (F,)
+        heading, radians, unwrapped.
     """
     counts = np.array([len(points) for points in observations])
     enough = np.flatnonzero(counts >= max(1, min(MIN_POINTS, counts.max(initial=0))))
-    chosen, at, weights = [observations[i] for i in enough.tolist()], seconds[enough], np.minimum(counts[enough], 200.0)
+    chosen, at, weights = (
+        [observations[i] for i in enough.tolist()],
+        seconds[enough],
+        np.minimum(counts[enough], 200.0),
+    )
     if len(enough) < 2:
         middle = np.mean(chosen[0], axis=0) if chosen else np.zeros(3)
-        return np.tile(middle, (len(seconds), 1)), np.zeros((len(seconds), 3)), np.zeros(len(seconds))
+        return (
+            np.tile(middle, (len(seconds), 1)),
+            np.zeros((len(seconds), 3)),
+            np.zeros(len(seconds)),
+        )
     best = best_observation(chosen)
     path, turns = follow(chosen, at, best) if rigid else (middles_of(chosen), None)
     positions, velocities = smooth(path, at, weights, _DRIVE_S if rigid else _WALK_S)
-    positions, velocities = resample(seconds, at, positions, _limit_acceleration(velocities, at, best))
+    positions, velocities = resample(
+        seconds, at, positions, _limit_acceleration(velocities, at, best)
+    )
     if turns is None:
         return positions, velocities, headings_of(velocities)
-    return positions, velocities, headings_by_turns(velocities, np.interp(seconds, at, turns), seconds)
+    return (
+        positions,
+        velocities,
+        headings_by_turns(velocities, np.interp(seconds, at, turns), seconds),
+    )
 
 
 def is_static(
@@ -78,8 +103,11 @@ def is_static(
     headings: NDArray[np.float64],
     seconds: NDArray[np.float64],
 ) -> bool:
-    """Return whether observations align as well without motion as with the estimated motion; the arguments are those of `misalignment`."""
-    still, moved = misalignment(observations, positions, headings, seconds)  # a wrong path aligns them badly too
+    """Return whether observations align as well without motion as with the estimated motion; the
+    arguments are those of `misalignment`.
+    """
+    # a wrong path aligns them badly too
+    still, moved = misalignment(observations, positions, headings, seconds)
     return bool(np.isnan(still) or still < min(moved + _DOUBT_M, _STATIC_M))
 
 
@@ -90,7 +118,8 @@ def misalignment(
     seconds: NDArray[np.float64],
     shifts_m: Sequence[float] = (0.0,),
 ) -> tuple[float, ...]:
-    """Return how well observations of an actor, about a second apart, align: the mean distance to the nearest point of the other, metres.
+    """Return how well observations of an actor, about a second apart, align: the mean distance to
+    the nearest point of the other, metres.
 
     Args:
         observations: (M, 3) points of the actor at each time, metres, world.
@@ -100,28 +129,39 @@ def misalignment(
         shifts_m: shifts along the heading that are added to the estimated motion, metres.
 
     Returns:
-        The distance without motion, and the distance with the estimated motion and each shift. All are NaN for a single observation.
+        The distance without motion, and the distance with the estimated motion and each shift. All
+        are NaN for a single observation.
     """
     thinned = [thin(points, _POINTS) for points in observations]
-    body = [multiply(points - positions[i], rotation_z(headings[i])[:3, :3]) for i, points in enumerate(thinned)]
+    body = [
+        multiply(points - positions[i], rotation_z(headings[i])[:3, :3])
+        for i, points in enumerate(thinned)
+    ]
     found = []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:
-            shifted = [_mean_distance(body[i] + np.array([shift, 0.0, 0.0]), body[j]) for shift in shifts_m]
+            shifted = [
+                _mean_distance(body[i] + np.array([shift, 0.0, 0.0]), body[j]) for shift in shifts_m
+            ]
             found.append([_mean_distance(thinned[i], thinned[j]), *shifted])
     return tuple(np.mean(found, axis=0).tolist()) if found else (np.nan,) * (1 + len(shifts_m))
 
 
 def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Return the mean distance of points to the nearest of other points, metres. Each distance is at most `_MAX_DISTANCE_M`."""
+    """Return the mean distance of points to the nearest of other points, metres.
+
+    Each distance is at most `_MAX_DISTANCE_M`.
+    """
     return float(np.minimum(np.sqrt(nearest_points(points, others)[1]), _MAX_DISTANCE_M).mean())
 
 
 def _limit_acceleration(
     velocities: NDArray[np.float64], seconds: NDArray[np.float64], best: int
 ) -> NDArray[np.float64]:
-    """Limit the change of (F, 3) velocities to the acceleration of an actor, from the index `best` outwards."""
+    """Limit the change of (F, 3) velocities to the acceleration of an actor, from the index `best`
+    outwards.
+    """
     bounded = velocities.copy()
     for step, stop in ((1, len(seconds)), (-1, -1)):
         for index in range(best + step, stop, step):
@@ -136,9 +176,11 @@ def _limit_acceleration(
 def headings_by_turns(
     velocities: NDArray[np.float64], turns: NDArray[np.float64], seconds: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return headings: registered turns, corrected by the directions of motion over a second or two.
+    """Return headings: registered turns, corrected by the directions of motion over a second or
+    two.
 
-    Directions of motion alone are wrong where a vehicle enters a bend, as it does not move where it points. Registered turns alone drift.
+    Directions of motion alone are wrong where a vehicle enters a bend, as it does not move where it
+    points. Registered turns alone drift.
 
     Args:
         velocities: (F, 3) m/s.
@@ -151,7 +193,9 @@ def headings_by_turns(
     fast, directions = fast_rows(velocities), headings_of(velocities)
     if len(fast) < _MIN_TURNS:
         return directions
-    left = smooth((directions - turns)[fast, None], seconds[fast], np.ones(len(fast)), _TURN_S)[0][:, 0]
+    left = smooth((directions - turns)[fast, None], seconds[fast], np.ones(len(fast)), _TURN_S)[0][
+        :, 0
+    ]
     return turns + np.interp(np.arange(len(velocities)), fast, left)
 
 
@@ -166,7 +210,8 @@ def follow(
         best: index of the observation to start with: see `best_observation`.
 
     Returns:
-        (F, 3) centre of the actor, metres, world, and its (F,) heading, radians, 0 in the best observation.
+        (F, 3) centre of the actor, metres, world, and its (F,) heading, radians, 0 in the best
+        observation.
     """
     counts = np.array([len(points) for points in observations])
     middles = middles_of(observations)
@@ -182,7 +227,11 @@ def follow(
         for index in range(best + step, stop, step):
             elapsed = seconds[index] - seconds[previous]
             predicted = states[previous] + velocity * elapsed
-            error = _PREDICTED * max(1.0, abs(elapsed) / 0.1) * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
+            error = (
+                _PREDICTED
+                * max(1.0, abs(elapsed) / 0.1)
+                * (_UNKNOWN / (1 + seen) if seen < _UNKNOWN - 1 else 1.0)
+            )
             points = thin(observations[index], _REGISTERED)
             shifts = _shift_of_ends(observations[previous], observations[index], velocity[:3])
             states[index] = register(points, model, predicted, error, states[previous, :3], shifts)
@@ -202,7 +251,8 @@ def corrections(
     error: NDArray[np.float64],
     best: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smooth change of the path of a rigid, upright actor with which its observations align.
+    """Return the smooth change of the path of a rigid, upright actor with which its observations
+    align.
 
     Args:
         observations: (M, 3) points of the actor at each time, metres, world.
@@ -218,7 +268,9 @@ def corrections(
     for index in [best, *range(best + 1, len(states)), *range(best - 1, -1, -1)]:
         points = thin(observations[index], _REGISTERED)
         if index != best:
-            laid[index] = register(points, model, states[index], error, states[index, :3], np.empty((0, 4)))
+            laid[index] = register(
+                points, model, states[index], error, states[index, :3], np.empty((0, 4))
+            )
         model.add(transform_points(invert(pose_of(laid[index])), points))
     counts = np.array([min(len(points), _REGISTERED) for points in observations], np.float64)
     return smooth(laid - states, seconds, counts, _DRIVE_S)
@@ -227,10 +279,12 @@ def corrections(
 def _shift_of_ends(
     before: NDArray[np.float64], now: NDArray[np.float64], velocity: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return (K, 4) directions, world, in which two observations show the same ends of an actor, and the displacement of these ends, metres.
+    """Return (K, 4) directions, world, in which two observations show the same ends of an actor,
+    and the displacement of these ends, metres.
 
-    A flat face determines no motion along it, but its ends do: the ends of the rear of a car ahead show its position across the street.
-    The ends are taken as the same if the visible part has the same width in both observations.
+    A flat face determines no motion along it, but its ends do: the ends of the rear of a car ahead
+    show its position across the street. The ends are taken as the same if the visible part has the
+    same width in both observations.
     """
     speed = float(np.hypot(velocity[0], velocity[1]))
     if speed < _SLOW_M_S or min(len(before), len(now)) < _END_POINTS:
@@ -238,14 +292,19 @@ def _shift_of_ends(
     ahead = np.array([velocity[0], velocity[1], 0.0]) / speed
     shifts = []
     for direction in (ahead, np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])):
-        (low, high), (low_now, high_now) = (ends((points * direction).sum(axis=1)) for points in (before, now))
+        (low, high), (low_now, high_now) = (
+            ends((points * direction).sum(axis=1)) for points in (before, now)
+        )
         if abs((high_now - low_now) - (high - low)) < _SAME_WIDTH_M:
             shifts.append(np.append(direction, (low_now + high_now) / 2 - (low + high) / 2))
     return np.array(shifts).reshape(-1, 4)
 
 
 def ends(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the 2 % and 98 % quantiles of (N,) values. `np.quantile` returns the same and takes ten times as long."""
+    """Return the 2 % and 98 % quantiles of (N,) values.
+
+    `np.quantile` returns the same and takes ten times as long.
+    """
     places = [(len(values) - 1) * quantile for quantile in (0.02, 0.98)]
     after = [min(int(place) + 1, len(values) - 1) for place in places]
     ranked = np.partition(values, [int(places[0]), after[0], int(places[1]), after[1]])
@@ -266,7 +325,9 @@ def middles_of(observations: Sequence[NDArray[np.float64]]) -> NDArray[np.float6
 
 
 def best_observation(observations: Sequence[NDArray[np.float64]]) -> int:
-    """Return the index of the observation to start with: it has many points, shows more than one side, and is not at an end of the track."""
+    """Return the index of the observation to start with: it has many points, shows more than one
+    side, and is not at an end of the track.
+    """
     counts = np.array([len(points) for points in observations])
     across = [_least_variance(points[:, :2]) if len(points) > 2 else 0.0 for points in observations]
     inner = np.arange(len(observations))
@@ -277,5 +338,7 @@ def best_observation(observations: Sequence[NDArray[np.float64]]) -> int:
 def _least_variance(points: NDArray[np.float64]) -> float:
     """Return the variance of (N, 2) points, N > 2, in the direction in which it is smallest."""
     x, y = (points - points.mean(axis=0)).T
-    a, b, c = (float((one * other).sum()) / (len(points) - 1) for one, other in ((x, x), (x, y), (y, y)))
+    a, b, c = (
+        float((one * other).sum()) / (len(points) - 1) for one, other in ((x, x), (x, y), (y, y))
+    )
     return (a + c) / 2 - float(np.sqrt(((a - c) / 2) ** 2 + b * b))

@@ -1,9 +1,12 @@
-"""The model of a rigid actor: its points so far with the planes around them, and the registration of an observation to these planes.
+"""The model of a rigid actor: its points so far with the planes around them, and the registration
+of an observation to these planes.
 
-Registration finds the position and the yaw of an upright actor at which its points lie on the planes.
+Registration finds the position and the yaw of an upright actor at which its points lie on the
+planes.
 
-The model grows with each observation, and only the new part is computed. Each point keeps the sums that give its plane. New points are
-added to the sums of their neighbours in the order of a sum over all points, so the planes have the same bits as if computed again.
+The model grows with each observation, and only the new part is computed. Each point keeps the sums
+that give its plane. New points are added to the sums of their neighbours in the order of a sum over
+all points, so the planes have the same bits as if computed again.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ _CELL_M, _POINTS = 0.15, 1200  # a model has one point per cell, and at most thi
 _PLANE_M = 0.5  # radius of the neighbourhood in which planes are estimated
 _LINE_M = 0.06  # points with a smaller standard deviation across are a line and have no plane
 _SUMS = 10  # 1, x, y, z, xx, xy, xz, yy, yz, zz
-_SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])  # positions of the last six in a (3, 3) matrix
+# positions of the last six in a (3, 3) matrix
+_SQUARES = np.array([[4, 5, 6], [5, 7, 8], [6, 8, 9]])
 
 
 class Planes:
@@ -30,13 +34,17 @@ class Planes:
 
     Attributes:
         points: (M, 3) metres, actor frame.
-        normals: (M, 3) normals of the planes. Their length, at most 1, grows with the flatness of the points. The normal of a single
-            point or of a line has length 0.
+        normals: (M, 3) normals of the planes. Their length, at most 1, grows with the flatness of
+            the points. The normal of a single point or of a line has length 0.
     """
 
     def __init__(self) -> None:
         """Start without points: add some before the first registration."""
-        self.points, self.normals, self._sums = np.empty((0, 3)), np.empty((0, 3)), np.empty((0, _SUMS))
+        self.points, self.normals, self._sums = (
+            np.empty((0, 3)),
+            np.empty((0, 3)),
+            np.empty((0, _SUMS)),
+        )
 
     def add(self, points: NDArray[np.float64]) -> None:
         """Add the (N, 3) points, metres, actor frame, that are in cells without a point."""
@@ -57,7 +65,9 @@ class Planes:
 
     @property
     def in_order(self) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
-        """(M, 3) points, sorted along the axis of their largest extent, the (M,) index of each in `points`, and this axis."""
+        """(M, 3) points, sorted along the axis of their largest extent, the (M,) index of each in
+        `points`, and this axis.
+        """
         return self._sorted, self._order, self._widest
 
 
@@ -76,14 +86,17 @@ def _normals(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @cached(error_model="python")
-def extend_sums(model: NDArray[np.float64], known: int, radius: float, sums: NDArray[np.float64]) -> NDArray[np.bool_]:
+def extend_sums(
+    model: NDArray[np.float64], known: int, radius: float, sums: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Add new points to the sums of the points within a radius of each point.
 
     Args:
         model: (M, 3) points.
         known: number of points, from the first, whose sums hold each other already.
         radius: of the neighbourhood.
-        sums: (M, 10) sums over the neighbours of each point, of the offsets from it: 1, x, y, z, xx, xy, xz, yy, yz, zz. Is changed.
+        sums: (M, 10) sums over the neighbours of each point, of the offsets from it: 1, x, y, z,
+            xx, xy, xz, yy, yz, zz. Is changed.
 
     Returns:
         (M,) whether the sums of a point changed.
@@ -92,7 +105,11 @@ def extend_sums(model: NDArray[np.float64], known: int, radius: float, sums: NDA
     for i in range(len(model)):
         own = sums[i]
         for j in range(known if i < known else 0, len(model)):
-            x, y, z = model[j, 0] - model[i, 0], model[j, 1] - model[i, 1], model[j, 2] - model[i, 2]
+            x, y, z = (
+                model[j, 0] - model[i, 0],
+                model[j, 1] - model[i, 1],
+                model[j, 2] - model[i, 2],
+            )
             if x * x + y * y + z * z < radius * radius:
                 changed[i] = True
                 own[0] += 1
@@ -117,9 +134,11 @@ def nearest_within(
     axis: int,
     squared: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair each point with the nearest point of a model within a distance; the model is sorted along an axis.
+    """Pair each point with the nearest point of a model within a distance; the model is sorted
+    along an axis.
 
-    The search starts at the position of a point on the axis and goes outwards, until all other points are too far along this axis alone.
+    The search starts at the position of a point on the axis and goes outwards, until all other
+    points are too far along this axis alone.
 
     Args:
         points: (N, 3) points.
@@ -130,15 +149,22 @@ def nearest_within(
         squared: square of the greatest distance of a pair.
 
     Returns:
-        (P,) indices of points that have a pair, increasing, and (P,) indices of their points of the model; the lowest index of equally near ones.
+        (P,) indices of points that have a pair, increasing, and (P,) indices of their points of the
+        model; the lowest index of equally near ones.
     """
-    rows, nearest, moved = np.empty(len(points), np.int64), np.empty(len(points), np.int64), np.empty(3)
+    rows, nearest, moved = (
+        np.empty(len(points), np.int64),
+        np.empty(len(points), np.int64),
+        np.empty(3),
+    )
     place, count, last = np.empty(3), 0, len(model) - 1
     for a in range(3):  # the operations of `invert` and `transform_points`, in their order
         place[a] = -(pose[0, a] * pose[0, 3] + pose[1, a] * pose[1, 3] + pose[2, a] * pose[2, 3])
     for i in range(len(points)):
         for a in range(3):
-            moved[a] = (points[i, 0] * pose[0, a] + points[i, 1] * pose[1, a] + points[i, 2] * pose[2, a]) + place[a]
+            moved[a] = (
+                points[i, 0] * pose[0, a] + points[i, 1] * pose[1, a] + points[i, 2] * pose[2, a]
+            ) + place[a]
         before, after = -1, last + 1
         while after - before > 1:
             middle = (before + after) // 2
@@ -170,11 +196,17 @@ def nearest_within(
 def nearest_points(
     points: NDArray[np.float64], model: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return (N,) the index of the model point nearest to each point, and (N,) the squared distance, by comparing all pairs."""
+    """Return (N,) the index of the model point nearest to each point, and (N,) the squared
+    distance, by comparing all pairs.
+    """
     index, squared = np.zeros(len(points), np.int64), np.full(len(points), np.inf)
     for i in range(len(points)):
         for j in range(len(model)):
-            dx, dy, dz = points[i, 0] - model[j, 0], points[i, 1] - model[j, 1], points[i, 2] - model[j, 2]
+            dx, dy, dz = (
+                points[i, 0] - model[j, 0],
+                points[i, 1] - model[j, 1],
+                points[i, 2] - model[j, 2],
+            )
             distance = dx * dx + dy * dy + dz * dz
             if distance < squared[i]:
                 squared[i], index[i] = distance, j
@@ -182,9 +214,17 @@ def nearest_points(
 
 
 _ITERATIONS = 8
-_FIRST_REACH_M, _LAST_REACH_M = 1.0, 0.3  # maximum distance of paired points; it decreases with each iteration
+# maximum distance of paired points; it decreases with each iteration
+_FIRST_REACH_M, _LAST_REACH_M = (
+    1.0,
+    0.3,
+)
 _DEVIATIONS = 2.0  # least first reach, in standard deviations of the prediction
-_POINT_M, _INDEPENDENT = 0.05, 200  # error of a point, and the number of points with independent errors
+# error of a point, and the number of points with independent errors
+_POINT_M, _INDEPENDENT = (
+    0.05,
+    200,
+)
 _VARIANCE_M2 = _POINT_M**2
 _ROBUST = 0.3  # fraction of the reach; pairs farther from their plane get less weight
 _ENDS_M = 0.12  # error of the displacement of the ends of the visible part
@@ -192,7 +232,9 @@ _FEWEST = 3  # least number of pairs that count
 
 
 def pose_of(state: NDArray[np.float64]) -> Transform:
-    """Return the (4, 4) pose of an upright actor with the (4,) state x, y, z in metres, and yaw in radians."""
+    """Return the (4, 4) pose of an upright actor with the (4,) state x, y, z in metres, and yaw in
+    radians.
+    """
     pose = rotation_z(float(state[3]))
     pose[:3, 3] = state[:3]
     return pose
@@ -214,7 +256,8 @@ def register(
         predicted: (4,) predicted state: x, y, z in metres, and yaw in radians.
         error: (4,) standard deviation of the prediction.
         previous: (3,) position at the previous observation, metres, world.
-        shifts: (K, 4) directions in which the ends of the visible part moved since then, and their displacement, metres.
+        shifts: (K, 4) directions in which the ends of the visible part moved since then, and their
+            displacement, metres.
     """
     state: NDArray[np.float64] = _register(
         points, *model.in_order, model.points, model.normals, predicted, error, previous, shifts
@@ -235,7 +278,9 @@ def _register(
     previous: NDArray[np.float64],
     shifts: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """As `register`, with the (M, 3) points and normals of the model, and the results of `Planes.in_order`."""
+    """As `register`, with the (M, 3) points and normals of the model, and the results of
+    `Planes.in_order`.
+    """
     state, prior = predicted.copy(), 1 / (error * error)
     first_reach = max(_FIRST_REACH_M, _DEVIATIONS * max(error[0], error[1]))
     pose, slope = np.eye(4), np.empty(4)
@@ -254,13 +299,24 @@ def _register(
                 for b in range(3):
                     information[a, b] += shift[a] * shift[b] / _ENDS_M**2
         rows, nearest = nearest_within(points, pose, ordered, order, axis, reach * reach)
-        scale, share = max(2 * _POINT_M, _ROBUST * reach), min(1.0, _INDEPENDENT / max(len(rows), 1))
+        scale, share = (
+            max(2 * _POINT_M, _ROBUST * reach),
+            min(1.0, _INDEPENDENT / max(len(rows), 1)),
+        )
         for p in range(len(rows) if len(rows) >= _FEWEST else 0):
             k, point = nearest[p], points[rows[p]]
-            arm_x, arm_y = model[k, 0] * cos - model[k, 1] * sin, model[k, 0] * sin + model[k, 1] * cos
-            slope[0], slope[1] = normals[k, 0] * cos - normals[k, 1] * sin, normals[k, 0] * sin + normals[k, 1] * cos
+            arm_x, arm_y = (
+                model[k, 0] * cos - model[k, 1] * sin,
+                model[k, 0] * sin + model[k, 1] * cos,
+            )
+            slope[0], slope[1] = (
+                normals[k, 0] * cos - normals[k, 1] * sin,
+                normals[k, 0] * sin + normals[k, 1] * cos,
+            )
             slope[2], slope[3] = normals[k, 2], arm_x * slope[1] - arm_y * slope[0]
-            off = (point[0] - state[0] - arm_x) * slope[0] + (point[1] - state[1] - arm_y) * slope[1]
+            off = (point[0] - state[0] - arm_x) * slope[0] + (point[1] - state[1] - arm_y) * slope[
+                1
+            ]
             off += (point[2] - state[2] - model[k, 2]) * slope[2]
             weight = share / _VARIANCE_M2 / (1 + (off / scale) ** 2)
             for a in range(4):

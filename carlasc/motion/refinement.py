@@ -1,9 +1,12 @@
-"""Refined poses: the given poses of a drive, changed so that scans within some seconds of each other agree.
+"""Refined poses: the given poses of a drive, changed so that scans within some seconds of each
+other agree.
 
-Scans are read in order, and some hundred are kept. A stretch of scans is aligned together (`joint_alignment`), with the end of the previous
-stretch, whose poses are final, and the beginning of the next one. A quarter of the places takes no part in the alignment. There, the
-distance of each scan from the surfaces of its neighbours is measured, before and after. A stretch keeps its given motion unless this
-distance decreases clearly. Over longer times than a stretch, the given poses have a weak weight.
+Scans are read in order, and some hundred are kept. A stretch of scans is aligned together
+(`joint_alignment`), with the end of the previous stretch, whose poses are final, and the beginning
+of the next one. A quarter of the places takes no part in the alignment. There, the distance of each
+scan from the surfaces of its neighbours is measured, before and after. A stretch keeps its given
+motion unless this distance decreases clearly. Over longer times than a stretch, the given poses
+have a weak weight.
 """
 
 from __future__ import annotations
@@ -53,16 +56,22 @@ _PLACE_M, _PLACES = 2.0, 4  # size of places, and one of so many is measured ins
 _MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that disagree are thick
 _FAR_M = 1e5  # farther points are no returns
 
-# The distance must decrease by a factor and a length, or by less if the gain is so many standard errors; so many scans share an error.
+# The distance must decrease by a factor and a length, or by less if the gain is so many standard
+# errors; so many scans share an error.
 _BETTER, _NEARER_M = 0.9, 0.003
 _SURE, _SURELY_M, _ERRORS, _ALIKE = 0.95, 0.0005, 2.5, 5
-# Greatest change of the motion from one scan to the next, and over some scans: poses of another drive need more.
+# Greatest change of the motion from one scan to the next, and over some scans: poses of another
+# drive need more.
 _FARTHEST_M, _FARTHEST_RAD = 0.7, np.deg2rad(3.0)
 _SPAN, _OFF_M, _OFF_RAD = 10, 1.0, np.deg2rad(5.0)
 # Poses fit if enough walls of single scans are flat together with the points of other scans there.
 _WALL_M, _WALL_POINTS = 2.0, 12  # size of the cells, and the fewest points of a wall
 _TALL_M2, _WIDE_M2 = 0.08, 0.04  # least variances of a wall upwards, and along its second axis
-_FEW_WALLS, _COMMON = 7, 0.4  # with fewer walls per scan, poses fit; and the least share of common walls
+# with fewer walls per scan, poses fit; and the least share of common walls
+_FEW_WALLS, _COMMON = (
+    7,
+    0.4,
+)
 
 
 @dataclass(frozen=True)
@@ -94,11 +103,12 @@ class RefinedPoses:
     Attributes:
         given: (F, 4, 4) float64 world_T_sensor of each scan before.
         poses: (F, 4, 4) float64 world_T_sensor of each scan.
-        before_m: (F,) distance of each scan from the surfaces of its neighbours, under the given poses, metres; NaN where it is unknown.
+        before_m: (F,) distance of each scan from the surfaces of its neighbours, under the given
+            poses, metres; NaN where it is unknown.
         after_m: (F,) the same under the refined poses.
         refined: (F,) bool, the scans with a changed motion.
-        fits: (F,) bool, False where walls of one scan are not flat together with the other scans: such poses belong to another drive or
-            to other frames, and are not refined.
+        fits: (F,) bool, False where walls of one scan are not flat together with the other scans:
+            such poses belong to another drive or to other frames, and are not refined.
     """
 
     given: NDArray[np.float64]
@@ -109,18 +119,26 @@ class RefinedPoses:
     fits: NDArray[np.bool_]
 
     def changes(self) -> NDArray[np.float64]:
-        """Return the (F - 1, 6) changes of the motions from each scan to the next one: metres, then radians, sensor frame."""
+        """Return the (F - 1, 6) changes of the motions from each scan to the next one: metres, then
+        radians, sensor frame.
+        """
         return _changes(self.given, self.poses)
 
     @property
     def disagreements_m(self) -> tuple[float | None, float | None]:
         """The means of `before_m` and `after_m`; None where they are unknown."""
-        before, after = (None if math.isnan(m := finite_mean(v)) else m for v in (self.before_m, self.after_m))
+        before, after = (
+            None if math.isnan(m := finite_mean(v)) else m for v in (self.before_m, self.after_m)
+        )
         return before, after
 
     def left(self, frames: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
-        """Return the first and the last frame of each stretch that was not refined; `frames` are the (F,) numbers of the scans."""
-        return tuple((int(frames[a]), int(frames[b])) for a, b, changed in self.stretches() if not changed)
+        """Return the first and the last frame of each stretch that was not refined; `frames` are
+        the (F,) numbers of the scans.
+        """
+        return tuple(
+            (int(frames[a]), int(frames[b])) for a, b, changed in self.stretches() if not changed
+        )
 
     def stretches(self) -> Iterator[tuple[int, int, bool]]:
         """Yield (first row, last row, whether refined) of each run of scans."""
@@ -159,8 +177,8 @@ def refine_poses(
 ) -> RefinedPoses:
     """Refine the poses of a drive.
 
-    In directions that the scans do not determine, as along a tunnel, the given poses hold. Moving actors among the points do little harm:
-    their points in a cell form no plane.
+    In directions that the scans do not determine, as along a tunnel, the given poses hold. Moving
+    actors among the points do little harm: their points in a cell form no plane.
 
     Args:
         scans: the scans, in order of time; read one after the other.
@@ -169,7 +187,11 @@ def refine_poses(
         steps: called with the number of scans that were read since the last call.
     """
     count, poses = len(given), given.copy()
-    before, after, refined = np.full(count, np.nan), np.full(count, np.nan), np.zeros(count, np.bool_)
+    before, after, refined = (
+        np.full(count, np.nan),
+        np.full(count, np.nan),
+        np.zeros(count, np.bool_),
+    )
     fits = np.ones(count, np.bool_)
     scans, kept, first = iter(scans), list[ThinnedScan](), 0
     begin = 0
@@ -184,7 +206,9 @@ def refine_poses(
         first = start
         near, rows = slice(start, last), slice(begin - start, end - start)
         if refined.any():  # start with the correction of the previous scan
-            poses[begin:last] = multiply(poses[begin - 1], invert(given[begin - 1]), given[begin:last])
+            poses[begin:last] = multiply(
+                poses[begin - 1], invert(given[begin - 1]), given[begin:last]
+            )
         held = poses[near].copy()
         found = align([scan.used for scan in kept], held, given[near], begin - start)
         measured = [scan.measured for scan in kept]
@@ -203,19 +227,27 @@ def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
     both = np.isfinite(before) & np.isfinite(after)
     if not both.any():
         return False
-    was, now, gain = float(before[both].mean()), float(after[both].mean()), before[both] - after[both]
+    was, now, gain = (
+        float(before[both].mean()),
+        float(after[both].mean()),
+        before[both] - after[both],
+    )
     error = float(gain.std()) * float(np.sqrt(_ALIKE / len(gain)))
     sure = now < min(_SURE * was, was - _SURELY_M) and was - now > _ERRORS * error
     return sure or now < min(_BETTER * was, was - _NEARER_M)
 
 
 def _fit(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> bool:
-    """Return whether enough walls of single scans are flat together with the other scans there; True if there are few walls."""
+    """Return whether enough walls of single scans are flat together with the other scans there;
+    True if there are few walls.
+    """
     walls = common = 0
     for found in blocks(points, poses, _WALL_M, shift=0.0):
         alone = Clusters(np.arange(len(found.scan) + 1), found.scan, found.sums)
         _, spread = spread_of(alone, poses, 1)
-        is_wall = (found.sums[:, 0] >= _WALL_POINTS) & _is_flat(spread) & (spread[:, 2, 2] > _TALL_M2)
+        is_wall = (
+            (found.sums[:, 0] >= _WALL_POINTS) & _is_flat(spread) & (spread[:, 2, 2] > _TALL_M2)
+        )
         shared, together = spread_of(found, poses, MIN_SCANS)
         cell = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))
         is_wall &= shared[cell]
@@ -229,7 +261,9 @@ def _is_flat(covariances: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray((values[:, 0] < 0.1 * values[:, 1]) & (values[:, 1] > _WIDE_M2))
 
 
-def _changes(given: NDArray[np.float64], found: NDArray[np.float64], span: int = 1) -> NDArray[np.float64]:
+def _changes(
+    given: NDArray[np.float64], found: NDArray[np.float64], span: int = 1
+) -> NDArray[np.float64]:
     before, after = (multiply(invert(poses[:-span]), poses[span:]) for poses in (given, found))
     return small_motions(multiply(invert(before), after))
 
@@ -251,8 +285,11 @@ def finite_mean(values: NDArray[np.float64]) -> float:
     return float(finite.mean()) if len(finite) else math.nan
 
 
-def disagreement(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (F,) root mean square distances of each scan from the planes of the others, metres; NaN where there are none.
+def disagreement(
+    points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the (F,) root mean square distances of each scan from the planes of the others,
+    metres; NaN where there are none.
 
     Args:
         points: (N, 3) of each scan, metres, sensor frame.
@@ -274,7 +311,9 @@ def _add_distances(
     thickness: NDArray[np.float64],
     result: NDArray[np.float64],
 ) -> None:
-    """Add to `result`, (F, 2), the squared distances of the clusters of each scan from the planes of the others, and their number."""
+    """Add to `result`, (F, 2), the squared distances of the clusters of each scan from the planes
+    of the others, and their number.
+    """
     for g in range(len(thickness)):
         if thickness[g] < 0:
             continue

@@ -13,11 +13,12 @@ from carlasc.core.scans import Scan
 
 MIN_SPEED_M_S = 0.3  # slower points count as static: estimated flow is never exactly zero
 _CELL_M = 0.4  # size of the cells in which moving points are grouped
-# Cells of one actor, and points with one number, are closer than this along its motion: a pole in front does not split a vehicle.
+# Cells of one actor, and points with one number, are closer than this along its motion: a pole in
+# front does not split a vehicle.
 _REACH_M = 2.0
-_BESIDE_M = (
-    1.0  # cells of one actor are closer than this across: vehicles in the next lane often have the same velocity
-)
+# cells of one actor are closer than this across: vehicles in the next lane often have the same
+# velocity
+_BESIDE_M = 1.0
 _SAME_VELOCITY_M_S = 0.5  # greatest difference of flow within one rigid actor
 
 LINKED_M_S = 2.0  # maximum change of an actor's velocity between two segments
@@ -61,14 +62,16 @@ def is_fast(flow: NDArray[np.floating], min_speed_m_s: float = MIN_SPEED_M_S) ->
 def segment_by_flow(
     frame: int, scan: Scan, world_T_sensor: Transform, *, min_speed_m_s: float = MIN_SPEED_M_S
 ) -> list[Segment]:
-    """Group the moving points of a scan into actors: the points of one actor are close together and have one velocity.
+    """Group the moving points of a scan into actors: the points of one actor are close together and
+    have one velocity.
 
-    Two actors side by side with the same velocity may become one segment, which has their velocity. Classes do not separate actors,
-    because labels may be wrong.
+    Two actors side by side with the same velocity may become one segment, which has their velocity.
+    Classes do not separate actors, because labels may be wrong.
 
     Args:
         frame: frame number.
-        scan: points with labels and flow, m/s over ground; points whose flow is not finite count as static.
+        scan: points with labels and flow, m/s over ground; points whose flow is not finite count as
+            static.
         world_T_sensor: (4, 4) pose of the scan.
         min_speed_m_s: slower points count as static.
 
@@ -102,8 +105,8 @@ def segment_by_instances(
 ) -> list[Segment]:
     """Return the numbered actors of a scan, moving or not. Their tracks decide which of them move.
 
-    A number at several places, metres apart, or with several velocities, has a segment for each: one of them may be another actor with a
-    wrong number.
+    A number at several places, metres apart, or with several velocities, has a segment for each:
+    one of them may be another actor with a wrong number.
 
     Args:
         frame: frame number.
@@ -116,18 +119,26 @@ def segment_by_instances(
     """
     if scan.instances is None or scan.labels is None:
         return []
-    numbered = np.flatnonzero((scan.instances > 0) & (scan.labels > 0) & ~np.isin(scan.labels, sorted(ground)))
+    numbered = np.flatnonzero(
+        (scan.instances > 0) & (scan.labels > 0) & ~np.isin(scan.labels, sorted(ground))
+    )
     points = transform_points(world_T_sensor, scan.points[numbered])
     flow = None if scan.flow is None else rotate_vectors(world_T_sensor, scan.flow[numbered])
     segments = []
     numbers = scan.instances[numbered].astype(np.int64)
-    spread = points / _REACH_M if flow is None else np.column_stack([points / _REACH_M, flow / LINKED_M_S])
+    spread = (
+        points / _REACH_M
+        if flow is None
+        else np.column_stack([points / _REACH_M, flow / LINKED_M_S])
+    )
     for own in (place for same in _groups(numbers) for place in _places(spread, same)):
         members = numbered[own]
         label = int(np.bincount(scan.labels[members]).argmax())
         velocity = None if flow is None else np.median(flow[own], axis=0)
         number = int(scan.instances[members[0]])
-        segments.append(Segment(frame, label, members, points[own], velocity, number, world_T_sensor[:3, 3]))
+        segments.append(
+            Segment(frame, label, members, points[own], velocity, number, world_T_sensor[:3, 3])
+        )
     return segments
 
 
@@ -155,18 +166,33 @@ class StaticPoints:
         return cls(frame, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3)))
 
     def segment_at(self, segment: Segment, margin_m: float = 0.5) -> Segment | None:
-        """Return the static points of a segment's class at its position; None if the segment has far more points."""
+        """Return the static points of a segment's class at its position; None if the segment has
+        far more points.
+        """
         lower, upper = segment.points.min(axis=0) - margin_m, segment.points.max(axis=0) + margin_m
         own = np.flatnonzero(
-            (self.labels == segment.label) & ((self.points > lower) & (self.points < upper)).all(axis=1)
+            (self.labels == segment.label)
+            & ((self.points > lower) & (self.points < upper)).all(axis=1)
         )
         if len(own) < max(5, len(segment.members) // 5):
             return None
-        return Segment(self.frame, segment.label, self.members[own], self.points[own], np.zeros(3), origin=self.origin)
+        return Segment(
+            self.frame,
+            segment.label,
+            self.members[own],
+            self.points[own],
+            np.zeros(3),
+            origin=self.origin,
+        )
 
 
 def static_actor_points(
-    frame: int, scan: Scan, world_T_sensor: Transform, labels: Collection[int], *, min_speed_m_s: float = MIN_SPEED_M_S
+    frame: int,
+    scan: Scan,
+    world_T_sensor: Transform,
+    labels: Collection[int],
+    *,
+    min_speed_m_s: float = MIN_SPEED_M_S,
 ) -> StaticPoints:
     """Return the static points of a scan that are of movable classes; none without flow and labels.
 
@@ -179,9 +205,13 @@ def static_actor_points(
     """
     if scan.flow is None or scan.labels is None:
         return StaticPoints.empty(frame)
-    members = np.flatnonzero(~is_fast(scan.flow, min_speed_m_s) & np.isin(scan.labels, sorted(labels)))
+    members = np.flatnonzero(
+        ~is_fast(scan.flow, min_speed_m_s) & np.isin(scan.labels, sorted(labels))
+    )
     points = transform_points(world_T_sensor, scan.points[members])
-    return StaticPoints(frame, members, scan.labels[members].astype(np.int64), points, world_T_sensor[:3, 3])
+    return StaticPoints(
+        frame, members, scan.labels[members].astype(np.int64), points, world_T_sensor[:3, 3]
+    )
 
 
 def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -200,15 +230,19 @@ def _places(spread: NDArray[np.float64], own: NDArray[np.int64]) -> list[NDArray
             order = np.argsort(values, kind="stable")
             gaps = np.flatnonzero(np.diff(values[order]) > 1) + 1
             if len(gaps):
-                return [place for part in np.split(own[order], gaps) for place in _places(spread, np.sort(part))]
+                return [
+                    place
+                    for part in np.split(own[order], gaps)
+                    for place in _places(spread, np.sort(part))
+                ]
     return [own]
 
 
 def _join(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the component number of each point: neighbouring cells of one velocity are joined."""
-    keys = np.concatenate([np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S)], axis=1).astype(
-        np.int64
-    )
+    keys = np.concatenate(
+        [np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S)], axis=1
+    ).astype(np.int64)
     _, cell = np.unique(keys, axis=0, return_inverse=True)
     count = np.bincount(cell)
     center = np.stack([np.bincount(cell, points[:, a]) for a in range(3)], axis=1) / count[:, None]
@@ -218,7 +252,9 @@ def _join(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray
     along2 = np.square(np.einsum("ijk,ik->ij", offset, ahead))
     across2 = np.square(offset).sum(axis=2) - along2
     near = (along2 < _REACH_M**2) & (across2 < _BESIDE_M**2)
-    joined = (near | near.T) & (np.square(speed[:, None] - speed[None]).sum(axis=2) < _SAME_VELOCITY_M_S**2)
+    joined = (near | near.T) & (
+        np.square(speed[:, None] - speed[None]).sum(axis=2) < _SAME_VELOCITY_M_S**2
+    )
     component = np.arange(len(count))
     while True:  # each cell takes the lowest number of its joined cells, until nothing changes
         lowest = np.where(joined, component[None], len(count)).min(axis=1)

@@ -1,4 +1,5 @@
-"""Small linear problems, solved with the same bits on every processor; smoothing and resampling over time; headings.
+"""Small linear problems, solved with the same bits on every processor; smoothing and resampling
+over time; headings.
 
 `np.linalg` is not used: LAPACK rounds differently on different processors.
 """
@@ -17,7 +18,8 @@ _SWEEPS = 12  # greatest number for Jacobi's method, which takes about five
 
 @cached(error_model="python")
 def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (K, D) parameters x for which `design @ x` is nearest to the values; the columns are orthogonalised one after the other.
+    """Return the (K, D) parameters x for which `design @ x` is nearest to the values; the columns
+    are orthogonalised one after the other.
 
     Args:
         design: (N, K), N >= 1. The parameter of a column that depends on earlier columns is 0.
@@ -94,14 +96,18 @@ def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> N
 
 
 @cached(error_model="python")
-def principal_axes(covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the eigenvalues of symmetric matrices, increasing, and their eigenvectors, by Jacobi's method.
+def principal_axes(
+    covariances: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the eigenvalues of symmetric matrices, increasing, and their eigenvectors, by Jacobi's
+    method.
 
     Args:
         covariances: (N, 3, 3).
 
     Returns:
-        (N, 3) eigenvalues and (N, 3, 3) unit eigenvectors in columns. The sign of a vector is reproducible, but follows no rule.
+        (N, 3) eigenvalues and (N, 3, 3) unit eigenvectors in columns. The sign of a vector is
+        reproducible, but follows no rule.
     """
     values, vectors = np.empty((len(covariances), 3)), np.empty((len(covariances), 3, 3))
     for n in range(len(covariances)):
@@ -115,15 +121,26 @@ def principal_axes(covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64
                     if a[p, q] == 0.0:
                         continue
                     ratio = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
-                    tangent = (1.0 if ratio >= 0 else -1.0) / (abs(ratio) + np.sqrt(ratio * ratio + 1.0))
+                    tangent = (1.0 if ratio >= 0 else -1.0) / (
+                        abs(ratio) + np.sqrt(ratio * ratio + 1.0)
+                    )
                     cos = 1.0 / np.sqrt(tangent * tangent + 1.0)
                     sin = tangent * cos
                     for k in range(3):
-                        a[k, p], a[k, q] = cos * a[k, p] - sin * a[k, q], sin * a[k, p] + cos * a[k, q]
+                        a[k, p], a[k, q] = (
+                            cos * a[k, p] - sin * a[k, q],
+                            sin * a[k, p] + cos * a[k, q],
+                        )
                     for k in range(3):
-                        a[p, k], a[q, k] = cos * a[p, k] - sin * a[q, k], sin * a[p, k] + cos * a[q, k]
+                        a[p, k], a[q, k] = (
+                            cos * a[p, k] - sin * a[q, k],
+                            sin * a[p, k] + cos * a[q, k],
+                        )
                     for k in range(3):
-                        v[k, p], v[k, q] = cos * v[k, p] - sin * v[k, q], sin * v[k, p] + cos * v[k, q]
+                        v[k, p], v[k, q] = (
+                            cos * v[k, p] - sin * v[k, q],
+                            sin * v[k, p] + cos * v[k, q],
+                        )
         order = np.argsort(np.array([a[0, 0], a[1, 1], a[2, 2]]))
         for k in range(3):
             values[n, k] = a[order[k], order[k]]
@@ -133,9 +150,12 @@ def principal_axes(covariances: NDArray[np.float64]) -> tuple[NDArray[np.float64
 
 
 def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation nearest to a (3, 3) mean of rotations; the identity if these have no mean direction."""
+    """Return the (3, 3) rotation nearest to a (3, 3) mean of rotations; the identity if these have
+    no mean direction.
+    """
     rotation = matrix
-    for _ in range(30):  # Newton's method for the polar decomposition: four or five steps for similar rotations
+    # Newton's method for the polar decomposition: four or five steps for similar rotations
+    for _ in range(30):
         rows = np.cross(rotation[[1, 2, 0]], rotation[[2, 0, 1]])
         volume = float((rotation[0] * rows[0]).sum())
         if volume < 1e-12:
@@ -145,7 +165,10 @@ def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def smooth(
-    values: NDArray[np.float64], seconds: NDArray[np.float64], weights: NDArray[np.float64], half_s: float
+    values: NDArray[np.float64],
+    seconds: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    half_s: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit a parabola around each time, robustly; a straight line if there are few values.
 
@@ -200,7 +223,8 @@ def resample(
     positions: NDArray[np.float64],
     velocities: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions and velocities at other times: linear between the known times, at constant velocity beyond.
+    """Return positions and velocities at other times: linear between the known times, at constant
+    velocity beyond.
 
     Args:
         at: (A,) the other times, seconds.
@@ -218,7 +242,9 @@ def resample(
 
 
 def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated while the actor is slow."""
+    """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated
+    while the actor is slow.
+    """
     fast = fast_rows(velocities)
     if not len(fast):
         mean = velocities.mean(axis=0)

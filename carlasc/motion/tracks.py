@@ -1,4 +1,6 @@
-"""Tracks: the motion, the poses and the body of one actor over time; the tracks of a sequence, and the file that keeps them."""
+"""Tracks: the motion, the poses and the body of one actor over time; the tracks of a sequence, and
+the file that keeps them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, rotation_z, transform_points
+from carlasc.core.geometry import (
+    Transform,
+    invert,
+    multiply,
+    rotate_vectors,
+    rotation_z,
+    transform_points,
+)
 from carlasc.errors import reading
 from carlasc.motion.bodies import BODY_MARGIN_M, Extent, Sizes, measure, surface_of
 from carlasc.motion.paths import estimate_path, is_static
@@ -48,13 +57,15 @@ class Track:
         instance: number of the actor; 0 if actors are not numbered.
         members: (M,) indices of the points of the actor in each scan that sees it, by frame.
         first: frame of `world_T_actor[0]`.
-        world_T_actor: (F, 4, 4) pose at each frame from `first` on; x is forward, and the origin is the centre of its body.
+        world_T_actor: (F, 4, 4) pose at each frame from `first` on; x is forward, and the origin is
+            the centre of its body.
         velocity: (F, 3) m/s, world, at the same frames.
         lower: (3,) metres, lower corner of the actor's whole body, actor frame.
         upper: (3,) metres, upper corner.
         extent: the visible part of the body.
         rigid: whether it keeps its shape, as vehicles do.
-        surface: (P, 3) float32, points of its surface, metres, actor frame. Before bodies are completed, exemplary actors alone have them.
+        surface: (P, 3) float32, points of its surface, metres, actor frame. Before bodies are
+            completed, exemplary actors alone have them.
         confidence: probability that it is real, from 0 to 1; 1 for an actor of the data.
     """
 
@@ -82,7 +93,9 @@ class Track:
         return self.velocity[row] if 0 <= row < len(self.velocity) else None
 
     def between(self, first: int, last: int) -> Track:
-        """Return the track at the frames from `first` to `last` only, which is small enough to send to a worker."""
+        """Return the track at the frames from `first` to `last` only, which is small enough to send
+        to a worker.
+        """
         start = max(self.first, first)
         rows = slice(start - self.first, max(last + 1 - self.first, start - self.first))
         members = {frame: own for frame, own in self.members.items() if first <= frame <= last}
@@ -96,10 +109,14 @@ class Track:
 
     @property
     def moves(self) -> bool:
-        """Whether the actor moves faster and farther than a static actor may seem to, and is not too large for one actor."""
+        """Whether the actor moves faster and farther than a static actor may seem to, and is not
+        too large for one actor.
+        """
         fast = (np.square(self.velocity).sum(axis=1) > MIN_SPEED_M_S**2).any()
         return bool(
-            self.size.max() < LONGEST_M and fast and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STATIC_M
+            self.size.max() < LONGEST_M
+            and fast
+            and np.ptp(self.world_T_actor[:, :3, 3], axis=0).max() > _STATIC_M
         )
 
 
@@ -111,7 +128,8 @@ def make_track(
     rigid: bool | None = None,
     confidence: float = 1.0,
 ) -> Track:
-    """Return the track of linked segments: their path, the poses along it, and the box around all points.
+    """Return the track of linked segments: their path, the poses along it, and the box around all
+    points.
 
     Args:
         chain: the segments of one actor, in order of time.
@@ -127,9 +145,13 @@ def make_track(
         observations = [segment.points for segment in chain]
         positions, velocities, headings = estimate_path(observations, seconds, rigid=keeps_shape)
         if is_static(observations, positions, headings, seconds):
-            positions, velocities, headings = (np.zeros_like(values) for values in (positions, velocities, headings))
+            positions, velocities, headings = (
+                np.zeros_like(values) for values in (positions, velocities, headings)
+            )
     else:
-        velocities = np.stack([segment.velocity for segment in chain if segment.velocity is not None])
+        velocities = np.stack(
+            [segment.velocity for segment in chain if segment.velocity is not None]
+        )
         positions, headings = _integrate(velocities, seconds, chain), headings_of(velocities)
     positions, extent, body = _fit_box(chain, positions, headings)
     frames, at = _frames_around(chain[0].frame, chain[-1].frame, times)
@@ -144,16 +166,31 @@ def make_track(
 
 
 def complete_bodies(tracks: Sequence[Track]) -> list[Track]:
-    """Return tracks in order of their first segment, with bodies that similar actors complete where they were not seen."""
+    """Return tracks in order of their first segment, with bodies that similar actors complete where
+    they were not seen.
+    """
     sizes = Sizes([(track.label, track.extent, track.surface) for track in tracks if track.rigid])
     whole = [_with_body(track, sizes) if track.rigid else track for track in tracks]
-    return sorted(whole, key=lambda track: (track.first, track.instance, track.label, *track.world_T_actor[0, :3, 3]))
+    return sorted(
+        whole,
+        key=lambda track: (
+            track.first,
+            track.instance,
+            track.label,
+            *track.world_T_actor[0, :3, 3],
+        ),
+    )
 
 
 def with_surfaces(tracks: Sequence[Track]) -> list[Track]:
-    """Return tracks of known bodies, such as boxes, with surfaces that the exemplary actors among them complete."""
+    """Return tracks of known bodies, such as boxes, with surfaces that the exemplary actors among
+    them complete.
+    """
     sizes = Sizes([(track.label, track.extent, track.surface) for track in tracks if track.rigid])
-    shapes = (sizes.surface(t.label, t.lower + BODY_MARGIN_M, t.upper - BODY_MARGIN_M, t.extent) for t in tracks)
+    shapes = (
+        sizes.surface(t.label, t.lower + BODY_MARGIN_M, t.upper - BODY_MARGIN_M, t.extent)
+        for t in tracks
+    )
     return [replace(track, surface=surface) for track, surface in zip(tracks, shapes, strict=True)]
 
 
@@ -162,7 +199,9 @@ def _with_body(track: Track, sizes: Sizes) -> Track:
     middle = (lower + upper) / 2
     poses = track.world_T_actor.copy()
     poses[:, :3, 3] += multiply(poses[:, :3, :3], middle[:, None])[..., 0]
-    seen = replace(track.extent, lower=track.extent.lower - middle, upper=track.extent.upper - middle)
+    seen = replace(
+        track.extent, lower=track.extent.lower - middle, upper=track.extent.upper - middle
+    )
     return replace(
         track,
         world_T_actor=poses,
@@ -176,7 +215,9 @@ def _with_body(track: Track, sizes: Sizes) -> Track:
 def _integrate(
     velocities: NDArray[np.float64], seconds: NDArray[np.float64], chain: Sequence[Segment]
 ) -> NDArray[np.float64]:
-    """Integrate velocities by the trapezoidal rule, through the centre of the segment with most points."""
+    """Integrate velocities by the trapezoidal rule, through the centre of the segment with most
+    points.
+    """
     steps = (velocities[1:] + velocities[:-1]) / 2 * np.diff(seconds)[:, None]
     path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     best = int(np.argmax([len(segment.members) for segment in chain]))
@@ -186,10 +227,11 @@ def _integrate(
 def _fit_box(
     chain: Sequence[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], Extent, NDArray[np.float64]]:
-    """Move the path to the centre of the visible part of the actor; return it, the extent, and the points in the actor frame.
+    """Move the path to the centre of the visible part of the actor; return it, the extent, and the
+    points in the actor frame.
 
-    The path is known except for a constant offset in the world. If the actor turns, the segments overlap only with the correct
-    offset, which moves the origin to their centre.
+    The path is known except for a constant offset in the world. If the actor turns, the segments
+    overlap only with the correct offset, which moves the origin to their centre.
     """
     best = int(np.argmax([len(segment.members) for segment in chain]))
     for _ in range(3):
@@ -206,14 +248,19 @@ def _fit_box(
     return positions, extent, np.concatenate(body) - middle
 
 
-def _frames_around(first: int, last: int, times: Mapping[int, float]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the frames from `_EXTRAPOLATE_S` before `first` to as long after `last`, and their times.
+def _frames_around(
+    first: int, last: int, times: Mapping[int, float]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the frames from `_EXTRAPOLATE_S` before `first` to as long after `last`, and their
+    times.
 
     Frames without a scan are interpolated, and extrapolated by the mean period.
     """
     known = np.array(sorted(times))
     seconds = np.array([times[int(frame)] for frame in known])
-    period = float(seconds[-1] - seconds[0]) / float(known[-1] - known[0]) if len(known) > 1 else 0.1
+    period = (
+        float(seconds[-1] - seconds[0]) / float(known[-1] - known[0]) if len(known) > 1 else 0.1
+    )
     more = max(1, round(_EXTRAPOLATE_S / period))
     frames = np.arange(first - more, last + more + 1)
     inside = np.interp(frames, known, seconds)
@@ -229,8 +276,10 @@ class MovingActors:
         tracks: the actors that move, by number.
         moving: (M,) indices of the points that move and belong to no track, by frame.
         summary: the facts of every actor, static ones too, as plain values.
-        own: (6,) lower and upper corners, metres, sensor frame, of boxes around points that move with the sensor: the recording vehicle.
-        numbers: number of each actor over the whole sequence, by the number of its track; empty if not needed.
+        own: (6,) lower and upper corners, metres, sensor frame, of boxes around points that move
+            with the sensor: the recording vehicle.
+        numbers: number of each actor over the whole sequence, by the number of its track; empty if
+            not needed.
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
@@ -246,7 +295,9 @@ class MovingActors:
         moving: Mapping[int, NDArray[np.integer]] | None = None,
         own: Sequence[NDArray[np.float64]] = (),
     ) -> Self:
-        """Return the actors of tracks: moving ones with their tracks, static ones in the summary only."""
+        """Return the actors of tracks: moving ones with their tracks, static ones in the summary
+        only.
+        """
         return cls(
             {number: track for number, track in enumerate(tracks) if track.moves},
             moving or {},
@@ -255,10 +306,18 @@ class MovingActors:
         )
 
     def between(self, first: int, last: int) -> MovingActors:
-        """Return the part for the frames from `first` to `last`, which is small enough to send to a worker with each frame."""
+        """Return the part for the frames from `first` to `last`, which is small enough to send to a
+        worker with each frame.
+        """
         near = {number: track.between(first, last) for number, track in self.tracks.items()}
-        tracks = {number: track for number, track in near.items() if track.members or len(track.world_T_actor)}
-        moving = {frame: members for frame, members in self.moving.items() if first <= frame <= last}
+        tracks = {
+            number: track
+            for number, track in near.items()
+            if track.members or len(track.world_T_actor)
+        }
+        moving = {
+            frame: members for frame, members in self.moving.items() if first <= frame <= last
+        }
         numbers = {number: self.numbers[number] for number in tracks} if self.numbers else {}
         return MovingActors(tracks, moving, own=self.own, numbers=numbers)
 
@@ -290,7 +349,9 @@ class MovingActors:
             surfaces.append(track.surface)
             extent = track.extent
             corners = [track.lower, track.upper, extent.lower, extent.upper]
-            bounds.append(np.concatenate([*corners, extent.faces, extent.seen_from, [track.confidence]]))
+            bounds.append(
+                np.concatenate([*corners, extent.faces, extent.seen_from, [track.confidence]])
+            )
             for frame, own in track.members.items():
                 members.append(own)
                 frames.append((number, frame, len(own)))
@@ -302,8 +363,12 @@ class MovingActors:
             "bounds": np.array(bounds, np.float64).reshape(-1, 19),
             "members": np.concatenate([np.empty(0, np.int32), *members]).astype(np.int32),
             "frames": np.array(frames, np.int64).reshape(-1, 3),
-            "moving": np.concatenate([np.empty(0, np.int32), *self.moving.values()]).astype(np.int32),
-            "moving_frames": np.array([(f, len(own)) for f, own in self.moving.items()], np.int64).reshape(-1, 2),
+            "moving": np.concatenate([np.empty(0, np.int32), *self.moving.values()]).astype(
+                np.int32
+            ),
+            "moving_frames": np.array(
+                [(f, len(own)) for f, own in self.moving.items()], np.int64
+            ).reshape(-1, 2),
             "own": np.array(self.own, np.float64).reshape(-1, 6),
         }
         about = json.dumps({"key": key, "summary": self.summary})
@@ -325,8 +390,13 @@ class MovingActors:
             tracks = _tracks(arrays)
             ends = np.cumsum(arrays["moving_frames"][:, 1])[:-1]
             parts = np.split(arrays["moving"], ends)
-            moving = {int(frame): own for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)}
-            return cls(tracks, moving, tuple(about["summary"]), tuple(arrays["own"])), str(about["key"])
+            moving = {
+                int(frame): own
+                for (frame, _), own in zip(arrays["moving_frames"], parts, strict=False)
+            }
+            return cls(tracks, moving, tuple(about["summary"]), tuple(arrays["own"])), str(
+                about["key"]
+            )
 
 
 def is_doubtful(confidence: float) -> bool:
@@ -354,7 +424,13 @@ def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
             arrays["velocities"][row : row + length],
             bounds[0:3],
             bounds[3:6],
-            Extent(bounds[6:9], bounds[9:12], (rear, front, low, high), points, (float(bounds[16]), float(bounds[17]))),
+            Extent(
+                bounds[6:9],
+                bounds[9:12],
+                (rear, front, low, high),
+                points,
+                (float(bounds[16]), float(bounds[17])),
+            ),
             bool(rigid),
             arrays["surfaces"][point : point + size],
             float(bounds[18]),
@@ -367,7 +443,9 @@ def _summarize(track: Track) -> dict[str, Any]:
     speed = np.linalg.norm(track.velocity, axis=1)
     return {
         "label": track.label,
-        "instance": track.instance if track.instance < FIRST_FOUND else 0,  # found actors have no number in the data
+        "instance": track.instance
+        if track.instance < FIRST_FOUND
+        else 0,  # found actors have no number in the data
         "first": int(min(track.members, default=track.first)),
         "last": int(max(track.members, default=track.first)),
         "scans": len(track.members),

@@ -1,8 +1,10 @@
 """Visibility: whether another scan saw the place of a point free, occupied, or not at all.
 
-A scan is kept as columns of azimuth, each sorted by elevation. A point of another scan is looked up by its direction. If the rays around
-this direction end well beyond the point, its place is free in that scan. If they end at the point, it is occupied; if they end before it, it
-is hidden. No ray is traversed, so the cost does not depend on the length of rays, and places between the channels of a LiDAR are decided too.
+A scan is kept as columns of azimuth, each sorted by elevation. A point of another scan is looked up
+by its direction. If the rays around this direction end well beyond the point, its place is free in
+that scan. If they end at the point, it is occupied; if they end before it, it is hidden. No ray is
+traversed, so the cost does not depend on the length of rays, and places between the channels of a
+LiDAR are decided too.
 """
 
 from __future__ import annotations
@@ -19,8 +21,16 @@ from carlasc.core.compiling import cached, inlined
 _COLUMNS = 1024
 _PER_RAD = _COLUMNS / (2 * math.pi)
 _MIN_RANGE_M = 1.0  # nearer returns are of the vehicle itself, or invalid
-_SIDE_M, _SIDE_RAD = 0.12, 0.003  # half width of the window around a direction: size of surfaces, and errors of poses
-_DEPTH_M, _DEPTH_SHARE = 0.25, 0.003  # a return within this distance, and share of the range, is of the same surface
+# half width of the window around a direction: size of surfaces, and errors of poses
+_SIDE_M, _SIDE_RAD = (
+    0.12,
+    0.003,
+)
+# a return within this distance, and share of the range, is of the same surface
+_DEPTH_M, _DEPTH_SHARE = (
+    0.25,
+    0.003,
+)
 SAME_PLACE_M = 0.3  # origins of rays within this distance count as one place
 _GAP_M = 0.8  # maximum distance between two rays, one above the other, with free space between them
 
@@ -32,7 +42,8 @@ class SortedReturns(NamedTuple):
 
     Attributes:
         start: (C + 1,) int32, first return of each column of azimuth.
-        slope: (N,) float32 height over horizontal distance of each return, increasing within a column.
+        slope: (N,) float32 height over horizontal distance of each return, increasing within a
+            column.
         distance: (N,) float32 metres from the origin of its ray.
         origin: (C, 3) float32 origin of the rays of each column, metres, in the frame of the scan.
     """
@@ -43,26 +54,39 @@ class SortedReturns(NamedTuple):
     origin: NDArray[np.float32]
 
     @classmethod
-    def of(cls, points: NDArray[np.float32], origins: NDArray[np.float32] | None = None) -> SortedReturns:
+    def of(
+        cls, points: NDArray[np.float32], origins: NDArray[np.float32] | None = None
+    ) -> SortedReturns:
         """Sort the points of a scan by the directions of their rays.
 
-        A column holds rays with one origin. Where the first and the last rays of a turn of a moving sensor overlap, the fewer are left out.
+        A column holds rays with one origin. Where the first and the last rays of a turn of a moving
+        sensor overlap, the fewer are left out.
 
         Args:
             points: (N, 3) metres, sensor frame.
             origins: (N, 3) origins of the rays, metres, sensor frame; None: (0, 0, 0).
         """
         began = np.zeros_like(points[:, :3]) if origins is None else origins
-        column, slope, distance = _directions(np.ascontiguousarray(points[:, :3] - began, np.float32))
+        column, slope, distance = _directions(
+            np.ascontiguousarray(points[:, :3] - began, np.float32)
+        )
         start, order, origin = _by_column(column, slope, np.ascontiguousarray(began, np.float32))
         return cls(start, slope[order], distance[order], origin)
 
 
 @cached
-def _directions(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the column of each point, seen from (0, 0, 0), or -1 if it is too near; its slope; and its distance."""
+def _directions(
+    points: NDArray[np.float32],
+) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the column of each point, seen from (0, 0, 0), or -1 if it is too near; its slope; and
+    its distance.
+    """
     n = len(points)
-    column, slope, distance = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.float32)
+    column, slope, distance = (
+        np.empty(n, np.int32),
+        np.empty(n, np.float32),
+        np.empty(n, np.float32),
+    )
     for i in range(n):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         flat = math.sqrt(x * x + y * y)
@@ -78,7 +102,9 @@ def _directions(points: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray
 def _by_column(
     column: NDArray[np.int32], slope: NDArray[np.float32], began: NDArray[np.float32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-    """Return `start`, the indices of the points in the order of columns and slopes, and `origin`: see `SortedReturns`."""
+    """Return `start`, the indices of the points in the order of columns and slopes, and `origin`:
+    see `SortedReturns`.
+    """
     begin = np.zeros(_COLUMNS + 1, np.int64)
     for i in range(len(column)):
         begin[column[i] + 1] += column[i] >= 0
@@ -96,7 +122,11 @@ def _by_column(
             place = began[own[len(own) // 2]]
             origin[c] = place
             for k in np.argsort(slope[own]):
-                x, y, z = began[own[k], 0] - place[0], began[own[k], 1] - place[1], began[own[k], 2] - place[2]
+                x, y, z = (
+                    began[own[k], 0] - place[0],
+                    began[own[k], 1] - place[1],
+                    began[own[k], 2] - place[2],
+                )
                 if x * x + y * y + z * z <= SAME_PLACE_M * SAME_PLACE_M:
                     order[count] = own[k]
                     count += 1
@@ -138,9 +168,8 @@ def look_up(
     moved = (origin != origin[0]).any()
     for i in asked:
         x, y, z = transform(pose, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
-        if (
-            moved and x * x + y * y > 0
-        ):  # from there, the point is in a column near this one, with nearly the same origin
+        # from there, the point is in a column near this one, with nearly the same origin
+        if moved and x * x + y * y > 0:
             place = origin[_column(fast_azimuth(x, y))]
             x, y, z = x - place[0], y - place[1], z - place[2]
         else:
@@ -176,10 +205,13 @@ def undecided(
 
     Args:
         asked: (A,) indices of points.
-        free: (2, M) bits of the scans before and after that saw the place of a point free. Higher bits are farther in time.
+        free: (2, M) bits of the scans before and after that saw the place of a point free. Higher
+            bits are farther in time.
         hit: (2, M) bits of the scans that saw it occupied.
-        left: number of scans before and after that are not looked up yet, all nearer in time than the others.
-        least: least number of scans that see the place of a moved point free, and of scans in a row if it is free on one side only.
+        left: number of scans before and after that are not looked up yet, all nearer in time than
+            the others.
+        least: least number of scans that see the place of a moved point free, and of scans in a row
+            if it is free on one side only.
     """
     kept = np.empty_like(asked)
     count, rest = 0, left[0] + left[1]
@@ -202,7 +234,9 @@ def undecided(
 
 @inlined
 def _first_above(least, lo, hi, slope):  # type: ignore[no-untyped-def]
-    """Return the index of the first return from `lo` to `hi` with a slope of at least `least`; `hi` without one."""
+    """Return the index of the first return from `lo` to `hi` with a slope of at least `least`; `hi`
+    without one.
+    """
     while lo < hi:
         mid = (lo + hi) >> 1
         if slope[mid] < least:
@@ -232,7 +266,10 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
     below_range, above_range = 0.0, 0.0
     for c in range(first, last + 1):
         column = (c + _COLUMNS) % _COLUMNS
-        lo, end = _first_above(steep - high, start[column], start[column + 1], slope), start[column + 1]
+        lo, end = (
+            _first_above(steep - high, start[column], start[column + 1], slope),
+            start[column + 1],
+        )
         if lo > start[column] and slope[lo - 1] > below:
             below, below_range = slope[lo - 1], distance[lo - 1]
         while lo < end and slope[lo] <= steep + high:

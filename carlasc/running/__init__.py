@@ -1,4 +1,6 @@
-"""Calling one function with many items in parallel: in new processes, in an executor of the caller, or on a cluster."""
+"""Calling one function with many items in parallel: in new processes, in an executor of the caller,
+or on a cluster.
+"""
 
 import lazy_loader
 

@@ -1,4 +1,7 @@
-"""Calling one function with many items on the workers of a Dask cluster. Workers first check versions and limit threads."""
+"""Calling one function with many items on the workers of a Dask cluster.
+
+Workers first check versions and limit threads.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,8 @@ class Versions:
     """The versions of software on which results depend.
 
     Attributes:
-        carlasc: version of the package, and a digest of its source, because rules can change between versions.
+        carlasc: version of the package, and a digest of its source, because rules can change
+            between versions.
         python: version of Python, without the patch number.
         numpy: version of NumPy.
         numba: version of Numba.
@@ -54,13 +58,18 @@ class Versions:
         Raises:
             CarlascError: the worker has other versions.
         """
-        names = [field.name for field in fields(self) if getattr(self, field.name) != getattr(other, field.name)]
+        names = [
+            field.name
+            for field in fields(self)
+            if getattr(self, field.name) != getattr(other, field.name)
+        ]
         if names:
             raise CarlascError(
                 f"worker {worker}",
                 expected=" and ".join(f"{name} {getattr(self, name)}" for name in names),
                 found=" and ".join(f"{name} {getattr(other, name)}" for name in names),
-                advice="install the same versions on all workers, because results may depend on them",
+                advice="install the same versions on all workers, because results may depend on "
+                "them",
             )
 
 
@@ -145,13 +154,16 @@ def run_on_cluster(
     items: Iterable[Item],
     lost: Callable[[Item, str], Result] | None,
 ) -> Generator[Result, None, None]:
-    """Yield `function(item)` for every item, in the order of the items; see `carlasc.running.run_all`.
+    """Yield `function(item)` for every item, in the order of the items; see
+    `carlasc.running.run_all`.
 
-    A few tasks per worker are submitted at a time. The scheduler moves the tasks of a worker that died to other workers. A result stays on
-    its worker until it is fetched; then the task is released.
+    A few tasks per worker are submitted at a time. The scheduler moves the tasks of a worker that
+    died to other workers. A result stays on its worker until it is fetched; then the task is
+    released.
 
     Raises:
-        CarlascError: the connection to the scheduler is lost, a worker has other versions, or an item is given up and `lost` is None.
+        CarlascError: the connection to the scheduler is lost, a worker has other versions, or an
+            item is given up and `lost` is None.
     """
     client = client.client if isinstance(client, LazyClient) else client
     distributed = import_extra("distributed", "cluster")
@@ -162,7 +174,8 @@ def run_on_cluster(
             tasks.submit(list(islice(waiting, tasks.window)))
             while tasks.pending:
                 yield from tasks.take(lost)
-                if len(tasks.pending) <= tasks.window // 2:  # several at once, because a call costs as much as a task
+                # several at once, because a call costs as much as a task
+                if len(tasks.pending) <= tasks.window // 2:
                     tasks.submit(list(islice(waiting, tasks.window - len(tasks.pending))))
         finally:
             _release(tasks.pending)
@@ -171,7 +184,9 @@ def run_on_cluster(
 class _Tasks:
     """The submitted tasks of a run, in the order of the items."""
 
-    def __init__(self, client: DaskClient, function: Callable[[Any], Any], distributed: Any) -> None:
+    def __init__(
+        self, client: DaskClient, function: Callable[[Any], Any], distributed: Any
+    ) -> None:
         import cloudpickle
 
         self.pending: deque[tuple[Any, Any]] = deque()
@@ -199,7 +214,9 @@ class _Tasks:
     def take(self, lost: Callable[[Any, str], Any] | None) -> Iterator[Any]:
         """Yield the result of the first task, and of the following tasks that are also done."""
         self.pending[0][1].exception()  # waits for its end
-        done = list(takewhile(lambda entry: entry[1].status == "finished", islice(self.pending, _TOGETHER)))
+        done = list(
+            takewhile(lambda entry: entry[1].status == "finished", islice(self.pending, _TOGETHER))
+        )
         batch = [self.pending.popleft() for _ in range(max(len(done), 1))]
         try:
             yield from self._results(batch, lost, together=bool(done))
@@ -207,12 +224,15 @@ class _Tasks:
             _release(batch)
 
     def _results(
-        self, batch: list[tuple[Any, Any]], lost: Callable[[Any, str], Any] | None, *, together: bool
+        self,
+        batch: list[tuple[Any, Any]],
+        lost: Callable[[Any, str], Any] | None,
+        *,
+        together: bool,
     ) -> Iterator[Any]:
         if together:
-            with suppress(
-                self._killed
-            ):  # the worker with the result died, and so did the worker that repeated the task
+            # the worker with the result died, and so did the worker that repeated the task
+            with suppress(self._killed):
                 yield from self._client.gather([future for _, future in batch])
                 return
         for item, future in batch:

@@ -1,4 +1,6 @@
-"""Opening a Dask cluster: on this machine, at the address of a scheduler, on Slurm, or of any cluster class of Dask."""
+"""Opening a Dask cluster: on this machine, at the address of a scheduler, on Slurm, or of any
+cluster class of Dask.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ _REFILL_S = 2.0
 _FORMS = "local, local:N, tcp://HOST:PORT, slurm, or the dotted path of a class"
 _SETTINGS = {
     "distributed.scheduler.allowed-failures": DEATHS - 1,
-    "distributed.scheduler.worker-saturation": 1.0,  # a worker holds only its current task, so that no other task is lost if it dies
+    # a worker holds only its current task, so that no other task is lost if it dies
+    "distributed.scheduler.worker-saturation": 1.0,
     **{f"distributed.nanny.pre-spawn-environ.{name}": "1" for name in ONE_THREAD},
     "distributed.worker.profile.enabled": False,  # the profiler samples stacks continuously
     "distributed.admin.large-graph-warning-threshold": "1GB",
@@ -34,19 +37,23 @@ _SETTINGS = {
 def open_cluster(where: str, *, workers: int | None = None) -> Iterator[LazyClient]:
     """Yield a Dask cluster for `run_all` and every argument `executor`.
 
-    The cluster starts with the first task, and is stopped at the end of the block, immediately if the block fails. All workers need the
-    same version of carlasc, and must read and write the same files under the same names: on a shared file system, or in an object store.
+    The cluster starts with the first task, and is stopped at the end of the block, immediately if
+    the block fails. All workers need the same version of carlasc, and must read and write the same
+    files under the same names: on a shared file system, or in an object store.
 
     Args:
-        where: "local": new processes on this machine; "local:N": N processes; "tcp://HOST:PORT" ("tls://", "ws://"): a running scheduler;
-            "slurm": Slurm jobs, as in the configuration file of Dask (`jobqueue.slurm`); "package.module.Class": a class that starts a
-            cluster when it is called without arguments.
-        workers: number of processes of "local", None for one per core; number of jobs or workers of the other clusters that are started.
+        where: "local": new processes on this machine; "local:N": N processes; "tcp://HOST:PORT"
+            ("tls://", "ws://"): a running scheduler; "slurm": Slurm jobs, as in the configuration
+            file of Dask (`jobqueue.slurm`); "package.module.Class": a class that starts a cluster
+            when it is called without arguments.
+        workers: number of processes of "local", None for one per core; number of jobs or workers of
+            the other clusters that are started.
 
     Raises:
         ArgumentError: `where` has none of these forms, or the number of workers is missing.
         DependencyError: Dask is not installed.
-        CarlascError: the scheduler does not answer, no worker starts in time, or a worker has other versions.
+        CarlascError: the scheduler does not answer, no worker starts in time, or a worker has other
+            versions.
     """
     distributed = import_extra("distributed", "cluster")
     start = _starter(where, workers)
@@ -74,9 +81,13 @@ def _starter(where: str, workers: int | None) -> Callable[[], Any] | None:
         return None
     if match := re.fullmatch(r"local(?::([1-9][0-9]*))?", where):
         if match[1] and workers not in (None, int(match[1])):
-            raise ArgumentError("workers", expected=f"no number of workers with {where}", found=str(workers))
+            raise ArgumentError(
+                "workers", expected=f"no number of workers with {where}", found=str(workers)
+            )
         return partial(_start_local, int(match[1]) if match[1] else Run(workers).processes)
-    module, _, name = "dask_jobqueue.SLURMCluster".rpartition(".") if where == "slurm" else where.rpartition(".")
+    module, _, name = (
+        "dask_jobqueue.SLURMCluster".rpartition(".") if where == "slurm" else where.rpartition(".")
+    )
     if where == "slurm":
         import_extra(module, "cluster")
     if not re.fullmatch(r"\w+(\.\w+)*", module):
@@ -95,7 +106,9 @@ def _start_local(workers: int) -> Any:
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
-            memory_limit=None,  # no limit, as without a cluster: Dask would pause or kill workers although memory is free
+            # no limit, as without a cluster: Dask would pause or kill workers although memory is
+            # free
+            memory_limit=None,
             dashboard_address="127.0.0.1:0",  # a free port, because the default port may be in use
             silence_logs=logging.CRITICAL,
         )
@@ -115,7 +128,9 @@ def _start_class(kind: Callable[[], Any], where: str, workers: int | None) -> An
         raise CarlascError(f"cluster {where}", problem=f"it does not start: {error}") from error
     if workers is None and not getattr(cluster, "plan", True):
         cluster.close()
-        raise ArgumentError("workers", expected=f"the number of jobs or workers that {where} starts", found="none")
+        raise ArgumentError(
+            "workers", expected=f"the number of jobs or workers that {where} starts", found="none"
+        )
     return cluster
 
 
@@ -134,7 +149,9 @@ def _keep(cluster: Any, workers: int) -> None:
 
     cluster.scale(**number)
     if isinstance(getattr(cluster, "workers", None), dict):
-        callback = cluster.periodic_callbacks["carlasc-refill"] = PeriodicCallback(refill, 1000 * _REFILL_S)
+        callback = cluster.periodic_callbacks["carlasc-refill"] = PeriodicCallback(
+            refill, 1000 * _REFILL_S
+        )
         cluster.loop.add_callback(callback.start)
 
 
@@ -156,12 +173,17 @@ def _started(start: Callable[[], Any]) -> Iterator[Any]:
 
 
 def _kill_workers(cluster: Any) -> None:
-    """Kill the processes of a cluster on this machine during their tasks. Other jobs end when the cluster is closed."""
+    """Kill the processes of a cluster on this machine during their tasks.
+
+    Other jobs end when the cluster is closed.
+    """
     import asyncio
 
     async def kill() -> None:
         nannies = [worker for worker in cluster.workers.values() if hasattr(worker, "kill")]
-        await asyncio.gather(*(nanny.kill(timeout=0.1) for nanny in nannies), return_exceptions=True)
+        await asyncio.gather(
+            *(nanny.kill(timeout=0.1) for nanny in nannies), return_exceptions=True
+        )
 
     if hasattr(cluster, "workers"):
         cluster.sync(kill)
@@ -169,7 +191,10 @@ def _kill_workers(cluster: Any) -> None:
 
 @contextmanager
 def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
-    """Yield a client of a scheduler with at least one worker. All workers have the versions of this process."""
+    """Yield a client of a scheduler with at least one worker.
+
+    All workers have the versions of this process.
+    """
     import dask
     from dask.utils import parse_timedelta
 
@@ -185,8 +210,9 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
             advice="check the address, and that the scheduler is running",
         )
     if failure:
-        # Dask closes a client that could not start only in its finalizer. To avoid a deadlock with the start of another client,
-        # the finalizer must run now, so the cause, which refers to the client, is dropped.
+        # Dask closes a client that could not start only in its finalizer. To avoid a deadlock with
+        # the start of another client, the finalizer must run now, so the cause, which refers to the
+        # client, is dropped.
         gc.collect()
         raise failure
     try:
@@ -197,12 +223,17 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
                 raise CarlascError(
                     f"cluster {where}",
                     problem=f"no worker started within {workers_s:g} s",
-                    advice="check its jobs or workers, or wait longer: DASK_CARLASC__WORKERS_TIMEOUT=1h",
+                    advice="check its jobs or workers, or wait longer: "
+                    "DASK_CARLASC__WORKERS_TIMEOUT=1h",
                 ) from error
             ours = Versions.here()  # workers that start later are checked before their first task
             for worker, found in client.run(Versions.here, on_error="return").items():
                 if not isinstance(found, Versions):
-                    raise CarlascError(f"worker {worker}", expected=f"carlasc {ours.carlasc}", found=f"none ({found})")
+                    raise CarlascError(
+                        f"worker {worker}",
+                        expected=f"carlasc {ours.carlasc}",
+                        found=f"none ({found})",
+                    )
                 ours.check(found, worker)
         yield client
     finally:
@@ -213,7 +244,9 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Suppress logs and warnings of Dask, because failures are reported in one line."""
-    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
+    names = [
+        name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"
+    ]
     before = {name: logging.getLogger(name).level for name in names}
     try:
         for name in names:

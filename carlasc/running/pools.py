@@ -34,17 +34,20 @@ class LostTaskError(CarlascError):
     def __init__(self, where: object = "a task") -> None:
         super().__init__(
             where,
-            problem=f"{DEATHS} worker processes died while running it: they ran out of memory, crashed, or were killed",
+            problem=f"{DEATHS} worker processes died while running it: they ran out of memory, "
+            f"crashed, or were killed",
             advice="try fewer `workers` or a coarser grid",
         )
 
 
 class OwnProcesses(Executor):
-    """An executor of processes that ignore Ctrl-C, use one thread each, and can be stopped during a task.
+    """An executor of processes that ignore Ctrl-C, use one thread each, and can be stopped during a
+    task.
 
-    Ctrl-C reaches all processes of a terminal. Only the main process handles it, and stops the others. When a process dies, all are
-    replaced, and the lost tasks run again, one at a time, so that a task that kills its process affects no other task. A task that is lost
-    three times raises LostTaskError.
+    Ctrl-C reaches all processes of a terminal. Only the main process handles it, and stops the
+    others. When a process dies, all are replaced, and the lost tasks run again, one at a time, so
+    that a task that kills its process affects no other task. A task that is lost three times raises
+    LostTaskError.
     """
 
     def __init__(self, workers: int) -> None:
@@ -56,7 +59,8 @@ class OwnProcesses(Executor):
         task = _RetriedTask(self, _Cleanly(fn), args, kwargs)
         if not task.start(self._pool):
             self.recover()
-            task.start(self._pool)  # if a process has died again, the task is lost, and `result` starts it again
+            # if a process has died again, the task is lost, and `result` starts it again
+            task.start(self._pool)
         self._tasks[id(task)] = task
         return task
 
@@ -70,7 +74,8 @@ class OwnProcesses(Executor):
         self._pool.shutdown(wait, cancel_futures=cancel_futures)
 
     def recover(self) -> None:
-        """Replace the processes after one died, and run the lost tasks again, each alone in a process.
+        """Replace the processes after one died, and run the lost tasks again, each alone in a
+        process.
 
         Raises:
             CarlascError: new processes die before they run a task.
@@ -102,7 +107,8 @@ class OwnProcesses(Executor):
             self._pool.end()  # so that messages of its processes on stderr come before the error
             raise CarlascError(
                 "worker processes die as soon as they start",
-                problem='the memory is full, or the script that starts them has no `if __name__ == "__main__":`',
+                problem="the memory is full, or the script that starts them has no `if __name__ "
+                '== "__main__":`',
                 advice="try fewer `workers`, or add the guard to the script",
             )
 
@@ -117,7 +123,11 @@ class _RetriedTask(Future[Any]):
     """A task that its pool may start several times."""
 
     def __init__(
-        self, pool: OwnProcesses, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+        self,
+        pool: OwnProcesses,
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
     ) -> None:
         super().__init__()
         self._owner, self._call, self._attempt = pool, (function, args, kwargs), Future[Any]()
@@ -155,7 +165,9 @@ class _RetriedTask(Future[Any]):
 
 
 class _NotingContext(SpawnContext):
-    """A context that records the processes that a pool starts, because pools do not list them before Python 3.14."""
+    """A context that records the processes that a pool starts, because pools do not list them
+    before Python 3.14.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -183,14 +195,16 @@ class _ProcessGroup(ProcessPoolExecutor):
         try:
             with inherited_by_workers():  # pools start processes when tasks are submitted
                 return super().submit(fn, *args, **kwargs)
-        except OSError as error:  # a process died while another was starting, and the pool has closed its queue
+        except (
+            OSError
+        ) as error:  # a process died while another was starting, and the pool has closed its queue
             raise BrokenProcessPool(f"a process cannot be started: {error}") from error
 
     def end(self) -> None:
         """End processes that are idle, or of which one has died.
 
-        A broken pool ends its processes and waits for them. It misses a process that was starting at that moment, which would then hang;
-        this method kills it.
+        A broken pool ends its processes and waits for them. It misses a process that was starting
+        at that moment, which would then hang; this method kills it.
         """
         self.shutdown(wait=False)
         for process in self._context.started:
@@ -213,7 +227,10 @@ class _ProcessGroup(ProcessPoolExecutor):
 
 @contextmanager
 def inherited_by_workers() -> Iterator[None]:
-    """Block Ctrl-C and limit libraries to one thread within the block. Processes that are started in it inherit both."""
+    """Block Ctrl-C and limit libraries to one thread within the block.
+
+    Processes that are started in it inherit both.
+    """
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
@@ -235,7 +252,9 @@ def _prepare_worker(first: Semaphore, wishes: tuple[tuple[Callable[[], None], fl
 
 
 def _end_with_parent() -> None:
-    """End this worker soon after the main process has ended. A killed main process cannot stop its workers.
+    """End this worker soon after the main process has ended.
+
+    A killed main process cannot stop its workers.
 
     Without this, workers would hang, because each of them keeps the queue of tasks open.
     """
@@ -250,13 +269,17 @@ def _end_with_parent() -> None:
 
 def _exit_worker(*_: object) -> None:
     if not _Cleanly.is_working:
-        # Exit immediately: after an exception while reading a task, the next worker would read the rest of it as a task.
+        # Exit immediately: after an exception while reading a task, the next worker would read the
+        # rest of it as a task.
         os._exit(_TERMINATED)
     raise SystemExit(_TERMINATED)
 
 
 class _Cleanly:
-    """Wraps a function. On SIGTERM, the function cleans up and its process ends instead of taking the next task."""
+    """Wraps a function.
+
+    On SIGTERM, the function cleans up and its process ends instead of taking the next task.
+    """
 
     is_working = False
 

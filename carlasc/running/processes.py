@@ -1,4 +1,6 @@
-"""Calling one function with many items in parallel: in new processes, in an executor of the caller, or on a Dask cluster."""
+"""Calling one function with many items in parallel: in new processes, in an executor of the caller,
+or on a Dask cluster.
+"""
 
 from __future__ import annotations
 
@@ -27,24 +29,28 @@ def run_all(
 ) -> Generator[Result, None, None]:
     """Yield `function(item)` for every item, in the order of the items.
 
-    At most two items per worker (four on a cluster) are in progress at a time, so memory use does not grow with the number of items.
+    At most two items per worker (four on a cluster) are in progress at a time, so memory use does
+    not grow with the number of items.
 
-    Without an executor, the function runs in new processes with one thread each, or in this process if `workers` is 1. When the generator
-    is closed or interrupted, these processes stop immediately, and each removes its unfinished file. They import the main module of the
-    caller again: a script must guard its work with `if __name__ == "__main__":`.
+    Without an executor, the function runs in new processes with one thread each, or in this process
+    if `workers` is 1. When the generator is closed or interrupted, these processes stop
+    immediately, and each removes its unfinished file. They import the main module of the caller
+    again: a script must guard its work with `if __name__ == "__main__":`.
 
-    If a worker process dies, another one repeats its items, so the function may run more than once with an item. An item is given up after
-    three worker processes died while working on it.
+    If a worker process dies, another one repeats its items, so the function may run more than once
+    with an item. An item is given up after three worker processes died while working on it.
 
     Args:
         function: a top-level function; it and the items are pickled.
-        items: the arguments of the calls, taken one by one. The iterable itself may call `run_all` with the same executor.
+        items: the arguments of the calls, taken one by one. The iterable itself may call `run_all`
+            with the same executor.
         run: number of processes, or the executor.
-        lost: returns the result for an item that is given up, from the item and a message. With None, such an item is an error.
+        lost: returns the result for an item that is given up, from the item and a message. With
+            None, such an item is an error.
 
     Raises:
-        CarlascError: an item is given up and `lost` is None, the worker processes of an executor of the caller died, or the connection
-            to a cluster is lost.
+        CarlascError: an item is given up and `lost` is None, the worker processes of an executor of
+            the caller died, or the connection to a cluster is lost.
     """
     workers, executor, waiting = run.processes, run.executor, iter(items)
     first = list(islice(waiting, 2))
@@ -92,7 +98,8 @@ def _submit_all(
     except BrokenExecutor as error:
         raise CarlascError(
             "a worker process died",
-            problem='it ran out of memory, was killed, or the script that started it has no `if __name__ == "__main__":`',
+            problem="it ran out of memory, was killed, or the script that started it has no `if "
+            '__name__ == "__main__":`',
             advice="try fewer `workers` or a coarser grid",
         ) from error
     finally:
@@ -102,7 +109,8 @@ def _submit_all(
 
 @contextmanager
 def one_pool(run: Run) -> Iterator[Run]:
-    """Yield a run with one executor for several calls of `run_all`, so that processes start only once.
+    """Yield a run with one executor for several calls of `run_all`, so that processes start only
+    once.
 
     A run that already has an executor, or has one worker, is yielded unchanged.
 
@@ -118,7 +126,9 @@ def one_pool(run: Run) -> Iterator[Run]:
 
 @contextmanager
 def _own_processes(workers: int) -> Iterator[Executor]:
-    """Yield an executor whose processes end with the block, immediately if the block fails or is interrupted."""
+    """Yield an executor whose processes end with the block, immediately if the block fails or is
+    interrupted.
+    """
     pool = OwnProcesses(workers)
     try:
         yield pool

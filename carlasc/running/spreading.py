@@ -1,4 +1,5 @@
-"""How the work of a run is distributed: the options of all parallel functions, the executor, and the part of the work.
+"""How the work of a run is distributed: the options of all parallel functions, the executor, and
+the part of the work.
 
 This module does not import Dask, so that commands on one machine start fast.
 """
@@ -33,7 +34,8 @@ class DaskClient(Protocol):
 
 
 class LazyClient:
-    """A client that connects on first use, so that a cluster starts no jobs for a run without work or with wrong arguments.
+    """A client that connects on first use, so that a cluster starts no jobs for a run without work
+    or with wrong arguments.
 
     Args:
         connect: returns the client.
@@ -49,7 +51,9 @@ class LazyClient:
 
 
 Engine = Executor | DaskClient | LazyClient
-"""An executor of parallel work: any `concurrent.futures.Executor`, a `distributed.Client` of Dask, or the result of `open_cluster`."""
+"""An executor of parallel work: any `concurrent.futures.Executor`, a `distributed.Client` of Dask,
+or the result of `open_cluster`.
+"""
 
 
 Item = TypeVar("Item")
@@ -57,7 +61,9 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Part:
-    """One of several parts of a run. Together, the parts process each item exactly once, in any order.
+    """One of several parts of a run.
+
+    Together, the parts process each item exactly once, in any order.
 
     Attributes:
         number: number of this part, from 1.
@@ -72,14 +78,17 @@ class Part:
 
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.count:
-            raise ArgumentError("part", expected="I/N with I from 1 to N, such as 2/4", found=str(self))
+            raise ArgumentError(
+                "part", expected="I/N with I from 1 to N, such as 2/4", found=str(self)
+            )
 
     @classmethod
     def parse(cls, text: str) -> Self:
         """Read "2/4".
 
         Raises:
-            ArgumentError: the text is not of this form, or the number is not between 1 and the count.
+            ArgumentError: the text is not of this form, or the number is not between 1 and the
+                count.
         """
         match = re.fullmatch(r"([0-9]+)/([0-9]+)", text.strip())
         if match is None:
@@ -87,12 +96,18 @@ class Part:
         return cls(int(match[1]), int(match[2]))
 
     def take(self, items: Sequence[Item]) -> Sequence[Item]:
-        """Return the items of this part. They are consecutive, because neighbouring items often read the same data."""
-        begin, end = (len(items) * number // self.count for number in (self.number - 1, self.number))
+        """Return the items of this part.
+
+        They are consecutive, because neighbouring items often read the same data.
+        """
+        begin, end = (
+            len(items) * number // self.count for number in (self.number - 1, self.number)
+        )
         return items[begin:end]
 
     def refuse(self, overwrite: bool) -> None:
-        """Check that `overwrite` is not combined with several parts, because a part would remove the output of others.
+        """Check that `overwrite` is not combined with several parts, because a part would remove
+        the output of others.
 
         Raises:
             ArgumentError: `overwrite` is given, and the run has several parts.
@@ -114,9 +129,12 @@ class Run:
     """How the work of a run is distributed, and its progress callback.
 
     Attributes:
-        workers: number of processes; None for one per core. With an executor: the number of its workers.
-        executor: executor of the work, instead of new processes; it is not shut down. None starts new processes.
-        part: the part of the work to do; other commands do the other parts, at the same time or later.
+        workers: number of processes; None for one per core. With an executor: the number of its
+            workers.
+        executor: executor of the work, instead of new processes; it is not shut down. None starts
+            new processes.
+        part: the part of the work to do; other commands do the other parts, at the same time or
+            later.
         progress: called with the number of finished steps and the number of all steps.
 
     Raises:
@@ -144,9 +162,14 @@ class Run:
 
 
 class StepCounter:
-    """Counts the steps of a run for its progress callback. A stage adds its steps as soon as their number is known."""
+    """Counts the steps of a run for its progress callback.
 
-    def __init__(self, progress: Callable[[int, int], None] | None, total: int = 0, done: int = 0) -> None:
+    A stage adds its steps as soon as their number is known.
+    """
+
+    def __init__(
+        self, progress: Callable[[int, int], None] | None, total: int = 0, done: int = 0
+    ) -> None:
         self._progress, self._done, self._total = progress, done, total
 
     def expect(self, more: int) -> None:
@@ -160,7 +183,10 @@ class StepCounter:
             self._progress(self._done, self._total)
 
     def stage(self, expected: int = 0) -> Callable[[int, int], None]:
-        """Return the progress callback of a stage that counts its own steps. `expected` of them are already in the total."""
+        """Return the progress callback of a stage that counts its own steps.
+
+        `expected` of them are already in the total.
+        """
         before, total = self._done, self._total - expected
 
         def advance(done: int, of: int) -> None:

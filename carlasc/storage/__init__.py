@@ -1,4 +1,6 @@
-"""The layout on disk, and the sources and sinks that read and write it: folders, zips, URLs, packed stores; downloads."""
+"""The layout on disk, and the sources and sinks that read and write it: folders, zips, URLs, packed
+stores; downloads.
+"""
 
 import lazy_loader
 

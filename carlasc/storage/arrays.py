@@ -1,8 +1,9 @@
 """Reading arrays from untrusted .npy and .npz files, and writing .npz files.
 
-The header of an array holds its type, shape and size. They are checked before any value is read, and only the header is unpacked for that.
-A small file that claims a huge array, or unpacks to one, therefore takes neither memory nor time. Pickles are never read.
-The format is that of `numpy.lib.format`; .npz files are zips of such files (PKWARE's APPNOTE).
+The header of an array holds its type, shape and size. They are checked before any value is read,
+and only the header is unpacked for that. A small file that claims a huge array, or unpacks to one,
+therefore takes neither memory nor time. Pickles are never read. The format is that of
+`numpy.lib.format`; .npz files are zips of such files (PKWARE's APPNOTE).
 """
 
 from __future__ import annotations
@@ -24,15 +25,25 @@ from carlasc.errors import FormatError, MissingDataError, reading
 
 _LONGEST_HEADER = 1 << 14  # bytes; NumPy refuses headers of more than 10,000
 _PIECE = 1 << 18  # bytes that are unpacked at a time
-_SMALL = 1 << 26  # bytes: smaller arrays are unpacked at any compression ratio: zeros compress very well
+# bytes: smaller arrays are unpacked at any compression ratio: zeros compress very well
+_SMALL = 1 << 26
 _MOST_RATIO = 100  # largest compression ratio of larger arrays; Deflate reaches 1032
-_MOST_BYTES = 1 << 28  # largest frame of any field but a grid: 20 million points, more than any sensor records
+# largest frame of any field but a grid: 20 million points, more than any sensor records
+_MOST_BYTES = 1 << 28
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the methods that NumPy writes
 _ENCRYPTED = 1  # flag
-_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_READERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 _ORDERS = ("<", ">")
-WHOLE_NUMBERS = ("?", "i1", "u1", *(f"{order}{kind}{size}" for order in _ORDERS for kind in "iu" for size in (2, 4, 8)))
+WHOLE_NUMBERS = (
+    "?",
+    "i1",
+    "u1",
+    *(f"{order}{kind}{size}" for order in _ORDERS for kind in "iu" for size in (2, 4, 8)),
+)
 """All integer types, for files of other programs, whose type is not fixed."""
 NUMBERS = (*WHOLE_NUMBERS, *(f"{order}f{size}" for order in _ORDERS for size in (2, 4, 8)))
 """All integer and floating-point types, for files of other programs."""
@@ -75,9 +86,14 @@ class _Header:
         return math.prod(self.shape) * self.dtype.itemsize
 
     def array(self, values: bytes | memoryview) -> NDArray[Any]:
-        """Return these bytes as an array in C order. Copies only if the file is in Fortran order."""
+        """Return these bytes as an array in C order.
+
+        Copies only if the file is in Fortran order.
+        """
         flat = np.frombuffer(values, self.dtype, math.prod(self.shape))
-        return np.asarray(flat.reshape(self.shape, order="F" if self.fortran_order else "C"), order="C")
+        return np.asarray(
+            flat.reshape(self.shape, order="F" if self.fortran_order else "C"), order="C"
+        )
 
 
 def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> NDArray[Any]:
@@ -98,7 +114,8 @@ def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> ND
     if len(data) - header.start != header.size:
         raise FormatError(
             where,
-            expected=f"{header.start + header.size} bytes ({_text(header.shape)} {header.dtype.name})",
+            expected=f"{header.start + header.size} bytes ({_text(header.shape)} "
+            f"{header.dtype.name})",
             found=str(len(data)),
             advice="the file is cut short, or something was added",
         )
@@ -106,7 +123,9 @@ def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> ND
 
 
 def read_npy(path: str | Path, expected: ArrayFormat) -> NDArray[Any]:
-    """Return the array of a .npy file on this machine. A file that is longer than its header says is not read.
+    """Return the array of a .npy file on this machine.
+
+    A file that is longer than its header says is not read.
 
     Raises:
         MissingDataError: the file does not exist.
@@ -118,7 +137,8 @@ def read_npy(path: str | Path, expected: ArrayFormat) -> NDArray[Any]:
         if found != header.start + header.size:
             raise FormatError(
                 path,
-                expected=f"{header.start + header.size} bytes ({_text(header.shape)} {header.dtype.name})",
+                expected=f"{header.start + header.size} bytes ({_text(header.shape)} "
+                f"{header.dtype.name})",
                 found=str(found),
                 advice="the file is cut short, or something was added",
             )
@@ -147,7 +167,9 @@ def check_ratio(size: int, packed: int, where: str) -> None:
 
 
 def check_size(shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
-    """Check that an array is not larger than any real frame. For fields whose size the format does not limit.
+    """Check that an array is not larger than any real frame.
+
+    For fields whose size the format does not limit.
 
     Raises:
         FormatError: the array is too large; the message begins with `what`.
@@ -170,28 +192,40 @@ class NpzFile:
 
     def __init__(self, archive: zipfile.ZipFile, where: str) -> None:
         self._archive, self._where = archive, where
-        self._members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        self._members = {
+            member.filename.removesuffix(".npy"): member for member in archive.infolist()
+        }
         self.names = tuple(self._members)
 
     def dtype(self, name: str) -> np.dtype[Any]:
         """Return the type of an array, from its header alone."""
         where = f"{self._where}: {name}"
-        with reading(where, "a .npy array in a whole zip"), self._archive.open(self._members[name]) as stream:
+        with (
+            reading(where, "a .npy array in a whole zip"),
+            self._archive.open(self._members[name]) as stream,
+        ):
             return _npy_header(stream)[2]
 
     def read(self, name: str, expected: ArrayFormat) -> NDArray[Any]:
         """Return an array, in C order.
 
         Raises:
-            FormatError: the array does not exist, has another type, shape or size, has a compression that NumPy does not use, or is damaged.
+            FormatError: the array does not exist, has another type, shape or size, has a
+                compression that NumPy does not use, or is damaged.
         """
         member, where = self._members.get(name), f"{self._where}: {name}"
         if member is None:
             raise FormatError(
-                self._where, expected=f"an array {name}", found=", ".join(self.names) or "an archive without arrays"
+                self._where,
+                expected=f"an array {name}",
+                found=", ".join(self.names) or "an archive without arrays",
             )
         if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
-            found = "an encrypted one" if member.flag_bits & _ENCRYPTED else f"compression {member.compress_type}"
+            found = (
+                "an encrypted one"
+                if member.flag_bits & _ENCRYPTED
+                else f"compression {member.compress_type}"
+            )
             raise FormatError(where, expected="a stored or deflated array", found=found)
         with reading(where, "a .npy array in a whole zip"), self._archive.open(member) as stream:
             header = _read_header(stream, expected, where)
@@ -202,7 +236,8 @@ class NpzFile:
         if member.file_size != header.start + header.size:
             raise FormatError(
                 where,
-                expected=f"{header.start + header.size} bytes ({_text(header.shape)} {header.dtype.name})",
+                expected=f"{header.start + header.size} bytes ({_text(header.shape)} "
+                f"{header.dtype.name})",
                 found=str(member.file_size),
                 advice="the file is damaged",
             )
@@ -218,13 +253,17 @@ class NpzFile:
         stream.read(1)  # reaches the end, where the checksum is compared
         if place != header.size:
             raise FormatError(
-                where, expected=f"{header.size} bytes of values", found=str(place), advice="the file is damaged"
+                where,
+                expected=f"{header.size} bytes of values",
+                found=str(place),
+                advice="the file is damaged",
             )
         return view
 
 
 def npz_bytes(arrays: Mapping[str, tuple[NDArray[Any], int]]) -> bytes:
-    """Return a compressed .npz file like that of `numpy.savez_compressed`, but with one Deflate level per array.
+    """Return a compressed .npz file like that of `numpy.savez_compressed`, but with one Deflate
+    level per array.
 
     Args:
         arrays: array and Deflate level by name. Levels go from 1 (fast) to 9 (small); NumPy uses 6.
@@ -274,7 +313,9 @@ def _opened(path: str | Path) -> Iterator[IO[bytes]]:
     except FileNotFoundError as error:
         raise MissingDataError(path, expected="a file", found="nothing") from error
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
-        raise FormatError(path, problem=f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise FormatError(
+            path, problem=f"cannot be read: {getattr(error, 'strerror', None) or error}"
+        ) from error
     with file:
         yield file
 
@@ -296,8 +337,14 @@ def _read_header(stream: IO[bytes], expected: ArrayFormat, where: str) -> _Heade
     with reading(where, "a .npy array"):
         shape, fortran_order, dtype = _npy_header(stream)
         start = stream.tell()
-    # An empty array of shape (0,) is accepted as (0, K): CarlaSC has such files for an empty list of actors.
-    if len(shape) == 1 and shape[0] == 0 and expected.shape is not None and len(expected.shape) == 2:
+    # An empty array of shape (0,) is accepted as (0, K): CarlaSC has such files for an empty list
+    # of actors.
+    if (
+        len(shape) == 1
+        and shape[0] == 0
+        and expected.shape is not None
+        and len(expected.shape) == 2
+    ):
         shape = (0, expected.shape[1] or 0)
     if not expected.holds(dtype):
         names = list(dict.fromkeys(np.dtype(name).name for name in expected.dtypes))
@@ -305,10 +352,14 @@ def _read_header(stream: IO[bytes], expected: ArrayFormat, where: str) -> _Heade
         raise FormatError(where, expected=f"{wanted} values", found=dtype.name)
     fits = expected.shape is None or (
         len(shape) == len(expected.shape)
-        and all(length in (None, found) for length, found in zip(expected.shape, shape, strict=True))
+        and all(
+            length in (None, found) for length, found in zip(expected.shape, shape, strict=True)
+        )
     )
     if not fits or min(shape, default=0) < 0:
-        raise FormatError(where, expected=f"an array of {_text(expected.shape or ())} values", found=_text(shape))
+        raise FormatError(
+            where, expected=f"an array of {_text(expected.shape or ())} values", found=_text(shape)
+        )
     if math.prod(shape) * dtype.itemsize >= 2**63:
         raise FormatError(where, expected="an array that fits into memory", found=_text(shape))
     if expected.most is not None and math.prod(shape) > expected.most:

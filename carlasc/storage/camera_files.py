@@ -28,10 +28,12 @@ def cameras_to_json(cameras: Iterable[CameraModel]) -> bytes:
 
 
 def cameras_of(sequence: Sequence) -> dict[str, CameraModel]:
-    """Return the cameras of a sequence by name, in the order of cameras.json; empty if the file does not exist.
+    """Return the cameras of a sequence by name, in the order of cameras.json; empty if the file
+    does not exist.
 
     Raises:
-        FormatError: the file is damaged, two cameras have the same name, or the pose of a camera does not fit the axes of the scans.
+        FormatError: the file is damaged, two cameras have the same name, or the pose of a camera
+            does not fit the axes of the scans.
     """
     if layout.CAMERAS not in sequence.documents():
         return {}
@@ -48,7 +50,8 @@ def cameras_from_json(data: bytes, where: str, axes: Axes) -> dict[str, CameraMo
         axes: handedness of the scans.
 
     Raises:
-        FormatError: the file is damaged, two cameras have the same name, or the pose of a camera does not fit the axes of the scans.
+        FormatError: the file is damaged, two cameras have the same name, or the pose of a camera
+            does not fit the axes of the scans.
     """
     values = parse_json(data, where)
     check_format(values.get("format", 1), where)
@@ -59,11 +62,22 @@ def cameras_from_json(data: bytes, where: str, axes: Axes) -> dict[str, CameraMo
     for about in listed:
         camera = CameraModel.from_dict(about, where)
         if camera.name in cameras:
-            raise FormatError(where, expected="a different name for each camera", found=f"two named {camera.name}")
+            raise FormatError(
+                where, expected="a different name for each camera", found=f"two named {camera.name}"
+            )
         if (np.linalg.det(camera.sensor_T_camera[:3, :3]) > 0) != (axes == "right"):
-            expected, found = ("a rotation", "a reflection") if axes == "right" else ("a reflection", "a rotation")
+            expected, found = (
+                ("a rotation", "a reflection")
+                if axes == "right"
+                else ("a reflection", "a rotation")
+            )
             advice = f"convert sensor_T_camera to the {axes}-handed axes of the scans"
-            raise FormatError(f"{where}: {camera.name}: sensor_T_camera", expected=expected, found=found, advice=advice)
+            raise FormatError(
+                f"{where}: {camera.name}: sensor_T_camera",
+                expected=expected,
+                found=found,
+                advice=advice,
+            )
         cameras[camera.name] = camera
     return cameras
 
@@ -82,7 +96,8 @@ def camera_named(sequence: Sequence, name: str) -> CameraModel:
 
 
 def scan_T_camera(sequence: Sequence, camera: CameraModel, frame: int) -> Transform | None:
-    """Return (4, 4) scan_T_camera, where camera is its pose at the time of the image of a frame; None if it took no image.
+    """Return (4, 4) scan_T_camera, where camera is its pose at the time of the image of a frame;
+    None if it took no image.
 
     The ego motion between the image and the scan is interpolated from poses.txt.
 
@@ -101,14 +116,20 @@ def scan_T_camera(sequence: Sequence, camera: CameraModel, frame: int) -> Transf
     line = sequence.line_of(frame, len(times), layout.TIMES)
     where = f"{sequence.location}/{layout.CAMERAS}: {camera.name}, frame {frame}"
     if len(camera.times) != len(times):
-        raise FormatError(where, expected=f"{len(times)} times, as in times.txt", found=f"{len(camera.times)} times")
+        raise FormatError(
+            where,
+            expected=f"{len(times)} times, as in times.txt",
+            found=f"{len(camera.times)} times",
+        )
     seconds = float(camera.times[line])
     if np.isnan(seconds):
         return None
     period = float(np.median(np.diff(times))) if len(times) > 1 else layout.FRAME_PERIOD_S
     if not abs(seconds - times[line]) <= period:
         found = f"{seconds - times[line]:+.3f} s"
-        raise FormatError(where, expected=f"an image within a frame ({period:.3f} s) of the scan", found=found)
+        raise FormatError(
+            where, expected=f"an image within a frame ({period:.3f} s) of the scan", found=found
+        )
     if abs(seconds - times[line]) < _SAME_TIME_S or len(poses) != len(times):
         return camera.sensor_T_camera
     near = slice(max(0, line - 1), line + 2)
@@ -135,8 +156,11 @@ def has_image(sequence: Sequence, camera: CameraModel, frame: int) -> bool:
     )
 
 
-def read_image(sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images") -> NDArray[Any]:
-    """Return the image of a frame: (H, W, 3) uint8 RGB, or (H, W) integers: classes, instances or depths.
+def read_image(
+    sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images"
+) -> NDArray[Any]:
+    """Return the image of a frame: (H, W, 3) uint8 RGB, or (H, W) integers: classes, instances or
+    depths.
 
     Args:
         sequence: the sequence.
@@ -146,15 +170,20 @@ def read_image(sequence: Sequence, camera: CameraModel, frame: int, folder: str 
 
     Raises:
         MissingDataError: the image does not exist.
-        FormatError: the image is cut short or damaged, or has another size than the camera's calibration.
+        FormatError: the image is cut short or damaged, or has another size than the camera's
+            calibration.
         DependencyError: Pillow is not installed.
     """
     data, where = image_bytes(sequence, camera, frame, folder)
     return decode_image(data, where, camera, color=folder == "images")
 
 
-def image_bytes(sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images") -> tuple[bytes, str]:
-    """Return the bytes of an image file, and its name for errors. Takes the arguments of `read_image`.
+def image_bytes(
+    sequence: Sequence, camera: CameraModel, frame: int, folder: str = "images"
+) -> tuple[bytes, str]:
+    """Return the bytes of an image file, and its name for errors.
+
+    Takes the arguments of `read_image`.
 
     Raises:
         MissingDataError: the image does not exist.
@@ -167,7 +196,9 @@ def image_bytes(sequence: Sequence, camera: CameraModel, frame: int, folder: str
         path = Path(sequence.location) / reference
         where = str(path)
         if not path.is_file():
-            raise MissingDataError(where, expected=f"an image of the camera {camera.name}", found="no file")
+            raise MissingDataError(
+                where, expected=f"an image of the camera {camera.name}", found="no file"
+            )
         return path.read_bytes(), where
     raise MissingDataError(
         sequence.location,
@@ -178,29 +209,41 @@ def image_bytes(sequence: Sequence, camera: CameraModel, frame: int, folder: str
 
 
 def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -> NDArray[Any]:
-    """Return the pixels of a JPEG or PNG file of a camera, as `read_image` does. With `color`, they are (H, W, 3) RGB, otherwise (H, W).
+    """Return the pixels of a JPEG or PNG file of a camera, as `read_image` does.
+
+    With `color`, they are (H, W, 3) RGB, otherwise (H, W).
 
     Raises:
-        FormatError: the image is cut short or damaged, or has another size than the camera's calibration.
+        FormatError: the image is cut short or damaged, or has another size than the camera's
+            calibration.
     """
     image = import_extra("PIL.Image", "render")
     try:
         with image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
             if picture.size != (camera.width, camera.height):
                 expected = f"{camera.width} x {camera.height} pixels, as camera {camera.name} is calibrated"
-                raise FormatError(where, expected=expected, found=f"{picture.size[0]} x {picture.size[1]}")
+                raise FormatError(
+                    where, expected=expected, found=f"{picture.size[0]} x {picture.size[1]}"
+                )
             pixels = np.asarray(picture.convert("RGB") if color else picture)
     except FormatError:
         raise
     except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
-        raise FormatError(where, expected="a whole JPEG or PNG", found="something else", advice=str(error)) from error
+        raise FormatError(
+            where, expected="a whole JPEG or PNG", found="something else", advice=str(error)
+        ) from error
     if not color and (pixels.ndim != 2 or pixels.dtype.kind not in "iu"):
-        raise FormatError(where, expected="a PNG with one integer per pixel", found=f"shape {pixels.shape}")
+        raise FormatError(
+            where, expected="a PNG with one integer per pixel", found=f"shape {pixels.shape}"
+        )
     return pixels
 
 
-def encode_image(pixels: NDArray[np.unsignedinteger], kind: str, quality: int = 90) -> NDArray[np.uint8]:
-    """Return an image as the bytes of a file: "JPEG" of (H, W, 3) uint8, or "PNG" of (H, W, 3) uint8 or (H, W) uint8 or uint16.
+def encode_image(
+    pixels: NDArray[np.unsignedinteger], kind: str, quality: int = 90
+) -> NDArray[np.uint8]:
+    """Return an image as the bytes of a file: "JPEG" of (H, W, 3) uint8, or "PNG" of (H, W, 3)
+    uint8 or (H, W) uint8 or uint16.
 
     Raises:
         DependencyError: Pillow is not installed.

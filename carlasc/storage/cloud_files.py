@@ -1,11 +1,14 @@
-"""Map files for other programs: points with classes, written in pieces (.ply, .pcd, .las and .npz), and OctoMap binary trees (.bt).
+"""Map files for other programs: points with classes, written in pieces (.ply, .pcd, .las and .npz),
+and OctoMap binary trees (.bt).
 
-PLY: https://paulbourke.net/dataformats/ply/. PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html (version 0.7).
+PLY: https://paulbourke.net/dataformats/ply/. PCD:
+https://pointclouds.org/documentation/tutorials/pcd_file_format.html (version 0.7).
 
-A binary tree stores which cells are occupied and which are free; all others are unknown. After a text header, each inner node has two bits for
-each of its eight children, 01 free, 10 occupied, 11 an inner node, 00 unknown, in the order x + 2 y + 4 z; the inner nodes follow each other
-in depth-first order. A tree has 16 levels, and its middle is at the origin. See A. Hornung et al., "OctoMap", Autonomous Robots 2013,
-section 5, and https://octomap.github.io.
+A binary tree stores which cells are occupied and which are free; all others are unknown. After a
+text header, each inner node has two bits for each of its eight children, 01 free, 10 occupied, 11
+an inner node, 00 unknown, in the order x + 2 y + 4 z; the inner nodes follow each other in
+depth-first order. A tree has 16 levels, and its middle is at the origin. See A. Hornung et al.,
+"OctoMap", Autonomous Robots 2013, section 5, and https://octomap.github.io.
 """
 
 from __future__ import annotations
@@ -27,11 +30,20 @@ from carlasc.errors import ArgumentError, import_extra
 from carlasc.storage.files import write_output
 
 POINT_DTYPE = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("label", "<u2"), ("seen", "<u4"), ("confidence", "<f4")]
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("label", "<u2"),
+        ("seen", "<u4"),
+        ("confidence", "<f4"),
+    ]
 )
-"""A point: position in metres, class, number of scans that saw its cell, confidence of the class."""
+"""A point: position in metres, class, number of scans that saw its cell, confidence of the class.
+"""
 
-_ROW_DTYPE = np.dtype([*POINT_DTYPE.descr[:3], ("rgb", "<u4"), *POINT_DTYPE.descr[3:]])  # 0xAARRGGBB: bytes b, g, r, a
+# 0xAARRGGBB: bytes b, g, r, a
+_ROW_DTYPE = np.dtype([*POINT_DTYPE.descr[:3], ("rgb", "<u4"), *POINT_DTYPE.descr[3:]])
 _PLY_NAMES = {"f4": "float", "u2": "ushort", "u4": "uint"}
 _LAS_SCALE_M = 0.0001
 _LAS_CLASSES = 256  # a classification has 8 bits; `label` holds every class
@@ -43,7 +55,8 @@ class PointPieces:
 
     Attributes:
         count: number of points.
-        pieces: yields arrays of `POINT_DTYPE`, `count` points in all; called once for each pass over them.
+        pieces: yields arrays of `POINT_DTYPE`, `count` points in all; called once for each pass
+            over them.
         classes: class table of the labels.
         about: one line about the points, for the headers of files.
     """
@@ -84,10 +97,28 @@ def _write_ply(file: BinaryIO, points: PointPieces) -> None:
 
 
 def _write_pcd(file: BinaryIO, points: PointPieces) -> None:
-    kinds = list(zip(*((name, kind[2:], kind[1].upper()) for name, kind, *_ in _ROW_DTYPE.descr), strict=True))
-    described = [" ".join([word, *values]) for word, values in zip(("FIELDS", "SIZE", "TYPE"), kinds, strict=True)]
-    head = [f"# .PCD v0.7: {points.about}", "VERSION 0.7", *described, "COUNT" + " 1" * len(_ROW_DTYPE.descr)]
-    size = [f"WIDTH {points.count}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {points.count}", "DATA binary"]
+    kinds = list(
+        zip(
+            *((name, kind[2:], kind[1].upper()) for name, kind, *_ in _ROW_DTYPE.descr), strict=True
+        )
+    )
+    described = [
+        " ".join([word, *values])
+        for word, values in zip(("FIELDS", "SIZE", "TYPE"), kinds, strict=True)
+    ]
+    head = [
+        f"# .PCD v0.7: {points.about}",
+        "VERSION 0.7",
+        *described,
+        "COUNT" + " 1" * len(_ROW_DTYPE.descr),
+    ]
+    size = [
+        f"WIDTH {points.count}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {points.count}",
+        "DATA binary",
+    ]
     _write_rows(file, points, [*head, *size])
 
 
@@ -107,7 +138,9 @@ def _write_las(file: BinaryIO, points: PointPieces) -> None:
         for piece in points.colored():
             record = laspy.ScaleAwarePointRecord.zeros(len(piece), header=header)
             record.x, record.y, record.z = (piece[axis].astype(np.float64) for axis in "xyz")
-            record.classification = np.where(piece["label"] < _LAS_CLASSES, piece["label"], 0).astype(np.uint8)
+            record.classification = np.where(
+                piece["label"] < _LAS_CLASSES, piece["label"], 0
+            ).astype(np.uint8)
             for name, shift in (("red", 16), ("green", 8), ("blue", 0)):
                 record[name] = (piece["rgb"] >> shift & 255).astype(np.uint16) * 257
             for name in extra:
@@ -119,8 +152,15 @@ def _write_npz(file: BinaryIO, points: PointPieces) -> None:
     with zipfile.ZipFile(file, "w") as archive:
         for name in ("points", "label", "seen", "confidence"):
             is_place = name == "points"
-            dtype, columns = POINT_DTYPE["x" if is_place else name], ["x", "y", "z"] if is_place else [name]
-            header = {"descr": dtype.str, "fortran_order": False, "shape": (points.count, 3)[: 1 + is_place]}
+            dtype, columns = (
+                POINT_DTYPE["x" if is_place else name],
+                ["x", "y", "z"] if is_place else [name],
+            )
+            header = {
+                "descr": dtype.str,
+                "fortran_order": False,
+                "shape": (points.count, 3)[: 1 + is_place],
+            }
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as entry:
                 np.lib.format.write_array_header_2_0(entry, header)
                 for piece in points.pieces():
@@ -147,7 +187,10 @@ _ALL_FREE, _ALL_OCCUPIED = 0x5555, 0xAAAA  # eight equal children, which become 
 
 
 def write_octomap(
-    path: str | os.PathLike[str], cells: NDArray[np.integer], occupied: NDArray[np.bool_], cell_m: float
+    path: str | os.PathLike[str],
+    cells: NDArray[np.integer],
+    occupied: NDArray[np.bool_],
+    cell_m: float,
 ) -> None:
     """Write cells as an OctoMap binary tree.
 
@@ -165,7 +208,8 @@ def write_octomap(
     if farthest >= _MIDDLE:
         raise ArgumentError(
             "cell_m",
-            expected=f"cells within {_MIDDLE * cell_m:g} m of the origin, the extent of an OctoMap tree",
+            expected=f"cells within {_MIDDLE * cell_m:g} m of the origin, the extent of an "
+            f"OctoMap tree",
             found=f"{farthest * cell_m:.0f} m",
             advice="use larger cells, or fewer frames",
         )

@@ -57,8 +57,13 @@ class FrameBlock:
     def missing(self) -> FrameBlock:
         """Return the frames that the writer lacks."""
         has = self.writer.has
-        lacking = {name: [frame for frame in frames if not has(name, frame)] for name, frames in self.frames.items()}
-        return FrameBlock(self.sequence, self.writer, {name: frames for name, frames in lacking.items() if frames})
+        lacking = {
+            name: [frame for frame in frames if not has(name, frame)]
+            for name, frames in self.frames.items()
+        }
+        return FrameBlock(
+            self.sequence, self.writer, {name: frames for name, frames in lacking.items() if frames}
+        )
 
 
 def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[FrameBlock]:
@@ -71,19 +76,25 @@ def blocks_of(sequence: Sequence, writer: SequenceWriter, size: int) -> list[Fra
 
 
 def copy_blocks(blocks: Series[FrameBlock], run: Run, *, again: bool = False) -> tuple[int, int]:
-    """Copy the blocks of a part of a run in parallel. Existing frames are not written again, unless `again` is given.
+    """Copy the blocks of a part of a run in parallel.
+
+    Existing frames are not written again, unless `again` is given.
 
     Returns:
         The number of files that were written, and the number of existing files that were kept.
     """
     ours = run.part.take(blocks)
-    todo = [block for block in (ours if again else [block.missing() for block in ours]) if block.files]
+    todo = [
+        block for block in (ours if again else [block.missing() for block in ours]) if block.files
+    ]
     total, files = sum(block.files for block in ours), 0
     step, left = StepCounter(run.progress, total), total - sum(block.files for block in todo)
     step(left)
     if run.workers is None and run.executor is None:
         run = replace(run, workers=max(1, min(run.processes, len(todo) // _FEW)))
-    for place in {place for block in todo for place in (block.sequence.location, block.writer.location)}:
+    for place in {
+        place for block in todo for place in (block.sequence.location, block.writer.location)
+    }:
         check_shared(place, run)
     with closing(run_all(_copy, todo, run)) as copied:
         for count in copied:
@@ -102,7 +113,9 @@ def _copy(block: FrameBlock) -> int:
 
 
 def copy_documents(sequence: Sequence, writer: SequenceWriter) -> None:
-    """Copy the text files of a sequence. Equal files, from an interrupted run or another part of this run, are kept.
+    """Copy the text files of a sequence.
+
+    Equal files, from an interrupted run or another part of this run, are kept.
 
     Raises:
         ConflictError: an existing text file is different.
@@ -119,9 +132,12 @@ def copy_documents(sequence: Sequence, writer: SequenceWriter) -> None:
 
 
 def typical_rows(sequence: Sequence) -> dict[str, int]:
-    """Return the largest number of elements of a few frames by field, for `SequenceWriter.expect`. The choice of frames is deterministic.
+    """Return the largest number of elements of a few frames by field, for `SequenceWriter.expect`.
 
-    Fields with one row per point have the size of `points`. Grids and boxes are left out, because their sizes are known.
+    The choice of frames is deterministic.
+
+    Fields with one row per point have the size of `points`. Grids and boxes are left out, because
+    their sizes are known.
     """
     found: dict[str, int] = {}
     for name in sorted(sequence.fields()):
@@ -142,7 +158,11 @@ def refuse_overlap(out: str | os.PathLike[str], source: Source) -> None:
         ConflictError: one is inside the other.
     """
     place: PurePath = PurePosixPath(os.fspath(out)) if is_url(out) else Path(out).resolve()
-    origin: PurePath = PurePosixPath(source.location) if is_url(source.location) else Path(source.location).resolve()
+    origin: PurePath = (
+        PurePosixPath(source.location)
+        if is_url(source.location)
+        else Path(source.location).resolve()
+    )
     if place == origin or place.is_relative_to(origin) or origin.is_relative_to(place):
         raise ConflictError(
             out,
@@ -181,17 +201,22 @@ def unpack(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> UnpackResult:
-    """Write all sequences of `source` as published files. A packed store gives the same bytes that were packed.
+    """Write all sequences of `source` as published files.
 
-    An interrupted run leaves `<out>.part`; the same call continues with the missing files. In an object store, and in a run of several
-    parts, files are written to `out` directly. Worker processes import the main module again: in scripts, call this function under
-    `if __name__ == "__main__":`, or with `workers=1`.
+    A packed store gives the same bytes that were packed.
+
+    An interrupted run leaves `<out>.part`; the same call continues with the missing files. In an
+    object store, and in a run of several parts, files are written to `out` directly. Worker
+    processes import the main module again: in scripts, call this function under `if __name__ ==
+    "__main__":`, or with `workers=1`.
 
     Args:
         source: a packed store, or anything else that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
-        overwrite: write into an existing folder and replace files of the same names; other files are unchanged.
-        run: how the work is distributed. The default is one process per core, fewer for few frames. Progress counts files.
+        overwrite: write into an existing folder and replace files of the same names; other files
+            are unchanged.
+        run: how the work is distributed. The default is one process per core, fewer for few frames.
+            Progress counts files.
 
     Returns:
         What was written.

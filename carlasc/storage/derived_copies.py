@@ -1,7 +1,10 @@
-"""Copies of a data set with some fields or text files replaced. Unchanged files are hard links to the files of the source.
+"""Copies of a data set with some fields or text files replaced.
 
-Grids are left out, because they were made from the replaced data. A copy is written like the output of `unpack`: after an interruption, the
-same call finishes it. A mark beside the unfinished copy records its input and options, so that only the same call continues it.
+Unchanged files are hard links to the files of the source.
+
+Grids are left out, because they were made from the replaced data. A copy is written like the output
+of `unpack`: after an interruption, the same call finishes it. A mark beside the unfinished copy
+records its input and options, so that only the same call continues it.
 """
 
 from __future__ import annotations
@@ -36,11 +39,13 @@ _MOST_UNREAD = 64  # frames
 
 @dataclass
 class CopyResult(UnpackResult):
-    """Result of writing a copy: the attributes of `UnpackResult`, where `files` counts files that are not links, and these.
+    """Result of writing a copy: the attributes of `UnpackResult`, where `files` counts files that
+    are not links, and these.
 
     Attributes:
         linked: number of files that are hard links to files of the source.
-        left_out: names of grids, such as "evaluation/", and fields that are not copied, because they do not fit the replaced data.
+        left_out: names of grids, such as "evaluation/", and fields that are not copied, because
+            they do not fit the replaced data.
     """
 
     linked: int = 0
@@ -48,7 +53,8 @@ class CopyResult(UnpackResult):
 
 
 class DerivedSequence(SequenceView):
-    """A sequence without grids, in which some fields and text files are replaced, added or left out.
+    """A sequence without grids, in which some fields and text files are replaced, added or left
+    out.
 
     Attributes:
         texts: the replaced or new text files by name.
@@ -85,14 +91,21 @@ class DerivedSequence(SequenceView):
 
     def frames(self, field: str) -> NDArray[np.int64]:
         """Return the frames of a field."""
-        return self.whole.frames(field) if field in self.kept else self.made.get(field, np.empty(0, np.int64))
+        return (
+            self.whole.frames(field)
+            if field in self.kept
+            else self.made.get(field, np.empty(0, np.int64))
+        )
 
     def make(self, frame: int) -> dict[str, NDArray[Any]]:
         """Return the replaced or new fields of a frame."""
         return {}
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one field of one frame. All made fields of a frame are kept in memory until the last of them, by name, is read."""
+        """Read one field of one frame.
+
+        All made fields of a frame are kept in memory until the last of them, by name, is read.
+        """
         if field not in self.made:
             return self.whole.read(field, frame)
         if frame not in self._unread:
@@ -105,12 +118,16 @@ class DerivedSequence(SequenceView):
         return array
 
     def documents(self) -> tuple[str, ...]:
-        """Return the text files of the whole sequence, without the ones of grids, and the new text files."""
+        """Return the text files of the whole sequence, without the ones of grids, and the new text
+        files.
+        """
         return (*self.unchanged_documents(), *self.texts)
 
     def unchanged_documents(self) -> tuple[str, ...]:
         """Return the unchanged text files."""
-        return tuple(name for name in self.whole.documents() if "/" not in name and name not in self.texts)
+        return tuple(
+            name for name in self.whole.documents() if "/" not in name and name not in self.texts
+        )
 
     def read_document(self, name: str) -> bytes:
         """Return the bytes of a text file."""
@@ -137,7 +154,8 @@ class DerivedCopy:
         source: the source of the copy.
         out: the folder to write: a path, or a URL of an object store.
         overwrite: whether it replaces an existing copy.
-        mark: the file that records input and options of the unfinished copy; None in object stores, and in runs of several parts.
+        mark: the file that records input and options of the unfinished copy; None in object stores,
+            and in runs of several parts.
     """
 
     source: Source
@@ -162,15 +180,18 @@ class DerivedCopy:
         Args:
             source: the data set to copy.
             out: the folder to write: a path, or a URL of an object store.
-            made_from: the options, and a digest of other input files. An interrupted run is continued only if these are equal.
-            kind: name of the replaced data, such as "predicted labels". Only a data set with such data is overwritten.
+            made_from: the options, and a digest of other input files. An interrupted run is
+                continued only if these are equal.
+            kind: name of the replaced data, such as "predicted labels". Only a data set with such
+                data is overwritten.
             is_kind: returns whether a sequence with this metadata has such data.
-            overwrite: whether a copy at `out` is replaced; it is removed when the new copy is complete.
+            overwrite: whether a copy at `out` is replaced; it is removed when the new copy is
+                complete.
             run: how the work is distributed.
 
         Raises:
-            ConflictError: something at `out` may not be replaced, `out` lies inside `source`, or an interrupted run had another input or
-                other options.
+            ConflictError: something at `out` may not be replaced, `out` lies inside `source`, or an
+                interrupted run had another input or other options.
         """
         run.part.refuse(overwrite)
         refuse_overlap(out, source)
@@ -182,7 +203,9 @@ class DerivedCopy:
         return cls(source, out, overwrite, mark)
 
     def writer(self, path: str) -> SequenceWriter | None:
-        """Return the writer for data derived from a sequence, kept until the copy is complete; None if they cannot be kept."""
+        """Return the writer for data derived from a sequence, kept until the copy is complete; None
+        if they cannot be kept.
+        """
         return None if self.mark is None else FolderSink(unfinished(Path(self.out))).sequence(path)
 
     def write(self, sequences: Mapping[str, DerivedSequence], run: Run) -> CopyResult:
@@ -208,7 +231,8 @@ class DerivedCopy:
             if self.overwrite:
                 remove(replaced(Path(self.out)))
         return CopyResult(
-            **vars(copied) | {"kept": copied.kept - linked, "elapsed_s": time.perf_counter() - began},
+            **vars(copied)
+            | {"kept": copied.kept - linked, "elapsed_s": time.perf_counter() - began},
             linked=linked,
             left_out=sorted({name for one in sequences.values() for name in one.left_out}),
         )
@@ -225,7 +249,9 @@ def _clear(out: Path, kind: str, is_kind: Callable[[Metadata], bool], *, overwri
     if not overwrite:
         advice = "choose another name, or give `overwrite=True`"
         raise ConflictError(out, expected="a new path", found="a folder or a file", advice=advice)
-    if not out.is_dir() or not all(is_kind(one.metadata) for one in FolderSource(out).sequences().values()):
+    if not out.is_dir() or not all(
+        is_kind(one.metadata) for one in FolderSource(out).sequences().values()
+    ):
         expected, advice = f"a data set with {kind} to overwrite", "choose another name"
         raise ConflictError(out, expected=expected, found="something else", advice=advice)
     remove(replaced(out))
@@ -236,21 +262,26 @@ def _mark(folder: Path, settings: Mapping[str, Any], *, overwrite: bool) -> Path
     """Write input and options of an unfinished copy into a file beside it, and return that file.
 
     Raises:
-        ConflictError: the folder holds the files of an interrupted run with another input or other options.
+        ConflictError: the folder holds the files of an interrupted run with another input or other
+            options.
     """
     mark, data = folder.with_name(f"{folder.name}.json"), to_json(dict(settings))
     before = mark.read_bytes() if mark.is_file() else None
     if folder.exists() and before != data:
         if before is None or not overwrite:
             expected = "the files of an interrupted run with the same input and options"
-            raise ConflictError(folder, expected=expected, found="files of another run", advice="remove the folder")
+            raise ConflictError(
+                folder, expected=expected, found="files of another run", advice="remove the folder"
+            )
         shutil.rmtree(folder)
     write_atomic(mark, data)
     return mark
 
 
 def _link_files(sequence: DerivedSequence, folder: Path) -> int:
-    """Make hard links to the unchanged files of a local folder, if the file system supports it, and return the number of new frame files."""
+    """Make hard links to the unchanged files of a local folder, if the file system supports it, and
+    return the number of new frame files.
+    """
     whole, count = sequence.whole, 0
     if not isinstance(whole, FolderSequence):
         return 0
@@ -266,7 +297,9 @@ def _link_files(sequence: DerivedSequence, folder: Path) -> int:
             count += "/" in path  # text files are not counted
         except FileExistsError:  # from an interrupted run, or from another part of this run
             continue
-        except OSError:  # the file system has no hard links, or is another one: the remaining files are copied
+        except (
+            OSError
+        ):  # the file system has no hard links, or is another one: the remaining files are copied
             break
     sync_all(folders)
     return count

@@ -15,7 +15,14 @@ from typing import TypeGuard
 from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choice
 from carlasc.running.spreading import StepCounter
 from carlasc.storage.extraction import check_space, extract_zip, extracted_size
-from carlasc.storage.files import make_folder, parse_json, remove_file, remove_stale, write_json, writing
+from carlasc.storage.files import (
+    make_folder,
+    parse_json,
+    remove_file,
+    remove_stale,
+    write_json,
+    writing,
+)
 from carlasc.storage.transport.fetching import FileFetch
 
 Progress = Callable[[int, int], None]
@@ -31,7 +38,8 @@ class Archive:
 
     Attributes:
         name: file name.
-        what: "sequences" (scans, poses, coarse Cartesian grids), or grids alone: "fine", "cylindrical".
+        what: "sequences" (scans, poses, coarse Cartesian grids), or grids alone: "fine",
+            "cylindrical".
         split: "train", "val", "test"; None if it holds all splits.
         url: its URL.
         gigabytes: approximate size, GB.
@@ -47,7 +55,8 @@ class Archive:
     def folder(self) -> str:
         """Folder that it is extracted to, relative to the folder that the user chose.
 
-        Zips of grids are extracted to separate folders, because their grids have the same names as the coarse grids of the sequences.
+        Zips of grids are extracted to separate folders, because their grids have the same names as
+        the coarse grids of the sequences.
         """
         return "." if self.what == SEQUENCES else self.name.removesuffix(".zip")
 
@@ -72,7 +81,8 @@ def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
     """Return the zips of some splits, or the zip of some grids.
 
     Args:
-        splits: "train", "val", "test" or "all", upper or lower case. Empty for grids, because their zips hold all splits.
+        splits: "train", "val", "test" or "all", upper or lower case. Empty for grids, because their
+            zips hold all splits.
         what: "sequences", "fine" or "cylindrical".
 
     Raises:
@@ -83,7 +93,9 @@ def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
     known = tuple(dict.fromkeys(archive.split for archive in ARCHIVES if archive.split))
     wanted = {split.lower() for split in splits}
     if unknown := wanted - {*known, "all"}:
-        raise ArgumentError("split", expected=f"one of {', '.join(known)}, all", found=", ".join(sorted(unknown)))
+        raise ArgumentError(
+            "split", expected=f"one of {', '.join(known)}, all", found=", ".join(sorted(unknown))
+        )
     if what != SEQUENCES and wanted - {"all"}:
         raise ArgumentError(
             "split",
@@ -96,7 +108,8 @@ def choose_archives(splits: Iterable[str], what: str) -> tuple[Archive, ...]:
     return tuple(
         archive
         for archive in ARCHIVES
-        if archive.what == what and (archive.split is None or archive.split in wanted or "all" in wanted)
+        if archive.what == what
+        and (archive.split is None or archive.split in wanted or "all" in wanted)
     )
 
 
@@ -145,19 +158,24 @@ def download(
     connections: int = 4,
     progress: Progress | None = None,
 ) -> DownloadResult:
-    """Fetch the published zips of one or more splits, or of the other grids. The same call continues after an interruption.
+    """Fetch the published zips of one or more splits, or of the other grids.
+
+    The same call continues after an interruption.
 
     A zip need not be extracted: `carlasc.open` reads it in place.
 
     Args:
         out: folder that the zips are written to.
-        split: "train" (two zips), "val", "test", "all", or several of them. Empty for grids, because their zips hold all splits.
+        split: "train" (two zips), "val", "test", "all", or several of them. Empty for grids,
+            because their zips hold all splits.
         what: "sequences" (scans, poses, coarse grids), or only "fine" or "cylindrical" grids.
         extract: extract each zip into `out` (grids into a separate folder there), then remove it.
         keep: with `extract`, keep the zip too.
-        base_url: URL of a mirror: zips are fetched from `<base_url>/<name>`. None fetches from the published URLs.
+        base_url: URL of a mirror: zips are fetched from `<base_url>/<name>`. None fetches from the
+            published URLs.
         connections: number of blocks of a zip that are fetched at the same time.
-        progress: called with (bytes done, total bytes), for each zip first while fetching, then while extracting.
+        progress: called with (bytes done, total bytes), for each zip first while fetching, then
+            while extracting.
 
     Returns:
         Size and place of each zip.
@@ -168,7 +186,8 @@ def download(
         ConflictError: another file with the name of a zip exists.
         FormatError: the file on the server is not a zip, or keeps changing.
         StorageError: the disk has too little free space.
-        CarlascError: the server cannot be reached. The next call continues with the bytes fetched so far.
+        CarlascError: the server cannot be reached. The next call continues with the bytes fetched
+            so far.
     """
     began = time.perf_counter()
     if connections < 1:
@@ -187,7 +206,10 @@ def download(
         remove_stale(folder)
     done = {archive: _extracted_before(folder, archive) for archive in archives if extract}
     pending = [archive for archive in archives if done.get(archive) is None]
-    fetches = {archive: FileFetch(_url(archive, base_url), folder / archive.name, connections) for archive in pending}
+    fetches = {
+        archive: FileFetch(_url(archive, base_url), folder / archive.name, connections)
+        for archive in pending
+    }
     _check_space(folder, fetches, extract)
     results = []
     for archive in archives:
@@ -229,7 +251,9 @@ def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float)
     return path.stat().st_size - resumed
 
 
-def _extract(result: Downloaded, folder: Path, archive: Archive, keep: bool, progress: Progress | None) -> Downloaded:
+def _extract(
+    result: Downloaded, folder: Path, archive: Archive, keep: bool, progress: Progress | None
+) -> Downloaded:
     path, target = folder / archive.name, folder / archive.folder
     files = extract_zip(path, target, StepCounter(progress, extracted_size(path)))
     if not keep:  # record the extraction, otherwise the next run would fetch the zip again
@@ -258,7 +282,9 @@ def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
     size, files = values.get("size"), values.get("files")
     if not (_is_count(size) and _is_count(files)):
         found = f"{size!r} and {files!r}"
-        raise FormatError(record, expected="integers as size and files", found=found, advice="remove it")
+        raise FormatError(
+            record, expected="integers as size and files", found=found, advice="remove it"
+        )
     return Downloaded(archive.name, None, size, 0, str(folder / archive.folder), files)
 
 
@@ -271,7 +297,9 @@ def _record(folder: Path, archive: Archive) -> Path:
 
 
 def _check_space(folder: Path, fetches: dict[Archive, FileFetch], extract: bool) -> None:
-    """Check the free space for all bytes to fetch, and for extracted files, which take about the same space."""
+    """Check the free space for all bytes to fetch, and for extracted files, which take about the
+    same space.
+    """
     needed = 0
     for archive, fetch in fetches.items():
         needed += 0 if (folder / archive.name).exists() else fetch.remaining()

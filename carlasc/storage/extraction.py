@@ -1,4 +1,7 @@
-"""Extracting a zip into a folder. No file is written outside of it, each file is written whole, and an interrupted run can continue."""
+"""Extracting a zip into a folder.
+
+No file is written outside of it, each file is written whole, and an interrupted run can continue.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,8 @@ def extract_zip(archive: Path, folder: Path, advance: Callable[[int], None]) -> 
         The number of files in the zip.
 
     Raises:
-        FormatError: the zip is damaged, or a name in it leads out of the folder. In the latter case nothing is extracted.
+        FormatError: the zip is damaged, or a name in it leads out of the folder. In the latter case
+            nothing is extracted.
         ConflictError: another file of the same name exists.
         StorageError: the disk is full, or the folder cannot be written to.
     """
@@ -40,15 +44,27 @@ def extract_zip(archive: Path, folder: Path, advance: Callable[[int], None]) -> 
             members = [member for member in opened.infolist() if not member.is_dir()]
         for member in members:
             check_member(member, archive)
-        check_ratio(sum(member.file_size for member in members), archive.stat().st_size, str(archive))
+        check_ratio(
+            sum(member.file_size for member in members), archive.stat().st_size, str(archive)
+        )
         missing = [member for member in members if not _extracted(member, folder / member.filename)]
-        check_space(folder, sum(member.file_size for member in missing), f"to extract {archive.name}")
-        advance(sum(member.file_size for member in members) - sum(member.file_size for member in missing))
+        check_space(
+            folder, sum(member.file_size for member in missing), f"to extract {archive.name}"
+        )
+        advance(
+            sum(member.file_size for member in members)
+            - sum(member.file_size for member in missing)
+        )
         for parent in {(folder / member.filename).parent for member in missing}:
             remove_stale(parent)
         for start in range(0, len(missing), _TOGETHER):
             batch = missing[start : start + _TOGETHER]
-            write_many({folder / member.filename: partial(_copy, opened, member, archive) for member in batch})
+            write_many(
+                {
+                    folder / member.filename: partial(_copy, opened, member, archive)
+                    for member in batch
+                }
+            )
             advance(sum(member.file_size for member in batch))
     return len(members)
 
@@ -72,7 +88,9 @@ def _reading(archive: Path) -> AbstractContextManager[None]:
     return reading(archive, "a whole zip", "fetch it again")
 
 
-def _copy(opened: zipfile.ZipFile, member: zipfile.ZipInfo, archive: Path, target: BinaryIO) -> None:
+def _copy(
+    opened: zipfile.ZipFile, member: zipfile.ZipInfo, archive: Path, target: BinaryIO
+) -> None:
     with _reading(archive):
         source = opened.open(member)
     with source:
@@ -93,16 +111,24 @@ def _read(source: IO[bytes], archive: Path) -> bytes:
 
 
 def check_member(member: zipfile.ZipInfo, archive: Path) -> None:
-    """Check that a member is not a link, has a name inside the folder, and has a plausible compression ratio.
+    """Check that a member is not a link, has a name inside the folder, and has a plausible
+    compression ratio.
 
     Raises:
         FormatError: it is not; the message names the member.
     """
     name = member.orig_filename  # as written in the zip: zipfile corrects some names by itself
     if leads_outside(name):
-        raise FormatError(archive, expected="names inside the folder", found=repr(name), advice="nothing was extracted")
+        raise FormatError(
+            archive,
+            expected="names inside the folder",
+            found=repr(name),
+            advice="nothing was extracted",
+        )
     if stat.S_ISLNK(member.external_attr >> 16):
-        raise FormatError(archive, expected="files", found=f"the link {name!r}", advice="nothing was extracted")
+        raise FormatError(
+            archive, expected="files", found=f"the link {name!r}", advice="nothing was extracted"
+        )
     check_ratio(member.file_size, member.compress_size, f"{archive}: {name}")
 
 

@@ -16,7 +16,8 @@ from carlasc.storage.arrays import ArrayFormat, npz_bytes, open_npz
 VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "u1"), ("votes", "<u2")])
 WIDE_VOTES_DTYPE = np.dtype([("voxel", "<i4"), ("label", "<u2"), ("votes", "<u2")])
 VELOCITY_DTYPE = np.dtype([("voxel", "<i4"), ("velocity", "<f2", (3,))])
-# Level 6, the default of zlib, takes 6 times as long and saves only 3 %: voxels are sorted, so repeats are always four bytes apart.
+# Level 6, the default of zlib, takes 6 times as long and saves only 3 %: voxels are sorted, so
+# repeats are always four bytes apart.
 _VOTES_LEVELS = {"voxel": 1, "label": 4, "votes": 4}
 _MOST_CLASSES = 256
 
@@ -42,17 +43,20 @@ Kind = Literal[
 class Field:
     """The content of one file per frame.
 
-    Stores, packing, converting, `info` and `validate` use `per` and `kind` to decide how to handle a field, not its name.
+    Stores, packing, converting, `info` and `validate` use `per` and `kind` to decide how to handle
+    a field, not its name.
 
     Attributes:
         name: name of the field in a Source and a Sink.
         folder: folder under `<coordinates>/`.
         suffix: ending of the file name.
-        per: unit of one row of the file: "point" (one row per point of the scan), "voxel" (one value per voxel of the grid),
-            "vote" (one row per vote), "moving voxel" (one row per moving voxel), "box" (one row per box), or "scan" (one file per scan).
-        kind: kind of the values: "position" and "vector" (these change with the axes), "class" (ids of the class table), "pairs" (class
-            and probability), "id" (unsigned integers, such as actors), "value" (any number), "count", "probability" (0 to 1),
-            "flags" (bits), "votes", "velocities" and "boxes" (tables), "picture" (the bytes of a file).
+        per: unit of one row of the file: "point" (one row per point of the scan), "voxel" (one
+            value per voxel of the grid), "vote" (one row per vote), "moving voxel" (one row per
+            moving voxel), "box" (one row per box), or "scan" (one file per scan).
+        kind: kind of the values: "position" and "vector" (these change with the axes), "class" (ids
+            of the class table), "pairs" (class and probability), "id" (unsigned integers, such as
+            actors), "value" (any number), "count", "probability" (0 to 1), "flags" (bits), "votes",
+            "velocities" and "boxes" (tables), "picture" (the bytes of a file).
         dtype: NumPy type on disk, little-endian; "" for tables, whose columns have different types.
         names: name of each value of a row.
         unit: unit of the values.
@@ -80,13 +84,16 @@ class Field:
         """Return the path of a frame's file under `<coordinates>/`."""
         return f"{self.folder}/{frame:06d}{self.suffix}"
 
-    def decode(self, data: bytes | memoryview, where: str, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
+    def decode(
+        self, data: bytes | memoryview, where: str, shape: tuple[int, ...] | None = None
+    ) -> NDArray[Any]:
         """Return the content of a file as an array, without a copy if the type allows it.
 
         Args:
             data: the whole file.
             where: the file, for errors.
-            shape: shape of the grid, for fields of a grid; None computes the number of rows from the size of the file.
+            shape: shape of the grid, for fields of a grid; None computes the number of rows from
+                the size of the file.
 
         Raises:
             FormatError: the size of the file does not match.
@@ -102,7 +109,10 @@ class Field:
         if shape is not None and size != self.size_of(shape):
             expected = f"{self.size_of(shape)} bytes ({' x '.join(map(str, shape))} {dtype.name})"
             raise FormatError(
-                where, expected=expected, found=str(size), advice="the file is cut short, or belongs to another grid"
+                where,
+                expected=expected,
+                found=str(size),
+                advice="the file is cut short, or belongs to another grid",
             )
         if size % row:
             raise FormatError(
@@ -117,8 +127,14 @@ class Field:
         return array if self.columns is None else array.reshape(-1, self.columns)
 
     def size_of(self, shape: tuple[int, ...] | None) -> int | None:
-        """Return the size in bytes of a file of a grid with this shape; None if it is known only after reading."""
-        return None if shape is None or self.per != "voxel" else np.dtype(self.dtype).itemsize * math.prod(shape)
+        """Return the size in bytes of a file of a grid with this shape; None if it is known only
+        after reading.
+        """
+        return (
+            None
+            if shape is None or self.per != "voxel"
+            else np.dtype(self.dtype).itemsize * math.prod(shape)
+        )
 
     def encode(self, array: NDArray[Any], where: str) -> bytes | memoryview:
         """Return the bytes of a frame's file.
@@ -143,7 +159,9 @@ class Field:
         """
         if self.kind == "votes":
             if array.dtype not in (VOTES_DTYPE, WIDE_VOTES_DTYPE):
-                raise FormatError(where, expected="a table of voxel, label and votes", found=str(array.dtype))
+                raise FormatError(
+                    where, expected="a table of voxel, label and votes", found=str(array.dtype)
+                )
             return
         if self.kind == "velocities":
             if array.dtype != VELOCITY_DTYPE or array.ndim != 1:
@@ -152,7 +170,9 @@ class Field:
             return
         if self.kind == "boxes":
             if array.dtype != BOXES_DTYPE or array.ndim != 1:
-                raise FormatError(where, expected="a table of boxes", found=f"{array.dtype}, shape {array.shape}")
+                raise FormatError(
+                    where, expected="a table of boxes", found=f"{array.dtype}, shape {array.shape}"
+                )
             return
         if self.columns is not None and (array.ndim != 2 or array.shape[1] != self.columns):
             raise FormatError(where, expected=f"shape (N, {self.columns})", found=f"{array.shape}")
@@ -160,10 +180,14 @@ class Field:
         if dtype.kind == "u" and array.dtype.kind not in "ub":
             raise FormatError(where, expected="unsigned integers", found=str(array.dtype))
         if dtype.kind == "u" and array.dtype.itemsize > dtype.itemsize:
-            raise FormatError(where, expected=f"{dtype.name} or a smaller type", found=str(array.dtype))
+            raise FormatError(
+                where, expected=f"{dtype.name} or a smaller type", found=str(array.dtype)
+            )
 
 
-def _decode_votes(data: bytes | memoryview, where: str, shape: tuple[int, ...] | None) -> NDArray[Any]:
+def _decode_votes(
+    data: bytes | memoryview, where: str, shape: tuple[int, ...] | None
+) -> NDArray[Any]:
     # The largest possible table: one row per voxel and class.
     most = None if shape is None else _MOST_CLASSES * math.prod(shape)
     with open_npz(data, where) as archive:
@@ -175,19 +199,28 @@ def _decode_votes(data: bytes | memoryview, where: str, shape: tuple[int, ...] |
     return votes
 
 
-def _decode_velocities(data: bytes | memoryview, where: str, shape: tuple[int, ...] | None) -> NDArray[Any]:
+def _decode_velocities(
+    data: bytes | memoryview, where: str, shape: tuple[int, ...] | None
+) -> NDArray[Any]:
     with open_npz(data, where) as archive:
-        voxels = archive.read("voxel", ArrayFormat(("<i4",), (None,), None if shape is None else math.prod(shape)))
+        voxels = archive.read(
+            "voxel", ArrayFormat(("<i4",), (None,), None if shape is None else math.prod(shape))
+        )
         table = np.empty(len(voxels), VELOCITY_DTYPE)
-        table["voxel"], table["velocity"] = voxels, archive.read("velocity", ArrayFormat(("<f2",), (len(voxels), 3)))
+        table["voxel"], table["velocity"] = (
+            voxels,
+            archive.read("velocity", ArrayFormat(("<f2",), (len(voxels), 3))),
+        )
     return table
 
 
 def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
-    """Check a field `<grid>/velocity`, (M,) rows of voxel and velocity, of a grid of `count` voxels.
+    """Check a field `<grid>/velocity`, (M,) rows of voxel and velocity, of a grid of `count`
+    voxels.
 
     Raises:
-        FormatError: a voxel is not in the grid, or a velocity is not finite; the message names `where`.
+        FormatError: a voxel is not in the grid, or a velocity is not finite; the message names
+            `where`.
     """
     voxel = velocity["voxel"]
     if len(outside := voxel[(voxel < 0) | (voxel >= count)]):
@@ -196,8 +229,13 @@ def check_velocity(velocity: NDArray[Any], count: int, where: str) -> None:
         raise FormatError(where, expected="finite velocities", found="NaN or infinity")
 
 
-def dense_velocity(velocity: NDArray[Any], size: tuple[int, ...], where: str) -> NDArray[np.float32]:
-    """Return (X, Y, Z, 3) float32 m/s of a grid of shape `size`; zero where nothing moves. Checks `velocity` with `check_velocity`."""
+def dense_velocity(
+    velocity: NDArray[Any], size: tuple[int, ...], where: str
+) -> NDArray[np.float32]:
+    """Return (X, Y, Z, 3) float32 m/s of a grid of shape `size`; zero where nothing moves.
+
+    Checks `velocity` with `check_velocity`.
+    """
     check_velocity(velocity, math.prod(size), where)
     dense = np.zeros((*size, 3), np.float32)
     dense.reshape(-1, 3)[velocity["voxel"]] = velocity["velocity"]

@@ -1,7 +1,8 @@
 """Atomic and durable writing of files, JSON, and checks of file names.
 
-File systems keep written data in memory for up to half a minute, and may store a file name before the content. After a power failure, a
-renamed file can therefore be empty. `os.fsync` waits until a file, or the names in a folder, are on the disk.
+File systems keep written data in memory for up to half a minute, and may store a file name before
+the content. After a power failure, a renamed file can therefore be empty. `os.fsync` waits until a
+file, or the names in a folder, are on the disk.
 """
 
 from __future__ import annotations
@@ -26,15 +27,18 @@ Content = bytes | memoryview | Callable[[BinaryIO], object]
 
 
 def write_atomic(path: Path, content: Content, *, create: bool = False) -> bool:
-    """Write a file under a temporary name in its folder, then rename it. It exists whole or not at all, also after Ctrl-C or on a full disk.
+    """Write a file under a temporary name in its folder, then rename it.
 
-    The same holds after a power failure, and the file is on the disk when this function returns, unless this is turned off
-    (see `is_durable`).
+    It exists whole or not at all, also after Ctrl-C or on a full disk.
+
+    The same holds after a power failure, and the file is on the disk when this function returns,
+    unless this is turned off (see `is_durable`).
 
     Args:
         path: the file; missing parent folders are created.
         content: the bytes, or a function that writes them to an open file.
-        create: write only if the file does not exist. If several processes do this at once, exactly one succeeds.
+        create: write only if the file does not exist. If several processes do this at once, exactly
+            one succeeds.
 
     Returns:
         False if `create` is given and the file exists; True otherwise.
@@ -47,8 +51,10 @@ def write_atomic(path: Path, content: Content, *, create: bool = False) -> bool:
         _write(temporary, content)
         sync_all([temporary])
         if create:
-            os.link(temporary, path)  # unlike a rename, a link fails if another process has written the file
-            temporary.unlink()  # before the folder is synced, otherwise a power failure could restore it
+            # unlike a rename, a link fails if another process has written the file
+            os.link(temporary, path)
+            # before the folder is synced, otherwise a power failure could restore it
+            temporary.unlink()
         else:
             temporary.replace(path)
         sync_all([path.parent])
@@ -64,13 +70,17 @@ def write_atomic(path: Path, content: Content, *, create: bool = False) -> bool:
 
 
 def write_many(*groups: Mapping[Path, Content]) -> None:
-    """Write several files as `write_atomic` does. They are synced together, which is faster than one after the other.
+    """Write several files as `write_atomic` does.
+
+    They are synced together, which is faster than one after the other.
 
     Args:
-        groups: files by path, in order. After a power failure, files of a group exist only if all files of the earlier groups do.
+        groups: files by path, in order. After a power failure, files of a group exist only if all
+            files of the earlier groups do.
 
     Raises:
-        StorageError: a file cannot be written. Files of its group that were not renamed yet, and of later groups, do not exist.
+        StorageError: a file cannot be written. Files of its group that were not renamed yet, and of
+            later groups, do not exist.
     """
     temporaries = {path: _temporary(path) for group in groups for path in group}
     path = Path()
@@ -91,7 +101,10 @@ def write_many(*groups: Mapping[Path, Content]) -> None:
 
 
 def _temporary(path: Path) -> Path:
-    """Return the temporary name of a file. It is determined before the file is created, so that it is removed whenever a signal interrupts."""
+    """Return the temporary name of a file.
+
+    It is determined before the file is created, so that it is removed whenever a signal interrupts.
+    """
     return path.with_name(f".{path.name}.{_HOST}-{os.getpid()}.{os.urandom(4).hex()}{_PART}")
 
 
@@ -118,7 +131,10 @@ def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
 
 
 def has_content(path: str | os.PathLike[str]) -> bool:
-    """Whether a file exists and is not empty. A power failure can leave empty files, if they were not written durably."""
+    """Whether a file exists and is not empty.
+
+    A power failure can leave empty files, if they were not written durably.
+    """
     try:
         return os.stat(path).st_size > 0
     except (FileNotFoundError, NotADirectoryError):
@@ -126,7 +142,8 @@ def has_content(path: str | os.PathLike[str]) -> bool:
 
 
 def write_output(path: Path, content: Content) -> None:
-    """Write a single output file as `write_atomic` does, and remove the temporary files of killed runs.
+    """Write a single output file as `write_atomic` does, and remove the temporary files of killed
+    runs.
 
     To write many files into a folder, call `remove_stale` once instead.
     """
@@ -135,19 +152,29 @@ def write_output(path: Path, content: Content) -> None:
 
 
 def remove_stale(folder: Path, *, deep: bool = False) -> None:
-    """Remove the temporary files of killed processes in a folder and its direct subfolders; with `deep`, also one level deeper.
+    """Remove the temporary files of killed processes in a folder and its direct subfolders; with
+    `deep`, also one level deeper.
 
-    A temporary file is stale if the process on this machine that wrote it has ended, or if it is a day old.
+    A temporary file is stale if the process on this machine that wrote it has ended, or if it is a
+    day old.
     """
-    found = folder.rglob(f".*{_PART}") if deep else (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}"))
+    found = (
+        folder.rglob(f".*{_PART}")
+        if deep
+        else (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}"))
+    )
     _remove_ended(found)
 
 
 def _remove_ended(parts: Iterable[Path]) -> None:
     for part in list(parts):
-        match = re.search(rf"\.{re.escape(_HOST)}-([0-9]{{1,9}})\.[^.]+{re.escape(_PART)}$", part.name)
+        match = re.search(
+            rf"\.{re.escape(_HOST)}-([0-9]{{1,9}})\.[^.]+{re.escape(_PART)}$", part.name
+        )
         try:
-            if (match and not _is_alive(int(match[1]))) or time.time() - part.stat().st_mtime > 86400:
+            if (
+                match and not _is_alive(int(match[1]))
+            ) or time.time() - part.stat().st_mtime > 86400:
                 part.unlink()
         except FileNotFoundError:
             continue  # its writer finished meanwhile
@@ -212,26 +239,36 @@ def parse_json_value(data: bytes | str, where: str) -> Any:
     """Read any JSON value.
 
     Raises:
-        FormatError: `where` (the file) is not JSON, is nested too deeply, or has text that is not valid Unicode.
+        FormatError: `where` (the file) is not JSON, is nested too deeply, or has text that is not
+            valid Unicode.
     """
     try:
         value = json.loads(data)
         if _HALF.search(data if isinstance(data, bytes) else data.encode()):
-            json.dumps(
-                value, ensure_ascii=False
-            ).encode()  # ValueError: a lone surrogate, which could not be written again
+            # ValueError: a lone surrogate, which could not be written again
+            json.dumps(value, ensure_ascii=False).encode()
         return value
-    except (ValueError, RecursionError, TypeError) as error:  # ValueError: also a number of more than 4,300 digits
-        raise FormatError(where, expected="JSON", found="something else", advice=describe(error)) from error
+    except (
+        ValueError,
+        RecursionError,
+        TypeError,
+    ) as error:  # ValueError: also a number of more than 4,300 digits
+        raise FormatError(
+            where, expected="JSON", found="something else", advice=describe(error)
+        ) from error
 
 
 def leads_outside(name: str) -> bool:
     """Whether a relative path with "/" may lead out of its folder, on any operating system.
 
-    Names come from untrusted archives and stores. Unsafe are absolute names, and names with a drive ("C:"), a part "..", a backslash, a zero
-    byte or a lone surrogate.
+    Names come from untrusted archives and stores. Unsafe are absolute names, and names with a drive
+    ("C:"), a part "..", a backslash, a zero byte or a lone surrogate.
     """
-    return name.startswith("/") or ".." in name.split("/") or bool(_DRIVE.match(name) or _NEVER.search(name))
+    return (
+        name.startswith("/")
+        or ".." in name.split("/")
+        or bool(_DRIVE.match(name) or _NEVER.search(name))
+    )
 
 
 _DRIVE = re.compile(r"[A-Za-z]:")
@@ -242,11 +279,19 @@ _FREE_SPACE = "free some space and run again"
 _HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())
 
 DURABLE = "CARLASC_DURABLE"
-"""The environment variable that turns it off. Worker processes have the environment of the process that starts them."""
+"""The environment variable that turns it off.
+
+Worker processes have the environment of the process that starts them.
+"""
 
 _VALUES = {"yes": True, "1": True, "true": True, "no": False, "0": False, "false": False}
 _SIDE_BY_SIDE = 16  # files that are synced at the same time
-_UNSUPPORTED = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}  # errors of file systems that cannot sync a folder
+# errors of file systems that cannot sync a folder
+_UNSUPPORTED = {
+    errno.EINVAL,
+    errno.ENOTSUP,
+    errno.ENOSYS,
+}
 
 
 def is_durable() -> bool:
@@ -273,9 +318,12 @@ def sync_file(descriptor: int) -> None:
 
 
 def sync_all(paths: Iterable[Path]) -> None:
-    """Wait until files, and the names in folders, are on the disk, each once. Nothing is done unless `is_durable`.
+    """Wait until files, and the names in folders, are on the disk, each once.
 
-    They are synced in parallel: the file system then writes its journal once for several files, which takes a quarter of the time.
+    Nothing is done unless `is_durable`.
+
+    They are synced in parallel: the file system then writes its journal once for several files,
+    which takes a quarter of the time.
 
     Raises:
         OSError: the disk is full or fails; names the path.
@@ -292,18 +340,27 @@ def sync_all(paths: Iterable[Path]) -> None:
 
 
 def sync_tree(path: Path) -> None:
-    """Wait until a file, or a folder with everything below it, is on the disk. Nothing is done unless `is_durable`."""
+    """Wait until a file, or a folder with everything below it, is on the disk.
+
+    Nothing is done unless `is_durable`.
+    """
     sync_all([path, *path.rglob("*")] if path.is_dir() else [path])
 
 
 def rename(old: Path, new: Path) -> None:
-    """Rename a synced file or folder, and wait until the new name is on the disk. An existing file is replaced."""
+    """Rename a synced file or folder, and wait until the new name is on the disk.
+
+    An existing file is replaced.
+    """
     old.replace(new)
     sync_all([new.parent])
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file, if it exists, and wait until the removal is on the disk. For files that the next run reads."""
+    """Remove a file, if it exists, and wait until the removal is on the disk.
+
+    For files that the next run reads.
+    """
     try:
         path.unlink()
     except FileNotFoundError:
@@ -312,7 +369,9 @@ def remove_file(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents, unless they exist, and wait until the new names are on the disk."""
+    """Create a folder and its parents, unless they exist, and wait until the new names are on the
+    disk.
+    """
     if folder.is_dir():
         return
     new = [place for place in (folder, *folder.parents) if not place.exists()]
@@ -338,7 +397,8 @@ if sys.platform == "darwin":
 
     def _sync(descriptor: int) -> None:
         try:
-            fcntl.fcntl(descriptor, fcntl.F_FULLFSYNC)  # fsync alone leaves the bytes in the drive's own memory
+            # fsync alone leaves the bytes in the drive's own memory
+            fcntl.fcntl(descriptor, fcntl.F_FULLFSYNC)
         except OSError:  # not supported by the file system, such as a network share
             os.fsync(descriptor)
 
@@ -354,5 +414,7 @@ def unfinished(path: Path) -> Path:
 
 
 def replaced(path: Path) -> Path:
-    """Return the path of an older store until the new one is complete: `<name>.replaced`, a name that users are unlikely to choose."""
+    """Return the path of an older store until the new one is complete: `<name>.replaced`, a name
+    that users are unlikely to choose.
+    """
     return path.with_name(f"{path.name}.replaced")

@@ -1,4 +1,7 @@
-"""Reading and writing the published layout in a folder, one file per frame and field. The writer supports object stores too."""
+"""Reading and writing the published layout in a folder, one file per frame and field.
+
+The writer supports object stores too.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +24,17 @@ from carlasc.storage.sinks import SequenceWriter, Sink
 from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 from carlasc.storage.transport.trees import LocalTree
 
-_ZIP_END, _ZIP_END_BYTES = b"PK\x05\x06", 22  # end record of a zip without a comment, as NumPy writes it
+# end record of a zip without a comment, as NumPy writes it
+_ZIP_END, _ZIP_END_BYTES = (
+    b"PK\x05\x06",
+    22,
+)
 
 
 class FolderSource(PublishedSource):
-    """A folder of any level: the root with its splits, a split, a sequence, or one `<coordinates>` folder."""
+    """A folder of any level: the root with its splits, a split, a sequence, or one `<coordinates>`
+    folder.
+    """
 
     def __init__(self, source: str | os.PathLike[str]) -> None:
         """Keep the path of the folder. It is listed when its sequences are first used.
@@ -37,7 +46,9 @@ class FolderSource(PublishedSource):
         super().__init__(LocalTree(source))
         if not self.folder.is_dir():
             raise MissingDataError(
-                self.folder, expected="a folder", found="a file" if self.folder.exists() else "nothing"
+                self.folder,
+                expected="a folder",
+                found="a file" if self.folder.exists() else "nothing",
             )
 
     def sequences(self) -> Mapping[str, Sequence]:
@@ -84,7 +95,10 @@ class FolderSink(Sink):
         self.location = self.target.location
 
     def sequence(self, path: str) -> FolderWriter:
-        """Start or continue the folder of a sequence. Temporary files of a killed run are removed."""
+        """Start or continue the folder of a sequence.
+
+        Temporary files of a killed run are removed.
+        """
         target = self.target.below(path)
         if isinstance(target, LocalTarget):
             remove_stale(target.folder)
@@ -114,7 +128,10 @@ class FolderWriter(SequenceWriter):
         self._whole = WholeFiles(self.location) if isinstance(self.target, LocalTarget) else None
 
     def has(self, field: str, frame: int) -> bool:
-        """Whether the file exists and has a valid size. In an object store, its folder is listed once."""
+        """Whether the file exists and has a valid size.
+
+        In an object store, its folder is listed once.
+        """
         if self._whole is not None:
             return self._whole.has(field, frame)
         return self.target.tree.is_file(layout.field_named(field).file(frame))
@@ -128,12 +145,17 @@ class FolderWriter(SequenceWriter):
         self.target.put(*self._file(field, frame, array))
 
     def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
-        """Write the files of several frames in parallel. The last file of each frame is written after the other files of that frame."""
+        """Write the files of several frames in parallel.
+
+        The last file of each frame is written after the other files of that frame.
+        """
         files = [
-            [self._file(field, frame, array) for field, array in fields.items()] for frame, fields in frames.items()
+            [self._file(field, frame, array) for field, array in fields.items()]
+            for frame, fields in frames.items()
         ]
         self.target.put_many(
-            dict(file for parts in files for file in parts[:-1]), dict(parts[-1] for parts in files if parts)
+            dict(file for parts in files for file in parts[:-1]),
+            dict(parts[-1] for parts in files if parts),
         )
 
     def _file(self, field: str, frame: int, array: NDArray[Any]) -> tuple[str, bytes | memoryview]:
@@ -148,11 +170,16 @@ class FolderWriter(SequenceWriter):
         return entry.decode(self.target.tree.read(path), self.target.tree.where(path))
 
     def remove_grid(self, grid: str) -> None:
-        """Remove the report and the frames of a grid, then its params.json. Other files in its folder are kept."""
+        """Remove the report and the frames of a grid, then its params.json.
+
+        Other files in its folder are kept.
+        """
         self.target.remove(layout.report_file(grid))
         parts = [layout.field_named(f"{grid}/{part}").suffix for part in layout.GRID_FIELDS]
         names = [
-            name for name in self.target.tree.entries(grid) if any(layout.frame_of(name, s) is not None for s in parts)
+            name
+            for name in self.target.tree.entries(grid)
+            if any(layout.frame_of(name, s) is not None for s in parts)
         ]
         self.target.remove_many(f"{grid}/{name}" for name in names)
         self.target.remove(layout.params_file(grid))
@@ -170,15 +197,20 @@ class FolderWriter(SequenceWriter):
         return self.target.put(name, data, create=True)
 
     def read_document(self, name: str) -> bytes | None:
-        """Return the bytes of a text file; None if it does not exist, or is empty after a power failure."""
+        """Return the bytes of a text file; None if it does not exist, or is empty after a power
+        failure.
+        """
         return self.target.read(name) or None
 
 
 class WholeFiles:
-    """Checks by their sizes whether the files of frames in one `<coordinates>` folder are whole. It can be pickled.
+    """Checks by their sizes whether the files of frames in one `<coordinates>` folder are whole.
 
-    A power failure can leave empty and short files, unless they were written durably (see `carlasc.storage.files`). Checking the size costs
-    little more than checking that the file exists.
+    It can be pickled.
+
+    A power failure can leave empty and short files, unless they were written durably (see
+    `carlasc.storage.files`). Checking the size costs little more than checking that the file
+    exists.
 
     Args:
         folder: the folder.
@@ -186,14 +218,16 @@ class WholeFiles:
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
-        self._cells: dict[str, int] = {}  # number of voxels of each grid whose params.json has been read
+        # number of voxels of each grid whose params.json has been read
+        self._cells: dict[str, int] = {}
 
     def has(self, name: str, frame: int) -> bool:
         """Whether the file of a field exists and has a valid size.
 
-        The size of a grid follows from params.json. Fields with one row per point must have as many rows as `points`, and `points` as many as
-        `labels`. Tables of votes or velocities must have the end record of a zip. A file of boxes may be empty, and so may a scan whose points
-        and labels are both empty.
+        The size of a grid follows from params.json. Fields with one row per point must have as many
+        rows as `points`, and `points` as many as `labels`. Tables of votes or velocities must have
+        the end record of a zip. A file of boxes may be empty, and so may a scan whose points and
+        labels are both empty.
         """
         entry = layout.field_named(name)
         size = self._size(entry, frame)

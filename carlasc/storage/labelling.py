@@ -1,4 +1,7 @@
-"""`label`: a copy of a data set with predicted labels. Other files are hard links to the files of the source."""
+"""`label`: a copy of a data set with predicted labels.
+
+Other files are hard links to the files of the source.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,12 @@ from carlasc.core.tables import remaps_between
 from carlasc.errors import ArgumentError, FormatError
 from carlasc.running.spreading import Run
 from carlasc.storage import layout
-from carlasc.storage.derived_copies import CopyResult, DerivedCopy, DerivedSequence, sequences_with_scans
+from carlasc.storage.derived_copies import (
+    CopyResult,
+    DerivedCopy,
+    DerivedSequence,
+    sequences_with_scans,
+)
 from carlasc.storage.metadata import PREDICTED
 from carlasc.storage.opening import as_source
 from carlasc.storage.predictions import (
@@ -63,21 +71,27 @@ def label(
 ) -> LabelResult:
     """Write a copy of a data set with the predicted labels of a network. The source is not changed.
 
-    Unchanged files are hard links to the files of the source, if both are folders of one file system. Do not edit files of either in place;
-    carlasc never does. Grids are left out, because they were made from other labels. An interrupted run leaves `<out>.part`; the same
-    call finishes it.
+    Unchanged files are hard links to the files of the source, if both are folders of one file
+    system. Do not edit files of either in place; carlasc never does. Grids are left out, because
+    they were made from other labels. An interrupted run leaves `<out>.part`; the same call finishes
+    it.
 
     Args:
         source: the data set with the points: anything that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
-        predictions: a folder with one file per frame, in folders such as `<split>/<sequence>/` or `<sequence>/predictions/`; for a single
-            sequence they may be in the folder itself. `.label`: uint32 per point, of which the lower 16 bits are the class. `.npy`: (N,)
-            class ids, or (N, C) probabilities by class id. `.npz`: `labels` (N,), `probabilities` (N, C), or both.
-        classes: class table of the predictions: its name, a JSON file, or a table; None for the table of each sequence. Labels are converted
-            to the table of the sequence if a remap exists; otherwise the result has the table of the predictions.
+        predictions: a folder with one file per frame, in folders such as `<split>/<sequence>/` or
+            `<sequence>/predictions/`; for a single sequence they may be in the folder itself.
+            `.label`: uint32 per point, of which the lower 16 bits are the class. `.npy`: (N,) class
+            ids, or (N, C) probabilities by class id. `.npz`: `labels` (N,), `probabilities` (N, C),
+            or both.
+        classes: class table of the predictions: its name, a JSON file, or a table; None for the
+            table of each sequence. Labels are converted to the table of the sequence if a remap
+            exists; otherwise the result has the table of the predictions.
         logits: whether (N, C) arrays hold scores before the softmax.
-        by: name of the network in carlasc.json, reports and cards; None for the name of the folder `predictions`.
-        frames: range of frames that get labels; each needs a file. Other frames are copied without labels.
+        by: name of the network in carlasc.json, reports and cards; None for the name of the folder
+            `predictions`.
+        frames: range of frames that get labels; each needs a file. Other frames are copied without
+            labels.
         overwrite: replace a data set at `out` that `label` has made.
         run: how the work is distributed. Progress counts files.
 
@@ -86,7 +100,8 @@ def label(
 
     Raises:
         ArgumentError: `classes` or `by` is not valid.
-        ConflictError: something exists at `out`, `out` lies inside `source`, or an interrupted run had other predictions.
+        ConflictError: something exists at `out`, `out` lies inside `source`, or an interrupted run
+            had other predictions.
         MissingDataError: a frame has no predictions.
         FormatError: a file of predictions does not fit its scan or its class table.
         StorageError: the files cannot be written.
@@ -99,9 +114,15 @@ def label(
     scans = sequences_with_scans(source)
     files = find_predictions(root, scans, chosen)
     sequences = {
-        path: _LabelledSequence(one, files[path], reader_for(table, one, logits), by) for path, one in scans.items()
+        path: _LabelledSequence(one, files[path], reader_for(table, one, logits), by)
+        for path, one in scans.items()
     }
-    settings = {"frames": str(chosen), "logits": logits, "by": by, "predictions": _digest(files.values())}
+    settings = {
+        "frames": str(chosen),
+        "logits": logits,
+        "by": by,
+        "predictions": _digest(files.values()),
+    }
     settings |= {"classes": None if table is None else table.to_dict()}
     copy = begin_labelled(source, out, settings, overwrite, run)
     copied = copy.write(sequences, run)
@@ -125,7 +146,11 @@ def checked_name(by: str) -> str:
 
 
 def begin_labelled(
-    source: Source, out: str | os.PathLike[str], settings: Mapping[str, Any], overwrite: bool, run: Run
+    source: Source,
+    out: str | os.PathLike[str],
+    settings: Mapping[str, Any],
+    overwrite: bool,
+    run: Run,
 ) -> DerivedCopy:
     """Begin a copy with predicted labels; see `DerivedCopy.begin`."""
     return DerivedCopy.begin(
@@ -147,31 +172,50 @@ class _LabelledSequence(DerivedSequence):
         reader: reads them.
     """
 
-    def __init__(self, whole: Sequence, files: PredictedFiles, reader: PredictionReader, by: str) -> None:
+    def __init__(
+        self, whole: Sequence, files: PredictedFiles, reader: PredictionReader, by: str
+    ) -> None:
         extra = {**whole.metadata.extra, "labels": f"{PREDICTED}{by}"}
         metadata = replace(whole.metadata, classes=reader.target, extra=extra).to_json()
-        stale = {"boxes"} if reader.target != whole.metadata.classes else set()  # boxes have classes of the other table
-        first = files.path(files.frames[0]) if files.frames else None  # all files are like the first
+        # boxes have classes of the other table
+        stale = {"boxes"} if reader.target != whole.metadata.classes else set()
+        # all files are like the first
+        first = files.path(files.frames[0]) if files.frames else None
         own = _PREDICTED[: 1 + (load(first)[1] is not None)] if first else ()
         made = dict.fromkeys(own, np.array(files.frames, np.int64))
-        super().__init__(whole, {layout.METADATA: metadata}, made=made, stale={*stale, *_PREDICTED} - {*own})
+        super().__init__(
+            whole, {layout.METADATA: metadata}, made=made, stale={*stale, *_PREDICTED} - {*own}
+        )
         self.files, self.reader = files, reader
 
     def make(self, frame: int) -> dict[str, NDArray[Any]]:
         """Return the labels of a frame, and the probabilities if the files have them."""
         path = self.files.path(frame)
-        found = dict(zip(_PREDICTED, self.reader.read(path, len(self.whole.read("points", frame))), strict=True))
+        found = dict(
+            zip(
+                _PREDICTED,
+                self.reader.read(path, len(self.whole.read("points", frame))),
+                strict=True,
+            )
+        )
         if (found["probabilities"] is not None) != ("probabilities" in self.made):
             words = (
-                ("labels", "probabilities") if "probabilities" not in self.made else ("probabilities", "labels only")
+                ("labels", "probabilities")
+                if "probabilities" not in self.made
+                else ("probabilities", "labels only")
             )
             advice = "predict all frames in the same form"
-            raise FormatError(path, expected=f"{words[0]}, as in the first file", found=words[1], advice=advice)
+            raise FormatError(
+                path, expected=f"{words[0]}, as in the first file", found=words[1], advice=advice
+            )
         return {name: array for name, array in found.items() if array is not None}
 
 
 def reader_for(given: ClassTable | None, sequence: Sequence, logits: bool) -> PredictionReader:
-    """Return a reader of predictions for a sequence. It converts labels to the table of the sequence, if a remap exists."""
+    """Return a reader of predictions for a sequence.
+
+    It converts labels to the table of the sequence, if a remap exists.
+    """
     own = sequence.metadata.classes
     try:
         remaps_between(given or own, own)
@@ -185,5 +229,7 @@ def _digest(files: Iterable[PredictedFiles]) -> str:
     digest = blake2b(digest_size=16)
     for path in (one.path(frame) for one in files for frame in one.frames):
         found = path.stat()
-        digest.update(f"{path}\0{found.st_size}\0{found.st_mtime_ns}\0".encode(errors="surrogateescape"))
+        digest.update(
+            f"{path}\0{found.st_size}\0{found.st_mtime_ns}\0".encode(errors="surrogateescape")
+        )
     return digest.hexdigest()

@@ -1,8 +1,12 @@
-"""The published layout as one table: field, file name, type, shape, unit. No other module contains file names.
+"""The published layout as one table: field, file name, type, shape, unit.
 
-    <split>/<sequence>/<coordinates>/velodyne/000000.bin, ...: see the format page, `docs/format.md#layout`
+No other module contains file names.
 
-Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid>/counts`, ... for the grid in the folder `<grid>`. `poses` and `times` are in text files with one line per frame.
+    <split>/<sequence>/<coordinates>/velodyne/000000.bin, ...: see the format page,
+    `docs/format.md#layout`
+
+Field names are flat: `points`, `labels`, ... for scans, `<grid>/labels`, `<grid>/counts`, ... for
+the grid in the folder `<grid>`. `poses` and `times` are in text files with one line per frame.
 """
 
 from __future__ import annotations
@@ -30,10 +34,13 @@ METADATA = "carlasc.json"
 CAMERAS = "cameras.json"
 PARAMS = "params.json"
 REPORT = "carlasc-report.json"
-DERIVED = ".carlasc"  # folder of data derived from a sequence: not a field, never packed, safe to delete
+DERIVED = (
+    ".carlasc"  # folder of data derived from a sequence: not a field, never packed, safe to delete
+)
 
 FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
-CERTAIN = 65535  # value for a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
+# value for a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
+CERTAIN = 65535
 
 
 SCAN_FIELDS: dict[str, Field] = {
@@ -52,7 +59,8 @@ SCAN_FIELDS: dict[str, Field] = {
         Field(
             name="probabilities", folder="probabilities", suffix=".bin", per="point", kind="pairs",
             dtype="<u2", names=("class1", "share1", "class2", "share2", "class3", "share3"), unit="class, 1/65535",
-            meaning="the likeliest classes of each point, the first first: class and probability in 1/65535; 0 and 0 where there is none",
+            meaning="the likeliest classes of each point, the first first: class and probability "
+                    "in 1/65535; 0 and 0 where there is none",
             published=False,
         ),
         Field(
@@ -118,13 +126,15 @@ _GRID_FIELDS: dict[str, Field] = {
         Field(
             name="classes", folder="", suffix=".classes.npz", per="vote", kind="votes",
             dtype="", names=("voxel", "label", "votes"), unit="1/65535",
-            meaning="probability of each class of a voxel if it is occupied, in 1/65535: voxel, label, votes; only non-zero ones",
+            meaning="probability of each class of a voxel if it is occupied, in 1/65535: voxel, "
+                    "label, votes; only non-zero ones",
             published=False,
         ),
         Field(
             name="flags", folder="", suffix=".flags.bin", per="voxel", kind="flags",
             dtype="u1", names=("flags",), unit="bits",
-            meaning="what else is known of the voxel: 1 inferred, 2 contested, 4 seen now, 8 in an actor", published=False,
+            meaning="what else is known of the voxel: 1 inferred, 2 contested, 4 seen now, 8 in "
+                    "an actor", published=False,
         ),
         Field(
             name="views", folder="", suffix=".views.bin", per="voxel", kind="count",
@@ -139,7 +149,8 @@ _GRID_FIELDS: dict[str, Field] = {
         Field(
             name="velocity", folder="", suffix=".velocity.npz", per="moving voxel", kind="velocities",
             dtype="", names=("voxel", "velocity"), unit="m/s",
-            meaning="velocity of each voxel that moves: voxel (flat index), velocity; sensor frame, ego motion removed",
+            meaning="velocity of each voxel that moves: voxel (flat index), velocity; sensor "
+                    "frame, ego motion removed",
             published=False,
         ),
         Field(
@@ -151,30 +162,39 @@ _GRID_FIELDS: dict[str, Field] = {
 }  # fmt: skip
 IMAGE_FOLDERS = {
     "images": "image of a camera, as its JPEG or PNG bytes",
-    "image_labels": "class of each pixel of a camera's image, as the bytes of an 8-bit or 16-bit PNG",
+    "image_labels": "class of each pixel of a camera's image, as the bytes of an 8-bit or 16-bit "
+    "PNG",
     "image_instances": "actor of each pixel, 0 none, as the bytes of a 16-bit PNG",
-    "image_depths": "depth of each pixel along the camera's axis in 1/256 m, 0 none, as the bytes of a 16-bit PNG",
+    "image_depths": "depth of each pixel along the camera's axis in 1/256 m, 0 none, as the bytes "
+    "of a 16-bit PNG",
 }
-"""Folders with one subfolder per camera, and their content. The field of images/front/000000.jpg is `images.front.jpg`."""
+"""Folders with one subfolder per camera, and their content.
+
+The field of images/front/000000.jpg is `images.front.jpg`.
+"""
 IMAGE_SUFFIXES = ("jpg", "png")
 GRID_FIELDS = tuple(_GRID_FIELDS)
 ACTOR_FIELDS = ("instance", "velocity")  # fields that `carlasc regrid --keep-actors` adds to a grid
+# fields that `carlasc regrid --keep-evidence` adds to a grid
 EVIDENCE_FIELDS = (
     "occupied",
     "classes",
     "flags",
     "views",
-)  # fields that `carlasc regrid --keep-evidence` adds to a grid
+)
 LINE_FIELDS = ("poses", "times")
 
 
 def identity_of(path: str) -> tuple[str | None, str, Coordinates]:
     """Return the split, the name and the coordinates of a sequence from its path.
 
-    The path is that of the `<coordinates>` folder, absolute or relative; leading parts may be missing. If the last part is not a
-    name of coordinates, it is the name of the sequence, and the coordinates are Cartesian.
+    The path is that of the `<coordinates>` folder, absolute or relative; leading parts may be
+    missing. If the last part is not a name of coordinates, it is the name of the sequence, and the
+    coordinates are Cartesian.
     """
-    parts = [part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("/", ".")]
+    parts = [
+        part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("/", ".")
+    ]
     coordinates = parts.pop() if parts and parts[-1] in COORDINATES else "cartesian"
     name = parts.pop() if parts else ""
     split = next((split for split in SPLITS if parts and parts[-1].lower() == split.lower()), None)
@@ -208,7 +228,11 @@ def field_named(name: str) -> Field:
 
 def point_fields() -> tuple[str, ...]:
     """Return the names of the fields with one row per point, except `points`."""
-    return tuple(name for name, field in SCAN_FIELDS.items() if field.per == "point" and field.kind != "position")
+    return tuple(
+        name
+        for name, field in SCAN_FIELDS.items()
+        if field.per == "point" and field.kind != "position"
+    )
 
 
 def scan_folders() -> frozenset[str]:
@@ -222,7 +246,10 @@ def params_file(grid: str) -> str:
 
 
 def derived(name: str, digest: str) -> str:
-    """Return the path of a file derived from a sequence, such as its tracks. `digest` identifies its input and settings."""
+    """Return the path of a file derived from a sequence, such as its tracks.
+
+    `digest` identifies its input and settings.
+    """
     return f"{DERIVED}/{name}-{digest[:16]}.npz"
 
 
@@ -232,24 +259,31 @@ def report_file(grid: str) -> str:
 
 
 def grid_folder(spec: GridSpec) -> str:
-    """Return the name of a grid's folder: `evaluation` for the published grid of its coordinates; otherwise it contains the size."""
+    """Return the name of a grid's folder: `evaluation` for the published grid of its coordinates;
+    otherwise it contains the size.
+    """
     return (
-        EVALUATION if spec == GridSpec.published(spec.coordinates) else f"{EVALUATION}_{'x'.join(map(str, spec.size))}"
+        EVALUATION
+        if spec == GridSpec.published(spec.coordinates)
+        else f"{EVALUATION}_{'x'.join(map(str, spec.size))}"
     )
 
 
 def frame_of(file_name: str, suffix: str) -> int | None:
-    """Return the frame number of a file name such as `000012.label`; None if it is not the name of a frame with that suffix."""
+    """Return the frame number of a file name such as `000012.label`; None if it is not the name of
+    a frame with that suffix.
+    """
     if not file_name.endswith(suffix):
         return None
     stem = file_name[: len(file_name) - len(suffix)]
-    return (
-        int(stem) if 6 <= len(stem) <= 18 and stem.isascii() and stem.isdigit() else None
-    )  # 18 digits fit into an int64
+    # 18 digits fit into an int64
+    return int(stem) if 6 <= len(stem) <= 18 and stem.isascii() and stem.isdigit() else None
 
 
 def encode_poses(poses: NDArray[np.float64]) -> bytes:
-    """Return the text of poses.txt for (F, 4, 4) transforms: the first three rows of each, row-major, '%.18e'."""
+    """Return the text of poses.txt for (F, 4, 4) transforms: the first three rows of each,
+    row-major, '%.18e'.
+    """
     return _encode_lines(poses[:, :3, :].reshape(-1, 12))
 
 
@@ -280,17 +314,23 @@ def decode_times(data: bytes, where: str) -> NDArray[np.float64]:
 
 
 def _encode_lines(rows: NDArray[np.float64]) -> bytes:
-    return "".join(" ".join(f"{value:.18e}" for value in row) + "\n" for row in rows.tolist()).encode()
+    return "".join(
+        " ".join(f"{value:.18e}" for value in row) + "\n" for row in rows.tolist()
+    ).encode()
 
 
 def _decode_lines(data: bytes, columns: int, where: str) -> NDArray[np.float64]:
     try:
-        rows = [list(map(float, line.split())) for line in data.decode().splitlines() if line.strip()]
+        rows = [
+            list(map(float, line.split())) for line in data.decode().splitlines() if line.strip()
+        ]
     except (UnicodeDecodeError, ValueError) as error:
         raise FormatError(
             where, expected=f"{columns} numbers per line", found="something else", advice=str(error)
         ) from error
     for number, row in enumerate(rows, 1):
         if len(row) != columns:
-            raise FormatError(where, expected=f"{columns} numbers per line", found=f"{len(row)} in line {number}")
+            raise FormatError(
+                where, expected=f"{columns} numbers per line", found=f"{len(row)} in line {number}"
+            )
     return np.array(rows, np.float64).reshape(-1, columns)

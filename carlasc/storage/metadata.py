@@ -1,4 +1,7 @@
-"""The content of carlasc.json, and the version of the files that carlasc adds. See `docs/format.md#carlasc-json`."""
+"""The content of carlasc.json, and the version of the files that carlasc adds.
+
+See `docs/format.md#carlasc-json`.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,14 @@ from carlasc.errors import FormatError
 from carlasc.storage.files import parse_json, to_json
 
 FORMAT = 2
-"""Version of carlasc.json. Version 1 had no key `format`, and `frame` ("carlasc" or "kitti") where version 2 has `axes`."""
+"""Version of carlasc.json.
+
+Version 1 had no key `format`, and `frame` ("carlasc" or "kitti") where version 2 has `axes`.
+"""
 
 PREDICTED = "predicted by "
-"""Prefix of the key `labels` of carlasc.json for predicted labels; the name of the network follows."""
+"""Prefix of the key `labels` of carlasc.json for predicted labels; the name of the network follows.
+"""
 _AXES: dict[str, Axes] = {"carlasc": "left", "kitti": "right"}  # by the `frame` of version 1
 
 
@@ -25,10 +32,12 @@ class Metadata:
     """The content of carlasc.json. The defaults apply if the file does not exist.
 
     Attributes:
-        axes: "left" (left-handed, y to the right: CarlaSC, CARLA) or "right" (right-handed, y to the left: SemanticKITTI, ROS).
+        axes: "left" (left-handed, y to the right: CarlaSC, CARLA) or "right" (right-handed, y to
+            the left: SemanticKITTI, ROS).
         classes: class table of the labels.
         sensor: description of the sensor.
-        min_range_m: points nearer than this are left out of grids (the roof of the ego vehicle), metres.
+        min_range_m: points nearer than this are left out of grids (the roof of the ego vehicle),
+            metres.
         max_range_m: points farther than this are left out of grids, metres.
         source: data that the sequence was made from.
         extra: other keys, unchanged.
@@ -44,7 +53,10 @@ class Metadata:
 
     @property
     def has_rays(self) -> bool:
-        """Whether points have rays from a known sensor position. Without rays, there is no free space."""
+        """Whether points have rays from a known sensor position.
+
+        Without rays, there is no free space.
+        """
         return self.extra.get("rays") is not False
 
     @property
@@ -58,14 +70,21 @@ class Metadata:
         """Read carlasc.json, of this version or an older one; `where` is the file named in errors.
 
         Raises:
-            FormatError: it is not a JSON object, is of a newer version, or has unknown axes or an unknown or damaged class table.
+            FormatError: it is not a JSON object, is of a newer version, or has unknown axes or an
+                unknown or damaged class table.
         """
         values = parse_json(data, where)
         check_format(values.pop("format", 1), where)
-        ranges: dict[str, Any] = {name: values.pop(name, None) for name in ("min_range_m", "max_range_m")}
+        ranges: dict[str, Any] = {
+            name: values.pop(name, None) for name in ("min_range_m", "max_range_m")
+        }
         for name, value in ranges.items():
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or value < 0):
-                raise FormatError(where, expected=f"a number of metres in {name}", found=repr(value))
+            if value is not None and (
+                isinstance(value, bool) or not isinstance(value, int | float) or value < 0
+            ):
+                raise FormatError(
+                    where, expected=f"a number of metres in {name}", found=repr(value)
+                )
         return cls(
             _read_axes(values, where),
             table_from_json(values.pop("classes", CARLA.name), where),
@@ -76,11 +95,24 @@ class Metadata:
         )
 
     def to_json(self) -> bytes:
-        """Return the bytes of carlasc.json. A class table that is not built into carlasc is written in full."""
-        values: dict[str, Any] = {"format": FORMAT, "axes": self.axes, "classes": table_to_json(self.classes)}
-        values |= {"sensor": self.sensor, "min_range_m": self.min_range_m, "max_range_m": self.max_range_m}
+        """Return the bytes of carlasc.json.
+
+        A class table that is not built into carlasc is written in full.
+        """
+        values: dict[str, Any] = {
+            "format": FORMAT,
+            "axes": self.axes,
+            "classes": table_to_json(self.classes),
+        }
+        values |= {
+            "sensor": self.sensor,
+            "min_range_m": self.min_range_m,
+            "max_range_m": self.max_range_m,
+        }
         values |= {"source": self.source}
-        return to_json({key: value for key, value in values.items() if value is not None} | dict(self.extra))
+        return to_json(
+            {key: value for key, value in values.items() if value is not None} | dict(self.extra)
+        )
 
 
 def check_format(version: object, where: str) -> None:
@@ -93,7 +125,10 @@ def check_format(version: object, where: str) -> None:
         raise FormatError(where, expected="an integer above 0 in format", found=repr(version))
     if version > FORMAT:
         raise FormatError(
-            where, expected=f"format {FORMAT} or older", found=f"format {version}", advice="upgrade carlasc to read it"
+            where,
+            expected=f"format {FORMAT} or older",
+            found=f"format {version}",
+            advice="upgrade carlasc to read it",
         )
 
 
@@ -103,7 +138,9 @@ def _read_axes(values: dict[str, Any], where: str) -> Axes:
     if frame is not None and frame not in _AXES:
         raise FormatError(where, expected=f"{' or '.join(_AXES)} in frame", found=repr(frame))
     if axes is not None and axes not in get_args(Axes):
-        raise FormatError(where, expected=f"{' or '.join(get_args(Axes))} in axes", found=repr(axes))
+        raise FormatError(
+            where, expected=f"{' or '.join(get_args(Axes))} in axes", found=repr(axes)
+        )
     meant: Axes | None = None if frame is None else _AXES[frame]
     if axes is not None and meant is not None and axes != meant:
         raise FormatError(where, expected=f"the axes {meant}, as frame {frame} says", found=axes)

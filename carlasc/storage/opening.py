@@ -33,15 +33,21 @@ _SIGNATURE = 8  # number of leading bytes that identify the kind of file
 
 
 def open(
-    path: str | os.PathLike[str], *, cache: str | os.PathLike[str] | Cache | None = None, **storage_options: Any
+    path: str | os.PathLike[str],
+    *,
+    cache: str | os.PathLike[str] | Cache | None = None,
+    **storage_options: Any,
 ) -> Source:
     """Open a store of sequences. Its kind is determined from its content, not from its suffix.
 
     Args:
-        path: a folder of the published layout (the data set, a split, a sequence, one `<coordinates>` folder), a zip of such a folder (read
-            in place), a packed store (zarr, HDF5, Parquet), or the URL of any of these (http, s3, and all other protocols of fsspec).
-        cache: a local folder, or a `carlasc.Cache`, for the files of a packed zarr store or a folder at a URL. Each file is fetched
-            once for all processes. It is not used for local stores. None: no cache.
+        path: a folder of the published layout (the data set, a split, a sequence, one
+            `<coordinates>` folder), a zip of such a folder (read in place), a packed store (zarr,
+            HDF5, Parquet), or the URL of any of these (http, s3, and all other protocols of
+            fsspec).
+        cache: a local folder, or a `carlasc.Cache`, for the files of a packed zarr store or a
+            folder at a URL. Each file is fetched once for all processes. It is not used for local
+            stores. None: no cache.
         **storage_options: options of fsspec for the URL, such as `anon=True` or `endpoint_url=...`.
 
     Returns:
@@ -51,7 +57,8 @@ def open(
         MissingDataError: nothing exists at the path.
         ArgumentError: `cache` is given for a remote store that is a single file, or for tables.
         FormatError: the content is none of these, or is damaged.
-        DependencyError: a package is missing; the message names the extra of carlasc that installs it.
+        DependencyError: a package is missing; the message names the extra of carlasc that installs
+            it.
     """
     text = os.fspath(path)
     if is_url(text):
@@ -64,7 +71,10 @@ def open(
     if local.is_file():
         return _open_file(LocalTree(local.parent), local.name)
     raise MissingDataError(
-        local, expected="a folder, a zip or a packed store", found="nothing", advice="check the path"
+        local,
+        expected="a folder, a zip or a packed store",
+        found="nothing",
+        advice="check the path",
     )
 
 
@@ -81,18 +91,27 @@ def as_source(source: str | os.PathLike[str] | Source) -> Source:
 
 
 def open_sink(
-    path: str | os.PathLike[str] | Target, options: PackOptions | None, overwrite: bool, **storage_options: Any
+    path: str | os.PathLike[str] | Target,
+    options: PackOptions | None,
+    overwrite: bool,
+    **storage_options: Any,
 ) -> PackedSink | ZarrSink:
-    """Start a packed store. The suffix determines its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`. None as `options` takes the defaults.
+    """Start a packed store.
+
+    The suffix determines its kind: `.zarr`, `.h5` or `.hdf5`, `.parquet`. None as `options` takes
+    the defaults.
 
     Raises:
-        ArgumentError: the suffix is another one, the store lacks an option, or `path` is a URL and the store can be written locally only.
+        ArgumentError: the suffix is another one, the store lacks an option, or `path` is a URL and
+            the store can be written locally only.
         ConflictError: the path already exists, and `overwrite` is not given.
         DependencyError: a package is missing.
     """
     kind = PurePosixPath(path.location if isinstance(path, Target) else path).suffix
     if kind not in PACKED:
-        raise ArgumentError(path, expected="a store ending in .zarr, .h5 or .parquet", found=kind or "no suffix")
+        raise ArgumentError(
+            path, expected="a store ending in .zarr, .h5 or .parquet", found=kind or "no suffix"
+        )
     if kind == ".zarr":
         from carlasc.storage.zarr.zarr_sink import ZarrSink
 
@@ -123,7 +142,8 @@ def as_sink(
     """Return a Sink unchanged; otherwise start a store at a path or a URL.
 
     Args:
-        out: a folder of the published layout, or a packed store, whose name ends in .zarr, .h5, .hdf5 or .parquet; a path or a URL.
+        out: a folder of the published layout, or a packed store, whose name ends in .zarr, .h5,
+            .hdf5 or .parquet; a path or a URL.
         overwrite: replace an existing packed store.
         part: the part of the run that writes to the store.
         **storage_options: options of fsspec for a URL.
@@ -137,7 +157,9 @@ def as_sink(
         return out
     suffix = PurePosixPath(out.location if isinstance(out, Target) else out).suffix
     if part.count > 1 and suffix in PACKED[1:]:
-        raise ArgumentError("part", expected="a folder or a .zarr store as output of several parts", found=str(out))
+        raise ArgumentError(
+            "part", expected="a folder or a .zarr store as output of several parts", found=str(out)
+        )
     if suffix in PACKED:
         return open_sink(out, None, overwrite, **storage_options)
     return FolderSink(out, **storage_options)
@@ -214,4 +236,6 @@ def _open_file(tree: Tree, name: str) -> Source:
             found="a file inside a packed store",
             advice="give the folder of the store",
         )
-    raise FormatError(where, expected="a folder, a zip, or a packed store", found="a file that is none of these")
+    raise FormatError(
+        where, expected="a folder, a zip, or a packed store", found="a file that is none of these"
+    )

@@ -47,11 +47,13 @@ class PackResult:
 
     Attributes:
         out: the store: a path, or a URL.
-        is_finished: whether the store can be opened; if not, other parts of the run are missing, and sizes are not known yet.
+        is_finished: whether the store can be opened; if not, other parts of the run are missing,
+            and sizes are not known yet.
         sequences: paths of the sequences in it.
         frames: number of frames of all sequences.
         published_bytes: bytes of the published files, per field ("documents": the text files).
-        stored_bytes: bytes in the store, per field ("documents": the text files, "index": everything else).
+        stored_bytes: bytes in the store, per field ("documents": the text files, "index":
+            everything else).
         left_out: files that are not part of the layout and were not packed: "<sequence>: <file>".
         elapsed_s: duration, seconds.
     """
@@ -80,27 +82,35 @@ def pack(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> PackResult:
-    """Pack all sequences of `source` into one store. Packing is lossless, unless `lossy_mm` is given.
+    """Pack all sequences of `source` into one store.
 
-    An interrupted run leaves a store that cannot be opened: a `.zarr` at `out`, others at `<out>.part`. The same call finishes it:
-    zarr continues with the missing blocks of frames, Parquet after the last finished sequence, HDF5 starts again. Worker processes
-    import the main module again: in scripts, call this function under `if __name__ == "__main__":`, or with `workers=1`.
+    Packing is lossless, unless `lossy_mm` is given.
+
+    An interrupted run leaves a store that cannot be opened: a `.zarr` at `out`, others at
+    `<out>.part`. The same call finishes it: zarr continues with the missing blocks of frames,
+    Parquet after the last finished sequence, HDF5 starts again. Worker processes import the main
+    module again: in scripts, call this function under `if __name__ == "__main__":`, or with
+    `workers=1`.
 
     Args:
         source: what to pack: anything that `carlasc.open` takes, or a source.
-        out: the store to write, a path or (.zarr) a URL of an object store. The suffix, `.zarr`, `.h5` or `.parquet`, determines its kind.
+        out: the store to write, a path or (.zarr) a URL of an object store. The suffix, `.zarr`,
+            `.h5` or `.parquet`, determines its kind.
         small: compress points with PCodec (zarr only): smaller, but fewer programs can read it.
-        lossy_mm: quantise points to this many millimetres, which the store records. None keeps every bit.
+        lossy_mm: quantise points to this many millimetres, which the store records. None keeps
+            every bit.
         overwrite: replace an existing store at `out`.
-        run: how the work is distributed. A `.zarr` is packed in blocks of frames: by worker processes (default: one per core, fewer for few
-            blocks), by an executor, or in parts; the last part to finish completes the store. Other stores have one writer: `workers` is
+        run: how the work is distributed. A `.zarr` is packed in blocks of frames: by worker
+            processes (default: one per core, fewer for few blocks), by an executor, or in parts;
+            the last part to finish completes the store. Other stores have one writer: `workers` is
             the number of threads that read ahead of it. Progress counts files.
 
     Returns:
         The packed sequences, with the bytes before and after.
 
     Raises:
-        ArgumentError: `out` has another suffix, or an option is not supported by this kind of store.
+        ArgumentError: `out` has another suffix, or an option is not supported by this kind of
+            store.
         ConflictError: something exists at `out`, or `out` lies inside `source`.
         DependencyError: the package for this kind of store is not installed.
         FormatError, MissingDataError: a file of the source is damaged or missing.
@@ -139,11 +149,15 @@ def _refuse_several(out: object, run: Run) -> None:
     """Raise ArgumentError if several processes would write a store that supports one writer only."""
     for name, wanted in (("executor", run.executor is not None), ("part", run.part.count > 1)):
         if wanted:
-            raise ArgumentError(name, expected="a .zarr store, which several processes can write", found=str(out))
+            raise ArgumentError(
+                name, expected="a .zarr store, which several processes can write", found=str(out)
+            )
 
 
 def _pack_blocks(sequences: Mapping[str, Sequence], sink: ZarrSink, run: Run) -> bool:
-    """Pack the blocks of one part of the run, in any number of processes, and return whether the store is finished."""
+    """Pack the blocks of one part of the run, in any number of processes, and return whether the
+    store is finished.
+    """
     if sink.is_finished and run.part.count == 1:
         raise ConflictError(
             sink.location,
@@ -188,7 +202,9 @@ def _append(
     sequences: Mapping[str, Sequence], sink: PackedSink, progress: Progress | None, threads: int
 ) -> dict[str, int]:
     """Pack sequences one after the other, and return their published bytes by field."""
-    files = sum(len(sequence.frames(name)) for sequence in sequences.values() for name in sequence.fields())
+    files = sum(
+        len(sequence.frames(name)) for sequence in sequences.values() for name in sequence.fields()
+    )
     step = StepCounter(progress, files)
     published: Counter[str] = Counter()
     for path, sequence in sequences.items():
@@ -207,13 +223,19 @@ def _append_sequence(
     step: Callable[[int], None],
     threads: int,
 ) -> None:
-    """Copy a sequence field by field and add up its published bytes. `writer` is None if the sequence is already packed."""
+    """Copy a sequence field by field and add up its published bytes.
+
+    `writer` is None if the sequence is already packed.
+    """
     documents = {name: sequence.read_document(name) for name in sequence.documents()}
     published["documents"] += sum(map(len, documents.values()))
     if writer is not None:
         for name, data in documents.items():
             writer.write_document(name, data)
-        writer.expect({name: sequence.frames(name).tolist() for name in sequence.fields()}, typical_rows(sequence))
+        writer.expect(
+            {name: sequence.frames(name).tolist() for name in sequence.fields()},
+            typical_rows(sequence),
+        )
     for name in sorted(sequence.fields()):
         entry, frames = layout.field_named(name), sequence.frames(name).tolist()
         for frame, array in _read_ahead(sequence, name, frames, threads):
@@ -224,7 +246,9 @@ def _append_sequence(
             step(1)
 
 
-def _read_ahead(sequence: Sequence, name: str, frames: list[int], threads: int) -> Iterator[tuple[int, NDArray[Any]]]:
+def _read_ahead(
+    sequence: Sequence, name: str, frames: list[int], threads: int
+) -> Iterator[tuple[int, NDArray[Any]]]:
     """Yield the frames of a field in order. Threads read the next blocks in advance."""
     blocks = [frames[first : first + _BLOCK] for first in range(0, len(frames), _BLOCK)]
     with ThreadPoolExecutor(threads) as pool:

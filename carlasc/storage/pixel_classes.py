@@ -1,4 +1,7 @@
-"""The class of each pixel of camera images, in the layout or in a folder of network predictions. See `docs/howto/cameras.md`."""
+"""The class of each pixel of camera images, in the layout or in a folder of network predictions.
+
+See `docs/howto/cameras.md`.
+"""
 
 from __future__ import annotations
 
@@ -39,8 +42,8 @@ class PixelClasses:
 
         Args:
             sequence: a sequence with cameras.
-            root: a folder with `<sequence>/<camera>/000000.png` or `.npy`, or `<camera>/000000.png` for a single sequence; None uses the
-                `image_labels` of the sequence.
+            root: a folder with `<sequence>/<camera>/000000.png` or `.npy`, or `<camera>/000000.png`
+                for a single sequence; None uses the `image_labels` of the sequence.
 
         Raises:
             MissingDataError: the sequence has no cameras, or no classes of pixels exist.
@@ -48,7 +51,9 @@ class PixelClasses:
         """
         cameras = cameras_of(sequence)
         if not cameras:
-            raise MissingDataError(sequence.location, expected=f"cameras in {layout.CAMERAS}", found="none")
+            raise MissingDataError(
+                sequence.location, expected=f"cameras in {layout.CAMERAS}", found="none"
+            )
         if root is None:
             found = cls(sequence, None)
             known = set(image_fields(sequence, _LAYOUT))
@@ -58,13 +63,22 @@ class PixelClasses:
         if lost := sorted(known - set(cameras)):
             expected = f"cameras of {layout.CAMERAS}: {', '.join(cameras)}"
             raise FormatError(
-                root or sequence.location, expected=expected, found=f"{lost[0]}, which has no calibration"
+                root or sequence.location,
+                expected=expected,
+                found=f"{lost[0]}, which has no calibration",
             )
         if not known:
-            expected = f"classes of pixels, such as {sequence.name}/{next(iter(cameras))}/000000.png"
-            advice = "give the folder of a network's predictions as `pixels`" if root is None else ""
+            expected = (
+                f"classes of pixels, such as {sequence.name}/{next(iter(cameras))}/000000.png"
+            )
+            advice = (
+                "give the folder of a network's predictions as `pixels`" if root is None else ""
+            )
             raise MissingDataError(
-                root or f"{sequence.location}/{_LAYOUT}", expected=expected, found="none", advice=advice
+                root or f"{sequence.location}/{_LAYOUT}",
+                expected=expected,
+                found="none",
+                advice=advice,
             )
         return found
 
@@ -90,20 +104,29 @@ class PixelClasses:
         size, is_float = (camera.height, camera.width), array.dtype.kind == "f"
         if array.ndim != 2 + is_float or array.shape[:2] != size:
             expected = f"{size} integers, or {size} floats per class, as camera {camera.name} is calibrated"
-            raise FormatError(path, expected=expected, found=f"{array.dtype.name} of shape {array.shape}")
+            raise FormatError(
+                path, expected=expected, found=f"{array.dtype.name} of shape {array.shape}"
+            )
         return array
 
     def stamps(self) -> list[tuple[str, int, int]]:
-        """Return names, sizes and modification times of the files; empty for files of the layout, which belong to the source."""
+        """Return names, sizes and modification times of the files; empty for files of the layout,
+        which belong to the source.
+        """
         paths = [path for files in (self.files or {}).values() for path in files.values()]
-        return [(str(path), found.st_size, found.st_mtime_ns) for path in sorted(paths) for found in (path.stat(),)]
+        return [
+            (str(path), found.st_size, found.st_mtime_ns)
+            for path in sorted(paths)
+            for found in (path.stat(),)
+        ]
 
 
 def _files(sequence: Sequence, root: Path) -> dict[str, dict[int, Path]]:
+    # key: whether the path contains the name of the sequence
     named: dict[bool, dict[str, dict[int, Path]]] = {
         True: {},
         False: {},
-    }  # key: whether the path contains the name of the sequence
+    }
     for folder, _, names in os.walk(root):
         paths = {
             frame: Path(folder, name)

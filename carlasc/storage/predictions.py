@@ -1,4 +1,7 @@
-"""Files of network predictions: a class per point, and optional probabilities. See `docs/commands/label.md`."""
+"""Files of network predictions: a class per point, and optional probabilities.
+
+See `docs/commands/label.md`.
+"""
 
 from __future__ import annotations
 
@@ -41,12 +44,15 @@ class PredictedFiles:
         return self.folder / f"{frame:06d}{self.suffix}"
 
 
-def find_predictions(root: Path, sequences: Mapping[str, Sequence], chosen: FrameRange) -> dict[str, PredictedFiles]:
+def find_predictions(
+    root: Path, sequences: Mapping[str, Sequence], chosen: FrameRange
+) -> dict[str, PredictedFiles]:
     """Return the files of the chosen frames of each sequence.
 
-    The files of a sequence are in the only folder whose path contains the name of the sequence, and no name of another split or other
-    coordinates. If there are several such folders, the one named labels or predictions is used. The files of a single sequence may also be
-    in `root` itself, or in a folder with one of these two names.
+    The files of a sequence are in the only folder whose path contains the name of the sequence, and
+    no name of another split or other coordinates. If there are several such folders, the one named
+    labels or predictions is used. The files of a single sequence may also be in `root` itself, or
+    in a folder with one of these two names.
 
     Raises:
         MissingDataError: a sequence has no folder, or a frame no file.
@@ -55,33 +61,59 @@ def find_predictions(root: Path, sequences: Mapping[str, Sequence], chosen: Fram
     by_folder: dict[tuple[str, ...], PredictedFiles] = {}
     for folder, _, names in os.walk(root):
         for suffix in SUFFIXES:
-            stems = [name.removesuffix(suffix) for name in names if layout.frame_of(name, suffix) is not None]
+            stems = [
+                name.removesuffix(suffix)
+                for name in names
+                if layout.frame_of(name, suffix) is not None
+            ]
             if numbers := sorted(int(stem) for stem in stems if stem == f"{int(stem):06d}"):
                 parts = Path(folder).relative_to(root).parts
                 if parts in by_folder:
                     raise FormatError(
-                        folder, expected="files with one suffix", found=f"{by_folder[parts].suffix} and {suffix}"
+                        folder,
+                        expected="files with one suffix",
+                        found=f"{by_folder[parts].suffix} and {suffix}",
                     )
                 by_folder[parts] = PredictedFiles(Path(folder), suffix, tuple(numbers))
     result, lacking = {}, []
     for path, sequence in sequences.items():
-        matching = [parts for parts in by_folder if sequence.name in parts and not _others(sequence) & set(parts)]
+        matching = [
+            parts
+            for parts in by_folder
+            if sequence.name in parts and not _others(sequence) & set(parts)
+        ]
         if not matching and len(sequences) == 1:
-            matching = [parts for parts in by_folder if parts in ((), *((leaf,) for leaf in _LEAVES))]
+            matching = [
+                parts for parts in by_folder if parts in ((), *((leaf,) for leaf in _LEAVES))
+            ]
         matching = [parts for parts in matching if parts and parts[-1] in _LEAVES] or matching
         if len(matching) != 1:
-            folders = ", ".join("/".join(parts) or "." for parts in sorted(matching or by_folder)[:_NAMED]) or "none"
+            folders = (
+                ", ".join(
+                    "/".join(parts) or "." for parts in sorted(matching or by_folder)[:_NAMED]
+                )
+                or "none"
+            )
             expected = f"one folder of files such as {sequence.name}/000000{SUFFIXES[0]} ({', '.join(SUFFIXES[1:])})"
-            raise (FormatError if matching else MissingDataError)(root, expected=expected, found=folders)
+            raise (FormatError if matching else MissingDataError)(
+                root, expected=expected, found=folders
+            )
         files = by_folder[matching[0]]
         wanted = chosen.select(sequence.frames("points"))
         if len(missing := np.setdiff1d(wanted, files.frames)):
-            first = ", ".join(f"{frame:06d}" for frame in missing[:_NAMED]) + ", ..." * (len(missing) > _NAMED)
-            lacking.append(f"none for {len(missing)} of {len(wanted)} frames of {path or sequence.name} ({first})")
+            first = ", ".join(f"{frame:06d}" for frame in missing[:_NAMED]) + ", ..." * (
+                len(missing) > _NAMED
+            )
+            lacking.append(
+                f"none for {len(missing)} of {len(wanted)} frames of {path or sequence.name} "
+                f"({first})"
+            )
         result[path] = replace(files, frames=tuple(wanted.tolist()))
     if lacking:
         advice = "predict these frames too, or leave them out with `frames`"
-        raise MissingDataError(root, expected="a file for each frame", found="; ".join(lacking), advice=advice)
+        raise MissingDataError(
+            root, expected="a file for each frame", found="; ".join(lacking), advice=advice
+        )
     return result
 
 
@@ -91,7 +123,8 @@ def _others(sequence: Sequence) -> set[str]:
 
 
 def read_table(classes: str | os.PathLike[str] | ClassTable) -> ClassTable:
-    """Return a class table, given as a table, its name, or a JSON file: a class table in the form of carlasc.json, or a carlasc.json.
+    """Return a class table, given as a table, its name, or a JSON file: a class table in the form
+    of carlasc.json, or a carlasc.json.
 
     Raises:
         ArgumentError: `classes` is neither a known name nor a file.
@@ -100,7 +133,11 @@ def read_table(classes: str | os.PathLike[str] | ClassTable) -> ClassTable:
     if isinstance(classes, ClassTable) or str(classes) in TABLES:
         return classes if isinstance(classes, ClassTable) else TABLES[str(classes)]
     if not (path := Path(classes)).is_file():
-        raise ArgumentError("classes", expected=f"one of {', '.join(TABLES)}, or a JSON file", found=repr(str(classes)))
+        raise ArgumentError(
+            "classes",
+            expected=f"one of {', '.join(TABLES)}, or a JSON file",
+            found=repr(str(classes)),
+        )
     values = parse_json(path.read_bytes(), str(path))
     return table_from_json(values.get("classes", values), str(path))
 
@@ -120,23 +157,29 @@ class PredictionReader:
     logits: bool = False
 
     def read(self, path: Path, count: int) -> tuple[NDArray[np.uint32], NDArray[np.uint16] | None]:
-        """Return the (N,) labels of the `count` points of a scan, and the (N, 6) field `probabilities`, or None if the file has none.
+        """Return the (N,) labels of the `count` points of a scan, and the (N, 6) field
+        `probabilities`, or None if the file has none.
 
         Raises:
             MissingDataError: the file does not exist.
-            FormatError: it is damaged, has not one row per point, has classes that the table lacks, or has rows that are not probabilities.
+            FormatError: it is damaged, has not one row per point, has classes that the table lacks,
+                or has rows that are not probabilities.
         """
         labels, scores = load(path)
         for rows in (labels, scores):
             if rows is not None and len(rows) != count:
-                raise FormatError(path, expected=f"{count} rows, one per point", found=str(len(rows)))
+                raise FormatError(
+                    path, expected=f"{count} rows, one per point", found=str(len(rows))
+                )
         if scores is not None:
             scores = self.probabilities(scores, str(path))
             labels = scores.argmax(axis=1) if labels is None else labels
         if labels is None:
             raise FormatError(path, expected="labels or probabilities", found="neither")
         self.check(np.unique(labels), str(path))
-        converted = to_table(labels.astype(np.uint32), self.classes, self.target, str(path)).astype(np.uint32)
+        converted = to_table(labels.astype(np.uint32), self.classes, self.target, str(path)).astype(
+            np.uint32
+        )
         return converted, None if scores is None else self.pairs(scores, str(path))
 
     def check(self, ids: NDArray[np.integer], where: str) -> None:
@@ -146,12 +189,17 @@ class PredictionReader:
             FormatError: an id is missing in the table.
         """
         if len(unknown := ids[~np.isin(ids, list(self.classes.names))]):
-            expected = f"ids of the class table {self.classes.name}, up to {max(self.classes.names)}"
+            expected = (
+                f"ids of the class table {self.classes.name}, up to {max(self.classes.names)}"
+            )
             advice = "give the class table of the predictions as `classes`"
             raise FormatError(where, expected=expected, found=str(unknown[0]), advice=advice)
 
     def probabilities(self, scores: NDArray[np.floating], where: str) -> NDArray[np.float32]:
-        """Return (N, C) scores as float32 probabilities. Raises FormatError if they are not probabilities."""
+        """Return (N, C) scores as float32 probabilities.
+
+        Raises FormatError if they are not probabilities.
+        """
         shares = scores.astype(np.float32)
         with np.errstate(invalid="ignore", over="ignore"):
             if self.logits:
@@ -163,15 +211,23 @@ class PredictionReader:
             row = int(wrong.argmax())
             found = f"a sum of {sums[row]:g} and a minimum of {shares[row].min():g} at point {row}"
             expected = f"class probabilities that are at least 0 and sum to 1 within {_TOLERANCE} per point"
-            advice = "" if self.logits else "give `logits=True` if these are scores before the softmax"
+            advice = (
+                "" if self.logits else "give `logits=True` if these are scores before the softmax"
+            )
             raise FormatError(where, expected=expected, found=found, advice=advice)
         return shares
 
     def pairs(self, shares: NDArray[np.float32], where: str) -> NDArray[np.uint16]:
-        """Return the most probable classes of each point of (N, C) probabilities, with their probabilities. Merged classes are added up."""
-        columns = np.flatnonzero(shares.max(axis=0, initial=0) * layout.CERTAIN >= 1).astype(np.uint32)
+        """Return the most probable classes of each point of (N, C) probabilities, with their
+        probabilities. Merged classes are added up.
+        """
+        columns = np.flatnonzero(shares.max(axis=0, initial=0) * layout.CERTAIN >= 1).astype(
+            np.uint32
+        )
         self.check(columns, where)
-        ids, place = np.unique(to_table(columns, self.classes, self.target, where), return_inverse=True)
+        ids, place = np.unique(
+            to_table(columns, self.classes, self.target, where), return_inverse=True
+        )
         rest = np.zeros((len(shares), len(ids)), np.float32)
         for column, target in zip(columns.tolist(), place.reshape(-1).tolist(), strict=True):
             rest[:, target] += shares[:, column]
@@ -185,7 +241,9 @@ class PredictionReader:
 
 
 def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
-    """Return the labels, (N,) integers, and the scores, (N, C) floats, of a file; None for what it does not contain."""
+    """Return the labels, (N,) integers, and the scores, (N, C) floats, of a file; None for what it
+    does not contain.
+    """
     labels: NDArray[Any] | None = None
     scores: NDArray[Any] | None = None
     if path.suffix == ".npz":
@@ -200,9 +258,15 @@ def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
         is_float = array.dtype.kind == "f"
         if array.ndim != 1 + is_float:
             found = f"{array.dtype.name} of shape {array.shape}"
-            raise FormatError(path, expected="(N,) integers, or (N, C) floats with one column per class", found=found)
+            raise FormatError(
+                path,
+                expected="(N,) integers, or (N, C) floats with one column per class",
+                found=found,
+            )
         return (None, array) if is_float else (array, None)
     data = path.read_bytes()
     if len(data) % 4:
-        raise FormatError(path, expected="a multiple of 4 bytes (uint32 per point)", found=str(len(data)))
+        raise FormatError(
+            path, expected="a multiple of 4 bytes (uint32 per point)", found=str(len(data))
+        )
     return np.frombuffer(data, "<u4") & np.uint32(0xFFFF), None

@@ -1,8 +1,11 @@
-"""The protocol for reading stores: a Source yields sequences. `carlasc.storage.sinks` has the protocol for writing.
+"""The protocol for reading stores: a Source yields sequences.
 
-A sequence is one `<split>/<sequence>/<coordinates>` of the layout. It has fields and frames; one call reads one field of one
-frame as an array. A field that the sequence does not have is not listed by `fields()`. Sources hold paths, never open handles, so
-that they can be pickled. A store that needs a handle opens it in each process on the first read.
+`carlasc.storage.sinks` has the protocol for writing.
+
+A sequence is one `<split>/<sequence>/<coordinates>` of the layout. It has fields and frames; one
+call reads one field of one frame as an array. A field that the sequence does not have is not listed
+by `fields()`. Sources hold paths, never open handles, so that they can be pickled. A store that
+needs a handle opens it in each process on the first read.
 """
 
 from __future__ import annotations
@@ -52,11 +55,12 @@ class FileTree(Protocol):
 class Sequence(ABC):
     """One `<split>/<sequence>/<coordinates>`: fields and frames, read one at a time.
 
-    It is a collection of frame numbers: `for frame in sequence`, `frame in sequence` and `len(sequence)` use `scan_frames()`.
+    It is a collection of frame numbers: `for frame in sequence`, `frame in sequence` and
+    `len(sequence)` use `scan_frames()`.
 
     Attributes:
-        path: path of the sequence in its Source, such as "Train/Town01_Light/cartesian", which is unique there; "" if the Source is
-            this one sequence.
+        path: path of the sequence in its Source, such as "Train/Town01_Light/cartesian", which is
+            unique there; "" if the Source is this one sequence.
         location: name of the sequence in errors: a folder or a URL.
         split: "Train", "Val", "Test", or None.
         name: "Town01_Light".
@@ -74,18 +78,23 @@ class Sequence(ABC):
 
     @abstractmethod
     def fields(self) -> frozenset[str]:
-        """Return the names of the fields with one file per frame (see `carlasc.storage.layout`), without poses and times."""
+        """Return the names of the fields with one file per frame (see `carlasc.storage.layout`),
+        without poses and times.
+        """
 
     @abstractmethod
     def frames(self, field: str) -> NDArray[np.int64]:
-        """Return the sorted numbers of the (N,) frames that have a field; empty if the sequence does not have the field."""
+        """Return the sorted numbers of the (N,) frames that have a field; empty if the sequence
+        does not have the field.
+        """
 
     @abstractmethod
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one field of one frame, with the values and the shape of the published file.
 
-        Labels and counts may have a narrower type than in the file. `points` is (N, 4) float32, the arrays of a grid are (X, Y, Z),
-        `boxes` is a table (`carlasc.core.BOXES_DTYPE`), and `bev` is the (B,) uint8 bytes of the picture. The array may be read-only.
+        Labels and counts may have a narrower type than in the file. `points` is (N, 4) float32, the
+        arrays of a grid are (X, Y, Z), `boxes` is a table (`carlasc.core.BOXES_DTYPE`), and `bev`
+        is the (B,) uint8 bytes of the picture. The array may be read-only.
 
         Raises:
             MissingDataError: the field or the frame does not exist.
@@ -94,7 +103,9 @@ class Sequence(ABC):
 
     @abstractmethod
     def documents(self) -> tuple[str, ...]:
-        """Return the names of the existing text files: poses.txt, times.txt, carlasc.json, and params.json and the report of each grid."""
+        """Return the names of the existing text files: poses.txt, times.txt, carlasc.json, and
+        params.json and the report of each grid.
+        """
 
     @abstractmethod
     def read_document(self, name: str) -> bytes:
@@ -105,27 +116,36 @@ class Sequence(ABC):
         """
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
-        """Read one field of several frames, each with the shape that `read` returns. Some stores read them together, which is faster."""
+        """Read one field of several frames, each with the shape that `read` returns.
+
+        Some stores read them together, which is faster.
+        """
         return [self.read(field, frame) for frame in frames]
 
     def read_xyz(
         self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
     ) -> list[NDArray[np.float32]]:
-        """Read the coordinates of the points of several frames, in the memory layout of the store. The caller must not keep the arrays.
+        """Read the coordinates of the points of several frames, in the memory layout of the store.
+
+        The caller must not keep the arrays.
 
         Args:
             frames: numbers of the frames.
-            spare: arrays that earlier calls returned and that are no longer in use. The store may overwrite them.
+            spare: arrays that earlier calls returned and that are no longer in use. The store may
+                overwrite them.
 
         Returns:
-            (N, 3) or (N, 4) float32 metres of each frame: rows, or the transpose of contiguous x, y and z.
+            (N, 3) or (N, 4) float32 metres of each frame: rows, or the transpose of contiguous x, y
+            and z.
         """
         return self.read_many("points", frames)
 
     def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
-        """Return the files that hold a field of some frames, each once, as paths in the tree of the store.
+        """Return the files that hold a field of some frames, each once, as paths in the tree of the
+        store.
 
-        A cache fetches these files before the frames are read. The list is empty if the store does not support this.
+        A cache fetches these files before the frames are read. The list is empty if the store does
+        not support this.
         """
         return []
 
@@ -134,16 +154,22 @@ class Sequence(ABC):
         """The metadata in carlasc.json, or the defaults if the file does not exist."""
         if layout.METADATA not in self.documents():
             return Metadata()
-        return Metadata.from_json(self.read_document(layout.METADATA), f"{self.location}/{layout.METADATA}")
+        return Metadata.from_json(
+            self.read_document(layout.METADATA), f"{self.location}/{layout.METADATA}"
+        )
 
     @cached_property
     def grids(self) -> Mapping[str, GridSpec]:
         """The geometry of each grid of the sequence, by the name of the grid's folder."""
         names = sorted(
-            name.removesuffix(f"/{layout.PARAMS}") for name in self.documents() if name.endswith(f"/{layout.PARAMS}")
+            name.removesuffix(f"/{layout.PARAMS}")
+            for name in self.documents()
+            if name.endswith(f"/{layout.PARAMS}")
         )
         return {
-            name: GridSpec.from_params(self.params(name), f"{self.location}/{layout.params_file(name)}")
+            name: GridSpec.from_params(
+                self.params(name), f"{self.location}/{layout.params_file(name)}"
+            )
             for name in names
         }
 
@@ -161,11 +187,12 @@ class Sequence(ABC):
     def classes_of(self, grid: str) -> ClassTable:
         """Return the class table of a grid's labels.
 
-        This is the class table of the sequence, unless the grid's params.json names or contains another one under `carlasc`, as
-        predictions do.
+        This is the class table of the sequence, unless the grid's params.json names or contains
+        another one under `carlasc`, as predictions do.
 
         Raises:
-            FormatError: carlasc.json or params.json names an unknown table, or contains an invalid one.
+            FormatError: carlasc.json or params.json names an unknown table, or contains an invalid
+                one.
         """
         table = self._record(grid).get("classes")
         if table is None:
@@ -173,16 +200,22 @@ class Sequence(ABC):
         return table_from_json(table, f"{self.location}/{layout.params_file(grid)}")
 
     def predicted_by(self, grid: str) -> str | None:
-        """Return the name of the network that predicted a grid, from its params.json; None if the grid is not a prediction."""
+        """Return the name of the network that predicted a grid, from its params.json; None if the
+        grid is not a prediction.
+        """
         name = self._record(grid).get("network")
         return None if name is None else str(name)
 
     def _record(self, grid: str) -> Mapping[str, Any]:
-        """Return the record of how a grid was made: the value of `carlasc` in params.json, or an empty mapping."""
+        """Return the record of how a grid was made: the value of `carlasc` in params.json, or an
+        empty mapping.
+        """
         record = self.params(grid).get("carlasc")
         if not isinstance(record, dict):
             return {}
-        check_format(record.get("format", 1), f"{self.location}/{layout.params_file(grid)}: carlasc")
+        check_format(
+            record.get("format", 1), f"{self.location}/{layout.params_file(grid)}: carlasc"
+        )
         return record
 
     def with_poses(self, poses: NDArray[np.float64]) -> Self:
@@ -207,12 +240,18 @@ class Sequence(ABC):
         """
         if self._given_poses is not None:
             return self._given_poses
-        return layout.decode_poses(self.read_document(layout.POSES), f"{self.location}/{layout.POSES}")
+        return layout.decode_poses(
+            self.read_document(layout.POSES), f"{self.location}/{layout.POSES}"
+        )
 
     @cached_property
     def times(self) -> NDArray[np.float64]:
-        """(F,) seconds since the first frame, one per line of times.txt; `read_time` returns that of a frame."""
-        return layout.decode_times(self.read_document(layout.TIMES), f"{self.location}/{layout.TIMES}")
+        """(F,) seconds since the first frame, one per line of times.txt; `read_time` returns that
+        of a frame.
+        """
+        return layout.decode_times(
+            self.read_document(layout.TIMES), f"{self.location}/{layout.TIMES}"
+        )
 
     def read_pose(self, frame: int) -> Transform:
         """Return (4, 4) first_T_sensor of a frame.
@@ -224,7 +263,12 @@ class Sequence(ABC):
         pose = self.poses[line]
         if not np.isfinite(pose).all():
             where = f"{self.location}/{layout.POSES}: line {line + 1}"
-            raise FormatError(where, expected="finite numbers", found="NaN or infinity", advice="copy the file again")
+            raise FormatError(
+                where,
+                expected="finite numbers",
+                found="NaN or infinity",
+                advice="copy the file again",
+            )
         return pose
 
     def read_time(self, frame: int) -> float:
@@ -234,10 +278,16 @@ class Sequence(ABC):
             FormatError: times.txt has no line for the frame, or the line is not a valid time.
         """
         line = self.line_of(frame, len(self.times), layout.TIMES)
-        return float(check_seconds(self.times[line : line + 1], f"{self.location}/{layout.TIMES}: line {line + 1}")[0])
+        return float(
+            check_seconds(
+                self.times[line : line + 1], f"{self.location}/{layout.TIMES}: line {line + 1}"
+            )[0]
+        )
 
     def times_of(self, frames: Iterable[int]) -> NDArray[np.float64]:
-        """Return (F,) seconds of frames since the first frame: those of `read_time`, or at 10 Hz without times.txt."""
+        """Return (F,) seconds of frames since the first frame: those of `read_time`, or at 10 Hz
+        without times.txt.
+        """
         if layout.TIMES in self.documents():
             return np.array([self.read_time(int(frame)) for frame in frames], np.float64)
         return np.array([frame * layout.FRAME_PERIOD_S for frame in frames], np.float64)
@@ -245,8 +295,9 @@ class Sequence(ABC):
     def line_of(self, frame: int, lines: int, document: str) -> int:
         """Return the number of the line of a text file that belongs to a frame.
 
-        Line i belongs to frame i if the file is long enough for the last frame; frames in between may be missing. If the file has
-        exactly one line per existing frame, the lines belong to the frames in their order.
+        Line i belongs to frame i if the file is long enough for the last frame; frames in between
+        may be missing. If the file has exactly one line per existing frame, the lines belong to the
+        frames in their order.
 
         Args:
             frame: number of the frame.
@@ -272,23 +323,36 @@ class Sequence(ABC):
     @cached_property
     def _frame_lines(self) -> tuple[int, dict[int, int]]:
         frames = self.scan_frames()
-        return int(frames[-1]) if len(frames) else -1, {int(frame): line for line, frame in enumerate(frames)}
+        return int(frames[-1]) if len(frames) else -1, {
+            int(frame): line for line, frame in enumerate(frames)
+        }
 
     def scan_frames(self) -> NDArray[np.int64]:
-        """Return the (N,) frames of the sequence: frames with points, or frames of any field if the sequence has no scans."""
+        """Return the (N,) frames of the sequence: frames with points, or frames of any field if the
+        sequence has no scans.
+        """
         if len(points := self.frames("points")):
             return points
         return np.unique(
-            np.concatenate([np.empty(0, np.int64), *(self.frames(field) for field in sorted(self.fields()))])
+            np.concatenate(
+                [np.empty(0, np.int64), *(self.frames(field) for field in sorted(self.fields()))]
+            )
         )
 
     def scan(self, frame: int, fields: Iterable[str] | None = None) -> Scan:
-        """Read the points of a frame and the given `fields`, if they exist. None reads boxes and all fields with one row per point."""
+        """Read the points of a frame and the given `fields`, if they exist.
+
+        None reads boxes and all fields with one row per point.
+        """
         wanted = {*layout.point_fields(), "boxes"} if fields is None else set(fields)
         boxes = self.boxes(frame) if "boxes" in wanted else None
         wanted -= {"boxes", "remission"}
         points = self.read("points", frame)
-        read = {name: self.read(name, frame) for name in layout.point_fields() if name in wanted & self.fields()}
+        read = {
+            name: self.read(name, frame)
+            for name in layout.point_fields()
+            if name in wanted & self.fields()
+        }
         own = {name: read.pop(name) for name in ("labels", "flow", "instances") if name in read}
         try:
             return Scan(points[:, :3], remission=points[:, 3], **own, others=read, boxes=boxes)
@@ -309,7 +373,9 @@ class Sequence(ABC):
         """Read a grid of a frame: its labels, and its counts if they exist."""
         if name not in self.grids:
             raise MissingDataError(
-                self.location, expected=f"the grid {name}", found=f"{', '.join(self.grids) or 'none'}"
+                self.location,
+                expected=f"the grid {name}",
+                found=f"{', '.join(self.grids) or 'none'}",
             )
         counts = self.read(f"{name}/counts", frame) if f"{name}/counts" in self.fields() else None
         labels = cast(NDArray[np.unsignedinteger], self.read(f"{name}/labels", frame))
@@ -334,25 +400,37 @@ class Sequence(ABC):
         return f"<{type(self).__name__} {self.location}>"
 
     def _repr_html_(self) -> str:
-        """Return the HTML for notebooks: the content of the sequence, and its first grid from above."""
+        """Return the HTML for notebooks: the content of the sequence, and its first grid from
+        above.
+        """
         fields = ", ".join(sorted(field for field in self.fields() if "/" not in field))
-        rows = {"frames": len(self), "fields": fields} | {f"grid {name}": spec for name, spec in self.grids.items()}
+        rows = {"frames": len(self), "fields": fields} | {
+            f"grid {name}": spec for name, spec in self.grids.items()
+        }
         picture, name = None, next(iter(self.grids), "")
         if f"{name}/labels" in self.fields():
-            first, palette = self.frames(f"{name}/labels").tolist()[0], self.classes_of(name).palette
+            first, palette = (
+                self.frames(f"{name}/labels").tolist()[0],
+                self.classes_of(name).palette,
+            )
             labels, left_handed = self.read(f"{name}/labels", first), self.metadata.axes == "left"
             picture = self.grids[name].seen_from_above(labels, palette, left_handed=left_handed)
         return describe(self.location, rows, picture)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out cached data that another process can read again faster than it can be sent."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("poses", "times", "_frame_lines")}
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if name not in ("poses", "times", "_frame_lines")
+        }
 
 
 class Source(Mapping[str, Sequence]):
     """A store that sequences are read from: a mapping from their sorted paths to sequences.
 
-    `source["Train/Town01_Light"]` finds a sequence by its path. The coordinates may be left out of the path, if they are Cartesian or the sequence has only one kind.
+    `source["Train/Town01_Light"]` finds a sequence by its path. The coordinates may be left out of
+    the path, if they are Cartesian or the sequence has only one kind.
 
     Attributes:
         location: name of the source in errors: a folder, a file or a URL.
@@ -374,7 +452,9 @@ class Source(Mapping[str, Sequence]):
         for name in (path, *(f"{path}/{coordinates}" for coordinates in layout.COORDINATES)):
             if name in sequences:
                 return sequences[name]
-        raise MissingKeyError(self.location, expected=f"the sequence {path}", found=first_names(sequences))
+        raise MissingKeyError(
+            self.location, expected=f"the sequence {path}", found=first_names(sequences)
+        )
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.sequences())

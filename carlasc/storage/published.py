@@ -1,4 +1,6 @@
-"""The published layout in any tree of files: its sequences and their fields, one file per frame and field."""
+"""The published layout in any tree of files: its sequences and their fields, one file per frame and
+field.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ _CONTAINERS = (".zip", ".zarr", ".h5", ".hdf5", ".parquet")
 
 
 class PublishedSource(Source):
-    """The published layout in a tree of files: the root with its splits, a split, a sequence, or one `<coordinates>` folder."""
+    """The published layout in a tree of files: the root with its splits, a split, a sequence, or
+    one `<coordinates>` folder.
+    """
 
     def __init__(self, tree: Tree) -> None:
         self.tree = tree
@@ -70,16 +74,30 @@ class PublishedSequence(Sequence):
 
     @cached_property
     def _listing(self) -> dict[str, field_files.Field]:
-        """The fields whose folders exist. Lists the folder of the sequence, and checks for params.json in the folder of each grid."""
+        """The fields whose folders exist.
+
+        Lists the folder of the sequence, and checks for params.json in the folder of each grid.
+        """
         folders = {name for name, is_folder in self.tree.entries(self.path).items() if is_folder}
-        fields = {name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders}
+        fields = {
+            name: field for name, field in layout.SCAN_FIELDS.items() if field.folder in folders
+        }
         for folder in sorted(folders & layout.IMAGE_FOLDERS.keys()):
-            cameras = [name for name, below in self.tree.entries(self._prefix + folder).items() if below]
-            names = [f"{folder}.{camera}.{suffix}" for camera in cameras for suffix in layout.IMAGE_SUFFIXES]
+            cameras = [
+                name for name, below in self.tree.entries(self._prefix + folder).items() if below
+            ]
+            names = [
+                f"{folder}.{camera}.{suffix}"
+                for camera in cameras
+                for suffix in layout.IMAGE_SUFFIXES
+            ]
             fields |= {name: layout.field_named(name) for name in names}
         for grid in sorted(folders - layout.scan_folders() - layout.IMAGE_FOLDERS.keys()):
             if self.tree.is_file(self._prefix + layout.params_file(grid)):
-                fields |= {f"{grid}/{part}": layout.field_named(f"{grid}/{part}") for part in layout.GRID_FIELDS}
+                fields |= {
+                    f"{grid}/{part}": layout.field_named(f"{grid}/{part}")
+                    for part in layout.GRID_FIELDS
+                }
         return fields
 
     @cached_property
@@ -97,10 +115,14 @@ class PublishedSequence(Sequence):
         return self._frames[field]
 
     def __getstate__(self) -> dict[str, Any]:
-        return super().__getstate__() | {"_frames": {name: compact(found) for name, found in self._frames.items()}}
+        return super().__getstate__() | {
+            "_frames": {name: compact(found) for name, found in self._frames.items()}
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _frames={name: expand(found) for name, found in state["_frames"].items()})
+        self.__dict__.update(
+            state, _frames={name: expand(found) for name, found in state["_frames"].items()}
+        )
 
     def _list_folder_of(self, field: str) -> None:
         if field not in self._listing:
@@ -108,16 +130,26 @@ class PublishedSequence(Sequence):
             return
         folder = self._listing[field].folder
         names = self.tree.entries(self._prefix + folder)
-        for sibling in (f for f in self._listing.values() if f.folder == folder):  # fields of a grid share a folder
-            numbers = [number for name in names if (number := layout.frame_of(name, sibling.suffix)) is not None]
+        # fields of a grid share a folder
+        for sibling in (f for f in self._listing.values() if f.folder == folder):
+            numbers = [
+                number
+                for name in names
+                if (number := layout.frame_of(name, sibling.suffix)) is not None
+            ]
             self._frames[sibling.name] = np.array(sorted(numbers), np.int64)
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
-        """Read one file. A local file is memory-mapped: the array is read-only, and its bytes are read on access."""
+        """Read one file.
+
+        A local file is memory-mapped: the array is read-only, and its bytes are read on access.
+        """
         entry = self._entry(field)
         path = self._prefix + entry.file(frame)
         shape = self._shape(entry)
-        return entry.decode(self.tree.read(path, entry.size_of(shape)), self.tree.where(path), shape)
+        return entry.decode(
+            self.tree.read(path, entry.size_of(shape)), self.tree.where(path), shape
+        )
 
     def read_many(self, field: str, frames: Iterable[int]) -> list[NDArray[Any]]:
         """Read several files; all at once from a remote tree."""
@@ -134,12 +166,18 @@ class PublishedSequence(Sequence):
     def _entry(self, field: str) -> field_files.Field:
         if field not in self._listing:
             raise MissingDataError(
-                self.location, expected=f"the field {field}", found=", ".join(sorted(self.fields())) or "none"
+                self.location,
+                expected=f"the field {field}",
+                found=", ".join(sorted(self.fields())) or "none",
             )
         return self._listing[field]
 
     def _shape(self, entry: field_files.Field) -> tuple[int, int, int] | None:
-        return self.grids[entry.folder].size if entry.per in ("voxel", "vote", "moving voxel") else None
+        return (
+            self.grids[entry.folder].size
+            if entry.per in ("voxel", "vote", "moving voxel")
+            else None
+        )
 
     def documents(self) -> tuple[str, ...]:
         """Return the names of the text files."""
@@ -147,7 +185,9 @@ class PublishedSequence(Sequence):
         names = [name for name in texts if self.tree.is_file(self._prefix + name)]
         grids = sorted({field.folder for name, field in self._listing.items() if "/" in name})
         reports = [
-            layout.report_file(grid) for grid in grids if self.tree.is_file(self._prefix + layout.report_file(grid))
+            layout.report_file(grid)
+            for grid in grids
+            if self.tree.is_file(self._prefix + layout.report_file(grid))
         ]
         return (*names, *(layout.params_file(grid) for grid in grids), *reports)
 
@@ -156,7 +196,9 @@ class PublishedSequence(Sequence):
         return bytes(self.tree.read(self._prefix + name))
 
     def unknown_files(self) -> tuple[str, ...]:
-        """Return the files and folders of the sequence that are not part of the layout; names of folders end in "/"."""
+        """Return the files and folders of the sequence that are not part of the layout; names of
+        folders end in "/".
+        """
         known = {field.folder for field in self._listing.values()}
         texts = {layout.POSES, layout.TIMES, layout.METADATA, layout.CAMERAS}
         known |= {folder.partition("/")[0] for folder in known}
@@ -169,8 +211,14 @@ class PublishedSequence(Sequence):
         for folder in sorted(known - layout.IMAGE_FOLDERS.keys()):
             suffixes = {field.suffix for field in self._listing.values() if field.folder == folder}
             for name in self.tree.entries(self._prefix + folder):
-                frames = [number for suffix in suffixes if (number := layout.frame_of(name, suffix)) is not None]
-                if not frames and not (name in (layout.PARAMS, layout.REPORT) and folder not in layout.scan_folders()):
+                frames = [
+                    number
+                    for suffix in suffixes
+                    if (number := layout.frame_of(name, suffix)) is not None
+                ]
+                if not frames and not (
+                    name in (layout.PARAMS, layout.REPORT) and folder not in layout.scan_folders()
+                ):
                     unknown.append(f"{folder}/{name}")
         return tuple(sorted(unknown))
 
@@ -181,14 +229,21 @@ def _marks() -> frozenset[str]:
 
 
 def _find_sequences(tree: Tree, path: str, depth: int) -> Iterator[str]:
-    children = {name: is_folder for name, is_folder in tree.entries(path).items() if not name.startswith(".")}
-    if _marks() & set(children) or any(name.startswith(f"{layout.EVALUATION}_") for name in children):
+    children = {
+        name: is_folder
+        for name, is_folder in tree.entries(path).items()
+        if not name.startswith(".")
+    }
+    if _marks() & set(children) or any(
+        name.startswith(f"{layout.EVALUATION}_") for name in children
+    ):
         yield path
         return
     if depth == 0:
         return
     for name, is_folder in children.items():
-        if is_folder and name != "raw":  # a capture (carlasc.captures.raw) is not a sequence of the layout
+        # a capture (carlasc.captures.raw) is not a sequence of the layout
+        if is_folder and name != "raw":
             yield from _find_sequences(tree, f"{path}/{name}" if path else name, depth - 1)
 
 

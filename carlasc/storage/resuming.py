@@ -1,7 +1,8 @@
 """How a run continues the output of an earlier run, and protects other data.
 
-A grid's params.json holds the five published keys and, under `carlasc`, a record of how the grid was made. A run continues a grid only
-if both are equal to its own. A grid without a record is published data and is never written to. See the format page,
+A grid's params.json holds the five published keys and, under `carlasc`, a record of how the grid
+was made. A run continues a grid only if both are equal to its own. A grid without a record is
+published data and is never written to. See the format page,
 `docs/format.md#the-record-in-paramsjson`.
 """
 
@@ -29,7 +30,8 @@ RECORD = "carlasc"
 RECORD_FORMAT = 1
 """Version of the record: of its keys and their meaning."""
 _RENAMED = {"source": "observe", "vote": "voting"}  # old and new keys of records without a format
-_TOLERANCE = 1e-6  # metres, entries of a rotation, seconds: the last digits of poses.txt depend on the machine
+# metres, entries of a rotation, seconds: the last digits of poses.txt depend on the machine
+_TOLERANCE = 1e-6
 _LOOKED_AT = 16  # number of scans that are read to identify a sequence
 _OTHER_SETTINGS = "choose another `name`, or replace the grid with `overwrite=True`"
 _PUBLISHED = "this is published data, which is never written to: choose another `name` or `out`"
@@ -45,12 +47,19 @@ def check_name(name: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.+-]*", name):
         raise ArgumentError("name", expected="letters, digits and _ . + -", found=repr(name))
     if name in taken:
-        raise ArgumentError("name", expected="a name that the layout does not reserve", found=repr(name))
+        raise ArgumentError(
+            "name", expected="a name that the layout does not reserve", found=repr(name)
+        )
     return name
 
 
 def check_grid(
-    writer: SequenceWriter, grid: str, params: dict[str, Any], frames: Iterable[int], *, overwrite: bool
+    writer: SequenceWriter,
+    grid: str,
+    params: dict[str, Any],
+    frames: Iterable[int],
+    *,
+    overwrite: bool,
 ) -> bool:
     """Check whether a run may write to a grid.
 
@@ -62,32 +71,47 @@ def check_grid(
         overwrite: whether a grid that carlasc made with other settings may be replaced.
 
     Returns:
-        Whether the grid exists. It was made by carlasc, and has the same settings unless `overwrite` is given.
+        Whether the grid exists. It was made by carlasc, and has the same settings unless
+        `overwrite` is given.
 
     Raises:
-        ConflictError: the grid is published data, or has other settings; the message names the first difference.
-        FormatError: a newer version of carlasc made the grid, and this version cannot read its record.
+        ConflictError: the grid is published data, or has other settings; the message names the
+            first difference.
+        FormatError: a newer version of carlasc made the grid, and this version cannot read its
+            record.
     """
     where = f"{writer.location}/{layout.params_file(grid)}"
     data = writer.read_document(layout.params_file(grid))
     if data is None:
-        if any(writer.has(f"{grid}/{part}", frame) for frame in frames for part in ("labels", "counts")):
-            raise ConflictError(where, expected="the record of a run", found="frames without one", advice=_PUBLISHED)
+        if any(
+            writer.has(f"{grid}/{part}", frame) for frame in frames for part in ("labels", "counts")
+        ):
+            raise ConflictError(
+                where, expected="the record of a run", found="frames without one", advice=_PUBLISHED
+            )
         return False
     existing = parse_json(data, where)
     if not isinstance(existing.get(RECORD), dict):
         raise ConflictError(where, expected="the record of a run", found="none", advice=_PUBLISHED)
-    old, new = ({**document, RECORD: read_record(document[RECORD], where)} for document in (existing, params))
+    old, new = (
+        {**document, RECORD: read_record(document[RECORD], where)}
+        for document in (existing, params)
+    )
     if not overwrite and (difference := _first_difference(old, new)):
-        raise ConflictError(where, expected="a grid with the same settings", found=difference, advice=_OTHER_SETTINGS)
+        raise ConflictError(
+            where,
+            expected="a grid with the same settings",
+            found=difference,
+            advice=_OTHER_SETTINGS,
+        )
     return True
 
 
 def read_record(record: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Return the record of a grid, written by any version of carlasc, converted to `RECORD_FORMAT`.
 
-    Records of carlasc 0.1.0 have no "format". They name the version of carlasc instead of that of the rule, "source" instead of
-    "observe", and "vote" instead of "voting".
+    Records of carlasc 0.1.0 have no "format". They name the version of carlasc instead of that of
+    the rule, "source" instead of "observe", and "vote" instead of "voting".
 
     Args:
         record: the value of `RECORD` in params.json.
@@ -111,20 +135,27 @@ def read_record(record: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _first_difference(existing: dict[str, Any], wanted: dict[str, Any]) -> str | None:
-    """Describe the first difference between two params.json, the five published keys first; None if there is none."""
+    """Describe the first difference between two params.json, the five published keys first; None if
+    there is none.
+    """
     pairs = [(key, existing.get(key), wanted[key]) for key in wanted if key != RECORD]
     old, new = existing[RECORD], wanted[RECORD]
-    pairs += [(f"{RECORD}.{key}", old.get(key), new.get(key)) for key in dict.fromkeys([*new, *old])]
+    pairs += [
+        (f"{RECORD}.{key}", old.get(key), new.get(key)) for key in dict.fromkeys([*new, *old])
+    ]
     for key, found, expected in pairs:
         if found != expected:
-            return f"{key} {to_json(found).decode()} where this run has {to_json(expected).decode()}"
+            return (
+                f"{key} {to_json(found).decode()} where this run has {to_json(expected).decode()}"
+            )
     return None
 
 
 def agree_poses(writer: SequenceWriter, poses: NDArray[np.float64]) -> bytes | None:
     """Return the poses.txt to write; None if the existing one is complete.
 
-    Existing poses must be equal to those of this run. Lines without a pose (NaN: it could not be read) are filled in.
+    Existing poses must be equal to those of this run. Lines without a pose (NaN: it could not be
+    read) are filled in.
 
     Raises:
         ConflictError: an existing pose is different; the message names the frame.
@@ -151,7 +182,9 @@ def agree_times(writer: SequenceWriter, times: NDArray[np.float64]) -> bytes | N
     return None if merged is None else layout.encode_times(merged)
 
 
-def _merge(existing: NDArray[np.float64], ours: NDArray[np.float64], where: str) -> NDArray[np.float64] | None:
+def _merge(
+    existing: NDArray[np.float64], ours: NDArray[np.float64], where: str
+) -> NDArray[np.float64] | None:
     """Return the existing rows, completed by our rows; None if no row was missing."""
     both = min(len(existing), len(ours))
     differs = np.abs(existing[:both] - ours[:both]) > _TOLERANCE  # False if either is NaN
@@ -172,7 +205,9 @@ def agree_metadata(writer: SequenceWriter, metadata: Metadata) -> bytes | None:
     where = f"{writer.location}/{layout.METADATA}"
     there = Metadata() if data is None else Metadata.from_json(data, where)
     if data is not None and (there.axes, there.classes) != (metadata.axes, metadata.classes):
-        other = " with other ids, names or roles" if there.classes.name == metadata.classes.name else ""
+        other = (
+            " with other ids, names or roles" if there.classes.name == metadata.classes.name else ""
+        )
         other = "" if there.classes == metadata.classes else other
         raise ConflictError(
             where,
@@ -187,7 +222,8 @@ def check_scan(writer: SequenceWriter, field: str, frame: int, array: NDArray[An
     """Compare an existing field of a scan with the array of this run.
 
     Returns:
-        Whether the existing field is complete. False if it is empty after a power failure, and must be written again.
+        Whether the existing field is complete. False if it is empty after a power failure, and must
+        be written again.
 
     Raises:
         ConflictError: they differ.
@@ -195,7 +231,9 @@ def check_scan(writer: SequenceWriter, field: str, frame: int, array: NDArray[An
     existing = writer.read(field, frame)
     if existing is not None and not existing.size and array.size:
         return False
-    if existing is not None and not np.array_equal(existing, array, equal_nan=array.dtype.kind == "f"):
+    if existing is not None and not np.array_equal(
+        existing, array, equal_nan=array.dtype.kind == "f"
+    ):
         raise _other_data(f"{writer.location}/{layout.field_named(field).file(frame)}", frame)
     return True
 
@@ -210,7 +248,10 @@ def _other_data(where: str, frame: int) -> ConflictError:
 
 
 def scans_digest(sequence: Sequence, frames: NDArray[np.int64]) -> str:
-    """Return a digest of 16 scans of a sequence. Changes of other scans are not detected, but long drives need not be read."""
+    """Return a digest of 16 scans of a sequence.
+
+    Changes of other scans are not detected, but long drives need not be read.
+    """
     digest = sha256()
     for row in np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist():
         for name in sorted(sequence.fields() & layout.SCAN_FIELDS.keys()):
@@ -220,7 +261,10 @@ def scans_digest(sequence: Sequence, frames: NDArray[np.int64]) -> str:
 
 
 def _bytes_of(sequence: Sequence, name: str, frame: int) -> bytes:
-    """Return the bytes of a field; empty if it cannot be read. The error is reported when the grid is made."""
+    """Return the bytes of a field; empty if it cannot be read.
+
+    The error is reported when the grid is made.
+    """
     for _ in range(2):  # a second try, because a temporary error must not change the digest
         with suppress(CarlascError):
             return np.ascontiguousarray(sequence.read(name, frame)).tobytes()
@@ -228,7 +272,9 @@ def _bytes_of(sequence: Sequence, name: str, frame: int) -> bytes:
 
 
 def derived_key(sequence: Sequence, frames: NDArray[np.int64], scans: str, **settings: Any) -> str:
-    """Return a digest of settings, poses, times and scans. It identifies data derived from a sequence, such as actors or refined poses.
+    """Return a digest of settings, poses, times and scans.
+
+    It identifies data derived from a sequence, such as actors or refined poses.
 
     Args:
         sequence: the sequence.
@@ -249,7 +295,8 @@ def derived_key(sequence: Sequence, frames: NDArray[np.int64], scans: str, **set
 def read_derived(
     writer: SequenceWriter, name: str, key: str, read: Callable[[bytes, str], tuple[Kept, str]]
 ) -> Kept | None:
-    """Return derived data that an earlier run kept beside the grids of a sequence; None if no file has the same key.
+    """Return derived data that an earlier run kept beside the grids of a sequence; None if no file
+    has the same key.
 
     Args:
         writer: writes the sequence.

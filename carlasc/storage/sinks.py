@@ -1,4 +1,5 @@
-"""The protocol for writing stores: a Sink takes sequences, a SequenceWriter their fields and frames.
+"""The protocol for writing stores: a Sink takes sequences, a SequenceWriter their fields and
+frames.
 
 `carlasc.storage.protocol` is the protocol for reading, with the same fields and frames.
 """
@@ -19,14 +20,16 @@ from carlasc.storage.protocol import Source
 class SequenceWriter(ABC):
     """Writes one sequence.
 
-    In a folder, a file is complete when `write` returns, even if the run fails later. A packed store is complete only after its sink
-    has been closed.
+    In a folder, a file is complete when `write` returns, even if the run fails later. A packed
+    store is complete only after its sink has been closed.
 
     Attributes:
         location: name of the output in errors.
-        concurrent: whether several processes may write at the same time, each with its own pickled copy of the writer.
-        block: number of frames that are stored together: frames with equal `frame // block`. If `concurrent`, two processes should not
-            write different frames of one block at the same time. They may write the same frames.
+        concurrent: whether several processes may write at the same time, each with its own pickled
+            copy of the writer.
+        block: number of frames that are stored together: frames with equal `frame // block`. If
+            `concurrent`, two processes should not write different frames of one block at the same
+            time. They may write the same frames.
     """
 
     location: str
@@ -38,12 +41,14 @@ class SequenceWriter(ABC):
     ) -> None:
         """Announce the frames of a run, before it writes any frame.
 
-        Stores with several writers cannot be finished while announced frames are missing. They also reserve a fixed size for every frame,
-        which must not depend on the frame that is written first.
+        Stores with several writers cannot be finished while announced frames are missing. They also
+        reserve a fixed size for every frame, which must not depend on the frame that is written
+        first.
 
         Args:
             frames: numbers of the frames of each field.
-            rows: number of elements of a typical large frame by field, such as the maximum number of points of a few scans.
+            rows: number of elements of a typical large frame by field, such as the maximum number
+                of points of a few scans.
         """
 
     @abstractmethod
@@ -51,28 +56,34 @@ class SequenceWriter(ABC):
         """Return whether a field of a frame already exists and is complete."""
 
     def refresh(self) -> None:  # noqa: B027 (most stores remember nothing)
-        """Discard cached listings: the next `has` sees the frames that other processes have written."""
+        """Discard cached listings: the next `has` sees the frames that other processes have
+        written.
+        """
 
     @abstractmethod
     def write(self, field: str, frame: int, array: NDArray[Any]) -> None:
         """Write one field of one frame. An existing one is replaced.
 
-        The params.json of a grid must be written before its first frame. Stores that append need the frames of each field in
-        ascending order.
+        The params.json of a grid must be written before its first frame. Stores that append need
+        the frames of each field in ascending order.
 
         Args:
             field: name of the field (see `carlasc.storage.layout`).
             frame: number of the frame.
-            array: the values, with the shape of the published file: (N, ...) for N points, (X, Y, Z) for a grid.
+            array: the values, with the shape of the published file: (N, ...) for N points, (X, Y,
+                Z) for a grid.
 
         Raises:
             FormatError: the array does not fit the field.
         """
 
     def write_frames(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> None:
-        """Write the fields of several frames, in the given order. `frames` maps frame numbers to fields by name, with the shapes of `write`.
+        """Write the fields of several frames, in the given order.
 
-        Stores with several frames per file write the frames of a block together. They are fastest if they get a whole block at once.
+        `frames` maps frame numbers to fields by name, with the shapes of `write`.
+
+        Stores with several frames per file write the frames of a block together. They are fastest
+        if they get a whole block at once.
         """
         for frame, fields in frames.items():
             for field, array in fields.items():
@@ -94,28 +105,43 @@ class SequenceWriter(ABC):
 
     @abstractmethod
     def read_document(self, name: str) -> bytes | None:
-        """Return the bytes of a text file; None if it does not exist. Runs use this to continue the output of an earlier run."""
+        """Return the bytes of a text file; None if it does not exist.
+
+        Runs use this to continue the output of an earlier run.
+        """
 
     def read(self, field: str, frame: int) -> NDArray[Any] | None:
-        """Return an existing field of a frame as a flat array or (N, columns) rows; None if the store cannot read it."""
+        """Return an existing field of a frame as a flat array or (N, columns) rows; None if the
+        store cannot read it.
+        """
         return None
 
     def remove_grid(self, grid: str) -> None:
-        """Remove a grid. Its params.json is removed last, so that an interrupted removal can be continued.
+        """Remove a grid.
+
+        Its params.json is removed last, so that an interrupted removal can be continued.
 
         Raises:
             ConflictError: the store cannot remove grids.
         """
-        raise ConflictError(f"{self.location}: this store cannot replace its grid {grid}: write to a new store")
+        raise ConflictError(
+            f"{self.location}: this store cannot replace its grid {grid}: write to a new store"
+        )
 
     def close(self) -> None:  # noqa: B027 (most stores have nothing to finish)
-        """Finish the sequence, for example by writing an index. This is not called after an error."""
+        """Finish the sequence, for example by writing an index.
+
+        This is not called after an error.
+        """
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if kind is None:
             self.close()
@@ -139,21 +165,28 @@ class Sink(ABC):
         """Start or continue the sequence at a path such as "Train/Town01_Light/cartesian"."""
 
     def place(self, path: str) -> str:
-        """Return the name of a sequence, or of a grid in a sequence, in the finished store: the location of the store and the path in it."""
+        """Return the name of a sequence, or of a grid in a sequence, in the finished store: the
+        location of the store and the path in it.
+        """
         return path if self.location == "." else f"{self.location}/{path}"
 
     def finish(self, *, incomplete: bool = False) -> None:  # noqa: B027 (a folder has nothing to finish)
-        """Finish the store. A packed store can be opened after that. This is not called after an error.
+        """Finish the store.
+
+        A packed store can be opened after that. This is not called after an error.
 
         Args:
-            incomplete: finish the store even if announced frames are missing, because they could not be made.
+            incomplete: finish the store even if announced frames are missing, because they could
+                not be made.
 
         Raises:
             ConflictError: announced frames are missing.
         """
 
     def source(self) -> Source:
-        """Return a source of the written data. It can be used while more data are written; a packed store must be finished first.
+        """Return a source of the written data.
+
+        It can be used while more data are written; a packed store must be finished first.
 
         Raises:
             ConflictError: the store cannot be read while it is written.
@@ -169,7 +202,10 @@ class Sink(ABC):
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if kind is None:
             self.finish()

@@ -10,10 +10,11 @@ from carlasc.errors import DependencyError
 try:
     import pytest
 except ImportError as error:
-    raise DependencyError("pytest is not installed", advice="install it with `pip install pytest`") from error
+    raise DependencyError(
+        "pytest is not installed", advice="install it with `pip install pytest`"
+    ) from error
 
-pytest.register_assert_rewrite(
-    "carlasc.testing.contracts", "carlasc.testing.converters"
-)  # so that failures show the compared values
+# so that failures show the compared values
+pytest.register_assert_rewrite("carlasc.testing.contracts", "carlasc.testing.converters")
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,7 @@
-"""The contract tests of a Source and of a Sink. Subclass them, and pytest runs them on your store."""
+"""The contract tests of a Source and of a Sink.
+
+Subclass them, and pytest runs them on your store.
+"""
 
 # ruff: noqa: D102 (the name of a test says what it tests)
 
@@ -27,18 +30,23 @@ def read_sum(sequence: Sequence) -> float:
 
 
 class SourceContract:
-    """Contract of a Source: it returns the sequences, fields, frames, values and text files that `write_dataset` wrote.
+    """Contract of a Source: it returns the sequences, fields, frames, values and text files that
+    `write_dataset` wrote.
 
     A subclass defines `build`.
 
     Attributes:
-        processes: start methods of processes in which the source is also read ("spawn" takes two seconds); empty if it cannot be pickled.
+        processes: start methods of processes in which the source is also read ("spawn" takes two
+            seconds); empty if it cannot be pickled.
     """
 
     processes: tuple[str, ...] = ("fork", "spawn")
 
     def build(self, published: Path, folder: Path) -> Source:
-        """Return a source of the sequences in `published`, a folder of published files. `folder` is empty and can be written to."""
+        """Return a source of the sequences in `published`, a folder of published files.
+
+        `folder` is empty and can be written to.
+        """
         raise NotImplementedError
 
     @pytest.fixture(scope="class")
@@ -76,14 +84,21 @@ class SourceContract:
         for name in reference.fields():
             frames = reference.frames(name)
             assert sequence.frames(name).tolist() == frames.tolist()
-            for frame, together in zip(frames.tolist(), sequence.read_many(name, frames.tolist()), strict=True):
+            for frame, together in zip(
+                frames.tolist(), sequence.read_many(name, frames.tolist()), strict=True
+            ):
                 alone, wanted = sequence.read(name, frame), reference.read(name, frame)
                 assert alone.shape == together.shape == wanted.shape
                 assert published_bytes(name, alone) == published_bytes(name, wanted), (name, frame)
-                assert published_bytes(name, together) == published_bytes(name, wanted), (name, frame)
+                assert published_bytes(name, together) == published_bytes(name, wanted), (
+                    name,
+                    frame,
+                )
 
     @pytest.mark.parametrize("path", [WHOLE, SCANS, GRIDS])
-    def test_has_the_same_text_files(self, source: Source, expected: dict[str, Sequence], path: str) -> None:
+    def test_has_the_same_text_files(
+        self, source: Source, expected: dict[str, Sequence], path: str
+    ) -> None:
         sequence, reference = source.sequences()[path], expected[path]
         assert set(sequence.documents()) == set(reference.documents())
         for name in reference.documents():
@@ -104,8 +119,12 @@ class SourceContract:
         none, found, wanted = sequence.boxes(0), sequence.boxes(5), expected[WHOLE].boxes(5)
         assert none is not None and len(none) == 0 and sequence.boxes(2) is None
         assert found is not None and wanted is not None and len(found) == 5
-        assert found.annotated.dtype == np.bool_ and np.array_equal(found.annotated, wanted.annotated)
-        assert np.array_equal(found.tracks, wanted.tracks) and np.array_equal(found.sensor_T_box, wanted.sensor_T_box)
+        assert found.annotated.dtype == np.bool_ and np.array_equal(
+            found.annotated, wanted.annotated
+        )
+        assert np.array_equal(found.tracks, wanted.tracks) and np.array_equal(
+            found.sensor_T_box, wanted.sensor_T_box
+        )
         assert sequence.read("boxes", 5).dtype == BOXES_DTYPE
 
     def test_reads_frames_in_any_order_and_twice(self, source: Source) -> None:
@@ -153,7 +172,9 @@ class SourceContract:
         assert np.array_equal(after.read("points", 2), wanted)
 
     @pytest.mark.parametrize("method", ["fork", "spawn"])
-    def test_reads_in_other_processes_after_reading_in_this_one(self, source: Source, method: str) -> None:
+    def test_reads_in_other_processes_after_reading_in_this_one(
+        self, source: Source, method: str
+    ) -> None:
         if method not in self.processes:
             pytest.skip("this store is not tested with this start method of processes")
         sequence = source.sequences()[WHOLE]
@@ -162,7 +183,9 @@ class SourceContract:
             assert list(pool.map(read_sum, [sequence] * 4)) == [wanted] * 4
         assert read_sum(sequence) == wanted
 
-    @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs Linux to list the open files")
+    @pytest.mark.skipif(
+        not Path("/proc/self/fd").is_dir(), reason="needs Linux to list the open files"
+    )
     def test_keeps_no_file_open(self, source: Source) -> None:
         sequence = source.sequences()[WHOLE]
         for name in sequence.fields():
@@ -200,15 +223,22 @@ class SinkContract:
     def given(cls, tmp_path_factory: pytest.TempPathFactory) -> Source:
         return FolderSource(write_dataset(tmp_path_factory.mktemp("published") / "data", seed=1))
 
-    def write_all(self, given: Source, sink: Sink, order: Callable[[list[str]], list[str]] = sorted) -> None:
+    def write_all(
+        self, given: Source, sink: Sink, order: Callable[[list[str]], list[str]] = sorted
+    ) -> None:
         with sink:
             for path, sequence in given.sequences().items():
                 with sink.sequence(path) as writer:
                     for name in sequence.documents():
                         writer.write_document(name, sequence.read_document(name))
-                    frames = sorted({int(f) for name in sequence.fields() for f in sequence.frames(name)})
-                    for frame in frames:  # all fields of a frame before the next frame, as in a run over frames
-                        for name in order([n for n in sequence.fields() if frame in sequence.frames(n)]):
+                    frames = sorted(
+                        {int(f) for name in sequence.fields() for f in sequence.frames(name)}
+                    )
+                    # all fields of a frame before the next frame, as in a run over frames
+                    for frame in frames:
+                        for name in order(
+                            [n for n in sequence.fields() if frame in sequence.frames(n)]
+                        ):
                             writer.write(name, frame, sequence.read(name, frame))
                             assert writer.has(name, frame)
 
@@ -225,7 +255,11 @@ class SinkContract:
                 assert found[path].frames(name).tolist() == sequence.frames(name).tolist()
                 for frame in sequence.frames(name).tolist():
                     got, wanted = found[path].read(name, frame), sequence.read(name, frame)
-                    assert published_bytes(name, got) == published_bytes(name, wanted), (path, name, frame)
+                    assert published_bytes(name, got) == published_bytes(name, wanted), (
+                        path,
+                        name,
+                        frame,
+                    )
 
     def test_has_nothing_but_what_was_written(self, given: Source, out: Path) -> None:
         writer = self.sink(out).sequence(SCANS)

@@ -1,4 +1,7 @@
-"""The contract tests of a converter. Subclass them, and pytest runs them on a simulated drive in the format of your data set."""
+"""The contract tests of a converter.
+
+Subclass them, and pytest runs them on a simulated drive in the format of your data set.
+"""
 
 # ruff: noqa: D102 (the name of a test says what it tests)
 
@@ -25,7 +28,8 @@ from carlasc.testing.drives import KINDS, SimulatedDrive, world_T_sensor
 
 
 class ConverterContract:
-    """Contract of a converter: the conversion keeps points, labels, actors, boxes, poses and times of a drive.
+    """Contract of a converter: the conversion keeps points, labels, actors, boxes, poses and times
+    of a drive.
 
     A subclass defines `converter`, `ids` and `write`.
 
@@ -33,7 +37,8 @@ class ConverterContract:
         converter: name or class of the converter.
         ids: class id in the data set for each of `carlasc.testing.KINDS` that occurs.
         drive: the drive that is written.
-        keeps: content of the format, from "labels", "instances", "boxes", "poses", "times", "seconds" and "origins".
+        keeps: content of the format, from "labels", "instances", "boxes", "poses", "times",
+            "seconds" and "origins".
         options: options of the converter.
         points_m: tolerance of points, metres; 0 for bit-exact.
         poses_m: tolerance of poses: metres, and entries of a rotation.
@@ -52,11 +57,16 @@ class ConverterContract:
         raise NotImplementedError
 
     def arrange(self, frame: int, values: list[NDArray[Any]]) -> NDArray[Any]:
-        """Return values of the points of all sensors in the order of the converted scan. The default is sensor by sensor."""
+        """Return values of the points of all sensors in the order of the converted scan.
+
+        The default is sensor by sensor.
+        """
         return np.concatenate(values)
 
     def run(self, source: Path, out: Path, axes: str = "right") -> Sequence:
-        """Convert `source` to a new data set `out` with `axes` and the classes of the data set, and return the only sequence."""
+        """Convert `source` to a new data set `out` with `axes` and the classes of the data set, and
+        return the only sequence.
+        """
         classes = self._class().classes.name
         result = convert(
             self.converter,
@@ -109,7 +119,9 @@ class ConverterContract:
     def test_times_are_those_of_the_drive(self, sequence: Sequence) -> None:
         if "times" not in self.keeps:
             pytest.skip("the format has no times")
-        np.testing.assert_allclose(sequence.times, self.drive.times - self.drive.times[0], atol=1e-6)
+        np.testing.assert_allclose(
+            sequence.times, self.drive.times - self.drive.times[0], atol=1e-6
+        )
 
     def test_labels_are_those_of_the_drive(self, sequence: Sequence) -> None:
         if "labels" not in self.keeps:
@@ -127,7 +139,9 @@ class ConverterContract:
             truth = self.arrange(frame, [scan.instances for scan in self._scans(frame)])
             found = sequence.read("instances", frame)
             np.testing.assert_array_equal(found > 0, truth > 0)
-            for track, number in np.unique(np.stack([truth, found])[:, truth > 0], axis=1).T.tolist():
+            for track, number in np.unique(
+                np.stack([truth, found])[:, truth > 0], axis=1
+            ).T.tolist():
                 assert numbers.setdefault(track, number) == number
         assert len(numbers) == len(set(numbers.values())) > 0
 
@@ -149,10 +163,15 @@ class ConverterContract:
             assert sorted(nearest.tolist()) == list(range(len(expected)))
             assert distances.min(axis=1).max() < max(10 * self.poses_m, 1e-4)
             np.testing.assert_allclose(annotated.sizes, expected.sizes[nearest], atol=1e-3)
-            headings = [np.arctan2(b.sensor_T_box[:, 1, 0], b.sensor_T_box[:, 0, 0]) for b in (annotated, expected)]
+            headings = [
+                np.arctan2(b.sensor_T_box[:, 1, 0], b.sensor_T_box[:, 0, 0])
+                for b in (annotated, expected)
+            ]
             np.testing.assert_allclose(np.cos(headings[0] - headings[1][nearest]), 1, atol=1e-4)
             assert annotated.labels.tolist() == expected.labels[nearest].tolist()
-            for track, number in zip(expected.tracks[nearest].tolist(), annotated.tracks.tolist(), strict=True):
+            for track, number in zip(
+                expected.tracks[nearest].tolist(), annotated.tracks.tolist(), strict=True
+            ):
                 assert numbers.setdefault(track, number) == number
         assert frames and len(numbers) == len(set(numbers.values()))
 
@@ -163,7 +182,11 @@ class ConverterContract:
         truth = self.arrange(frame, [scan.instances for scan in self._scans(frame)])
         flow, instances = sequence.read("flow", frame), sequence.read("instances", frame)
         speed = np.linalg.norm(flow, axis=1)
-        things = [thing for thing in self.drive.things if thing.kind in ("car", "van", "pedestrian", "cyclist")]
+        things = [
+            thing
+            for thing in self.drive.things
+            if thing.kind in ("car", "van", "pedestrian", "cyclist")
+        ]
         compared = 0
         for track, thing in enumerate(things, 1):
             own = (truth == track) & (instances > 0)
@@ -180,16 +203,22 @@ class ConverterContract:
         for one, other in zip(handle.read(), again.read(), strict=True):
             assert np.array_equal(one.points, other.points)
 
-    def test_left_handed_axes_mirror_everything(self, source: Path, sequence: Sequence, tmp_path: Path) -> None:
+    def test_left_handed_axes_mirror_everything(
+        self, source: Path, sequence: Sequence, tmp_path: Path
+    ) -> None:
         left = self.run(source, tmp_path / "left", "left")
         frame = self.drive.frames - 1
         signs = np.array([1, -1, 1, 1], np.float32)
-        np.testing.assert_array_equal(left.read("points", frame), sequence.read("points", frame) * signs)
+        np.testing.assert_array_equal(
+            left.read("points", frame), sequence.read("points", frame) * signs
+        )
         if "poses" in self.keeps:
             mirror = np.diag(signs.astype(np.float64))
             np.testing.assert_allclose(left.poses, mirror @ sequence.poses @ mirror, atol=1e-9)
         for name in {"flow", "origins"} & left.fields():
-            np.testing.assert_array_equal(left.read(name, frame), sequence.read(name, frame) * signs[:3])
+            np.testing.assert_array_equal(
+                left.read(name, frame), sequence.read(name, frame) * signs[:3]
+            )
         if "boxes" in left.fields():
             assert np.allclose(_centers(left, frame), _centers(sequence, frame) * signs[:3])
 
@@ -210,14 +239,18 @@ class ConverterContract:
         if "poses" not in self.keeps:
             return  # a second estimate may differ in its last digits
         for path in (path for path in out.rglob("*") if path.is_file()):
-            assert (tmp_path / "out" / path.relative_to(out)).read_bytes() == path.read_bytes(), path.name
+            assert (tmp_path / "out" / path.relative_to(out)).read_bytes() == path.read_bytes(), (
+                path.name
+            )
 
     def _class(self) -> type[Converter]:
         return load_converter(self.converter) if isinstance(self.converter, str) else self.converter
 
     @property
     def _scan_T_first(self) -> NDArray[np.float64]:
-        """(4, 4) from the frame of the first sensor to the frame of the scan, which has the axes of the vehicle."""
+        """(4, 4) from the frame of the first sensor to the frame of the scan, which has the axes of
+        the vehicle.
+        """
         turned = self.drive.sensors[0].vehicle_T_sensor.copy()
         turned[:3, 3] = 0
         return turned
@@ -232,13 +265,21 @@ class ConverterContract:
             yield transform_points(sensor.vehicle_T_sensor, scan.deskewed[:, :3]) - first
 
     def boxes_of(self, frame: int) -> Boxes:
-        """Return the expected boxes of a frame, in the frame of the scan. Override this if the format keeps fewer boxes."""
+        """Return the expected boxes of a frame, in the frame of the scan.
+
+        Override this if the format keeps fewer boxes.
+        """
         to_scan = np.eye(4)
         to_scan[:3, 3] = -self.drive.sensors[0].vehicle_T_sensor[:3, 3]
-        return self.drive.boxes(frame, {kind: self.ids.get(kind, 0) for kind in KINDS}).transform(to_scan)
+        return self.drive.boxes(frame, {kind: self.ids.get(kind, 0) for kind in KINDS}).transform(
+            to_scan
+        )
 
     def labelled(self, sequence: Sequence) -> list[int]:
-        """Return the frames whose labels are compared. Override this if only some frames have their own labels."""
+        """Return the frames whose labels are compared.
+
+        Override this if only some frames have their own labels.
+        """
         return sequence.frames("labels").tolist()
 
 

@@ -1,7 +1,8 @@
 """A small data set with difficult cases for stores, and simulated errors of labels and poses.
 
-The data set has gaps in the frames, empty scans, missing fields, and grids of several shapes. Errors of labels are like those of a network,
-errors of poses like those of an odometry or a satellite receiver.
+The data set has gaps in the frames, empty scans, missing fields, and grids of several shapes.
+Errors of labels are like those of a network, errors of poses like those of an odometry or a
+satellite receiver.
 """
 
 from __future__ import annotations
@@ -33,9 +34,17 @@ GRIDS = "Test/Town10_Medium/cylindrical"
 
 def params(size: tuple[int, int, int], coordinates: str = "cartesian") -> bytes:
     """Return the bytes of the params.json of a grid."""
-    bounds = {"min_bound": [0.0 if coordinates == "cylindrical" else -25.6, -3.0, -2.0], "max_bound": [25.6, 3.0, 1.0]}
+    bounds = {
+        "min_bound": [0.0 if coordinates == "cylindrical" else -25.6, -3.0, -2.0],
+        "max_bound": [25.6, 3.0, 1.0],
+    }
     return json.dumps(
-        {"grid_size": [float(n) for n in size], **bounds, "num_channels": 25, "coordinates": coordinates}
+        {
+            "grid_size": [float(n) for n in size],
+            **bounds,
+            "num_channels": 25,
+            "coordinates": coordinates,
+        }
     ).encode()
 
 
@@ -64,16 +73,25 @@ def boxes(rng: np.random.Generator, count: int) -> Boxes:
     return Boxes.from_poses(tracks, labels, poses, sizes, rng.random(count) < 0.7)
 
 
-def grid(rng: np.random.Generator, size: tuple[int, int, int], whole: bool = True) -> dict[str, NDArray[Any]]:
+def grid(
+    rng: np.random.Generator, size: tuple[int, int, int], whole: bool = True
+) -> dict[str, NDArray[Any]]:
     """Return the labels and counts of a random grid; `whole` counts are integers."""
     counts = rng.integers(0, 40, size).astype(np.float32)
-    return {"labels": rng.integers(0, 23, size).astype(np.uint32), "counts": counts if whole else counts / 3}
+    return {
+        "labels": rng.integers(0, 23, size).astype(np.uint32),
+        "counts": counts if whole else counts / 3,
+    }
 
 
-def evidence(rng: np.random.Generator, size: tuple[int, int, int], wide: bool = False) -> dict[str, NDArray[Any]]:
+def evidence(
+    rng: np.random.Generator, size: tuple[int, int, int], wide: bool = False
+) -> dict[str, NDArray[Any]]:
     """Return the evidence fields of a random grid; `wide` class ids have two bytes."""
     voxels = int(np.prod(size))
-    classes = np.zeros(2 * voxels, field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE)
+    classes = np.zeros(
+        2 * voxels, field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE
+    )
     classes["voxel"], classes["label"] = np.repeat(np.arange(voxels), 2), np.tile([1, 10], voxels)
     shares = rng.integers(1, layout.CERTAIN, voxels)
     classes["votes"] = np.column_stack([shares, layout.CERTAIN - shares]).reshape(-1)
@@ -85,19 +103,26 @@ def evidence(rng: np.random.Generator, size: tuple[int, int, int], wide: bool = 
     }
 
 
-def actors(rng: np.random.Generator, size: tuple[int, int, int], count: int) -> dict[str, NDArray[Any]]:
+def actors(
+    rng: np.random.Generator, size: tuple[int, int, int], count: int
+) -> dict[str, NDArray[Any]]:
     """Return the actor fields of a random grid with `count` moving voxels: instance and velocity."""
     velocity = np.zeros(count, field_files.VELOCITY_DTYPE)
     velocity["voxel"] = np.sort(rng.permutation(int(np.prod(size)))[:count])
     velocity["velocity"] = rng.normal(scale=5, size=(count, 3))
-    return {"instance": rng.choice([0, 1, 2, 300, 70_000], size).astype(np.uint32), "velocity": velocity}
+    return {
+        "instance": rng.choice([0, 1, 2, 300, 70_000], size).astype(np.uint32),
+        "velocity": velocity,
+    }
 
 
 def lines(count: int) -> tuple[bytes, bytes]:
     """Return the bytes of poses.txt and times.txt of a straight drive."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 3] = np.arange(count) * 0.7
-    return layout.encode_poses(poses), layout.encode_times(np.arange(count, dtype=np.float64) * layout.FRAME_PERIOD_S)
+    return layout.encode_poses(poses), layout.encode_times(
+        np.arange(count, dtype=np.float64) * layout.FRAME_PERIOD_S
+    )
 
 
 def write_dataset(root: Path, seed: int = 0) -> Path:
@@ -131,8 +156,12 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
         whole.write("bev", frame, rng.integers(0, 256, 300 + frame).astype(np.uint8))
     whole.write_document("cameras.json", b'{"format": 1,  "cameras": []}\n')
     for frame in FRAMES[1:]:  # each camera has one kind of images
-        for number, field in enumerate(("images.front.jpg", "images.left-1.png", "image_depths.front.png")):
-            whole.write(field, frame, rng.integers(0, 256, 200 + 10 * frame + number).astype(np.uint8))
+        for number, field in enumerate(
+            ("images.front.jpg", "images.left-1.png", "image_depths.front.png")
+        ):
+            whole.write(
+                field, frame, rng.integers(0, 256, 200 + 10 * frame + number).astype(np.uint8)
+            )
         whole.write("evaluation_8x4x3/seen", frame, rng.integers(0, 256, SECOND).astype(np.uint8))
     scans = sink.sequence(SCANS)
     for frame in range(3):
@@ -149,7 +178,11 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
         for part, array in grid(rng, SIZE).items():
             grids.write(f"evaluation/{part}", frame, array)
     votes = np.zeros(5, field_files.VOTES_DTYPE)
-    votes["voxel"], votes["label"], votes["votes"] = [0, 1, 7, 20, 47], [1, 2, 3, 22, 0], [1, 300, 65535, 2, 1]
+    votes["voxel"], votes["label"], votes["votes"] = (
+        [0, 1, 7, 20, 47],
+        [1, 2, 3, 22, 0],
+        [1, 300, 65535, 2, 1],
+    )
     grids.write("evaluation/votes", 4, votes)
     for part, array in evidence(rng, SIZE).items():
         grids.write(f"evaluation/{part}", 4, array)
@@ -168,7 +201,10 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
 
 
 def published_bytes(field: str, array: NDArray[Any]) -> bytes:
-    """Return the bytes of the published file of an array of any shape. They do not depend on the type in which a store keeps the array."""
+    """Return the bytes of the published file of an array of any shape.
+
+    They do not depend on the type in which a store keeps the array.
+    """
     return bytes(layout.field_named(field).encode(array, field))
 
 
@@ -183,14 +219,16 @@ def wrong_labels(
 ) -> NDArray[np.unsignedinteger]:
     """Return a copy of labels in which a share is wrong. Points with class 0 are unchanged.
 
-    Clumps are cubes. The wrong clumps and their classes depend on their position and on `seed`. With points in the world frame and equal
-    seeds, several scans have wrong labels at the same positions, like a network that cannot recognise an object. With another seed for each
-    scan, or with points in the sensor frame, the positions differ.
+    Clumps are cubes. The wrong clumps and their classes depend on their position and on `seed`.
+    With points in the world frame and equal seeds, several scans have wrong labels at the same
+    positions, like a network that cannot recognise an object. With another seed for each scan, or
+    with points in the sensor frame, the positions differ.
 
     Args:
         labels: (N,) class ids.
         points: (N, 3) or more columns; the first three are x, y, z in metres.
-        share: share of the labelled points that get another class, 0 to 1; with clumps, the nearest share of whole clumps.
+        share: share of the labelled points that get another class, 0 to 1; with clumps, the nearest
+            share of whole clumps.
         clump_m: edge length of a clump, metres; None for random single points.
         classes: at least two ids for wrong labels; None for the ids in `labels`.
         seed: seed of the random numbers.
@@ -199,7 +237,8 @@ def wrong_labels(
         (N,) class ids of the type of `labels`.
 
     Raises:
-        ArgumentError: `share` or `clump_m` is not in its range, or there are fewer than two classes.
+        ArgumentError: `share` or `clump_m` is not in its range, or there are fewer than two
+            classes.
     """
     if not 0 <= share <= 1:
         raise ArgumentError("share", expected="a number from 0 to 1", found=str(share))
@@ -221,9 +260,8 @@ def wrong_labels(
         rngs = [np.random.default_rng([seed, *cube]) for cube in (cubes & 0xFFFFFFFF).tolist()]
         order = np.argsort([rng.random() for rng in rngs])
         wanted = share * len(places)
-        above = (
-            np.cumsum(counts[order]) - counts[order] / 2 < wanted
-        )  # clumps of which more than half is within the share
+        # clumps of which more than half is within the share
+        above = np.cumsum(counts[order]) - counts[order] / 2 < wanted
         chosen = np.zeros(len(cubes), np.bool_)
         chosen[order[above]] = True
         classes_of = np.array([rng.integers(0, len(others)) for rng in rngs])
@@ -248,10 +286,14 @@ def wrong_poses(
 
     Args:
         poses: (F, 4, 4) world_T_sensor in order of time.
-        jitter_m: standard deviation of an independent error of each position, along each axis of the world.
-        jitter_rad: standard deviation of an independent error of each rotation, about each axis of the sensor.
-        drift_m: standard deviation of an error of each motion between two poses, along each axis of the sensor; these errors add up.
-        drift_rad: standard deviation of an error of each rotation between two poses; these errors add up.
+        jitter_m: standard deviation of an independent error of each position, along each axis of
+            the world.
+        jitter_rad: standard deviation of an independent error of each rotation, about each axis of
+            the sensor.
+        drift_m: standard deviation of an error of each motion between two poses, along each axis of
+            the sensor; these errors add up.
+        drift_rad: standard deviation of an error of each rotation between two poses; these errors
+            add up.
         height_drift_m: standard deviation of the steps of a random walk of the height.
         seed: seed of the random numbers.
 
@@ -261,7 +303,12 @@ def wrong_poses(
     Raises:
         ArgumentError: a standard deviation is negative or not a number.
     """
-    given = {"jitter_m": jitter_m, "jitter_rad": jitter_rad, "drift_m": drift_m, "drift_rad": drift_rad}
+    given = {
+        "jitter_m": jitter_m,
+        "jitter_rad": jitter_rad,
+        "drift_m": drift_m,
+        "drift_rad": drift_rad,
+    }
     for name, value in (given | {"height_drift_m": height_drift_m}).items():
         if not 0 <= value < np.inf:
             raise ArgumentError(name, expected="a standard deviation, 0 or more", found=str(value))

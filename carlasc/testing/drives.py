@@ -1,4 +1,7 @@
-"""A small simulated drive with known ground truth. Tests of converters write it in the format of another data set and compare."""
+"""A small simulated drive with known ground truth.
+
+Tests of converters write it in the format of another data set and compare.
+"""
 
 from __future__ import annotations
 
@@ -41,16 +44,24 @@ class Thing:
     def world_T_box(self, seconds: NDArray[np.float64] | float) -> NDArray[np.float64]:
         """Return the (..., 4, 4) pose of the box at some times."""
         poses = np.broadcast_to(rotation_z(self.heading), (*np.shape(seconds), 4, 4)).copy()
-        way = np.asarray(seconds)[..., None] * (self.speed * np.array([np.cos(self.heading), np.sin(self.heading)]))
+        way = np.asarray(seconds)[..., None] * (
+            self.speed * np.array([np.cos(self.heading), np.sin(self.heading)])
+        )
         poses[..., :2, 3] = np.array(self.center[:2]) + way
         poses[..., 2, 3] = self.center[2]
         return poses
 
 
 def _street() -> tuple[Thing, ...]:
-    houses = [Thing("building", (x, side * 14.0, 4.0), (9.0, 6.0, 8.0)) for x in range(-20, 80, 14) for side in (-1, 1)]
+    houses = [
+        Thing("building", (x, side * 14.0, 4.0), (9.0, 6.0, 8.0))
+        for x in range(-20, 80, 14)
+        for side in (-1, 1)
+    ]
     poles = [Thing("pole", (x + 0.5, 7.5, 2.5), (0.2, 0.2, 5.0)) for x in range(-24, 80, 16)]
-    trees = [Thing("vegetation", (x + 3.0, -8.5, 2.0), (1.6, 1.6, 4.0), 0.4) for x in range(-20, 80, 11)]
+    trees = [
+        Thing("vegetation", (x + 3.0, -8.5, 2.0), (1.6, 1.6, 4.0), 0.4) for x in range(-20, 80, 11)
+    ]
     return (
         *houses,
         *poles,
@@ -68,8 +79,10 @@ class DriveScan:
     """The scan of one sensor for one frame.
 
     Attributes:
-        points: (N, 4) float32, x, y, z in metres in the frame of the sensor at the time of each point, and remission 0 to 1.
-        deskewed: (N, 4) float32, the same points in the frame of the sensor at the time of the frame.
+        points: (N, 4) float32, x, y, z in metres in the frame of the sensor at the time of each
+            point, and remission 0 to 1.
+        deskewed: (N, 4) float32, the same points in the frame of the sensor at the time of the
+            frame.
         kinds: (N,) uint8 indices of `KINDS`.
         instances: (N,) uint32 track numbers, 0 for things without a box.
         seconds: (N,) float64 time of each point after the time of the frame.
@@ -86,10 +99,13 @@ class DriveScan:
 
 @dataclass(frozen=True)
 class SimulatedDrive:
-    """A vehicle that drives along a street with traffic. Axes are right-handed: x forward, y left, z up. The drive is exact and deterministic.
+    """A vehicle that drives along a street with traffic.
 
-    The frame of the vehicle is at its rear axle, `axle_m` above the ground. If `rolling`, each sensor makes one turn per frame, from half a
-    period before the time of the frame to half a period after it. Otherwise, all points are taken at the time of the frame.
+    Axes are right-handed: x forward, y left, z up. The drive is exact and deterministic.
+
+    The frame of the vehicle is at its rear axle, `axle_m` above the ground. If `rolling`, each
+    sensor makes one turn per frame, from half a period before the time of the frame to half a
+    period after it. Otherwise, all points are taken at the time of the frame.
 
     Attributes:
         frames: number of frames.
@@ -108,7 +124,9 @@ class SimulatedDrive:
     period_s: float = 0.1
     sensors: tuple[Sensor, ...] = field(
         default_factory=lambda: (
-            Sensor("lidar", np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]])),
+            Sensor(
+                "lidar", np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]])
+            ),
         )
     )
     rolling: bool = False
@@ -119,7 +137,9 @@ class SimulatedDrive:
     channels: int = 20
     columns: int = 180
 
-    _kept: dict[tuple[int, int], DriveScan] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _kept: dict[tuple[int, int], DriveScan] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -127,7 +147,10 @@ class SimulatedDrive:
         return np.arange(self.frames, dtype=np.float64) * self.period_s
 
     def world_T_vehicle(self, seconds: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        """Return the (..., 4, 4) poses of the vehicle at some times. It moves slightly from side to side."""
+        """Return the (..., 4, 4) poses of the vehicle at some times.
+
+        It moves slightly from side to side.
+        """
         at = np.asarray(seconds, np.float64)
         x = self.speed * at
         poses = np.zeros((*at.shape, 4, 4))
@@ -139,7 +162,8 @@ class SimulatedDrive:
         return poses
 
     def boxes(self, frame: int, labels: dict[str, int] | None = None) -> Boxes:
-        """Return the boxes of the movable things within 60 m at a frame, in the frame of the vehicle.
+        """Return the boxes of the movable things within 60 m at a frame, in the frame of the
+        vehicle.
 
         Args:
             frame: frame number.
@@ -160,7 +184,10 @@ class SimulatedDrive:
         )
 
     def scan(self, frame: int, sensor: int = 0) -> DriveScan:
-        """Return the scan of a sensor for a frame. The last scans are cached; do not write to them."""
+        """Return the scan of a sensor for a frame.
+
+        The last scans are cached; do not write to them.
+        """
         key = (frame, sensor)
         if key not in self._kept:
             while len(self._kept) >= _KEPT:
@@ -181,7 +208,12 @@ class SimulatedDrive:
         azimuth, turn = np.repeat(azimuth, self.channels), np.repeat(turn, self.channels)
         elevation = np.tile(elevation, self.columns)
         rays = np.stack(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
+            [
+                np.cos(elevation) * np.cos(azimuth),
+                np.cos(elevation) * np.sin(azimuth),
+                np.sin(elevation),
+            ],
+            axis=1,
         )
         at = frame * self.period_s + turn
         poses = self.world_T_vehicle(at) @ mount
@@ -190,16 +222,25 @@ class SimulatedDrive:
         seen = reach < 60.0
         reach, hit, poses, turn = reach[seen], hit[seen], poses[seen], turn[seen]
         points = (rays[seen] * reach[:, None]).astype(np.float32)
-        world = np.einsum("nij,nj->ni", poses[:, :3, :3], points.astype(np.float64)) + poses[:, :3, 3]
-        deskewed = transform_points(invert(self.world_T_vehicle(frame * self.period_s) @ mount), world).astype(
-            np.float32
+        world = (
+            np.einsum("nij,nj->ni", poses[:, :3, :3], points.astype(np.float64)) + poses[:, :3, 3]
         )
+        deskewed = transform_points(
+            invert(self.world_T_vehicle(frame * self.period_s) @ mount), world
+        ).astype(np.float32)
         remission = np.round(0.1 + 0.05 * hit % 0.8, 2).astype(np.float32)[:, None]
-        kinds = np.array([KINDS.index("road"), *(KINDS.index(thing.kind) for thing in self.things)], np.uint8)
+        kinds = np.array(
+            [KINDS.index("road"), *(KINDS.index(thing.kind) for thing in self.things)], np.uint8
+        )
         tracks = {thing: track for track, thing in enumerate(self._movable, 1)}
         instances = np.array([0, *(tracks.get(thing, 0) for thing in self.things)], np.uint32)
         return DriveScan(
-            np.hstack([points, remission]), np.hstack([deskewed, remission]), kinds[hit], instances[hit], turn, poses
+            np.hstack([points, remission]),
+            np.hstack([deskewed, remission]),
+            kinds[hit],
+            instances[hit],
+            turn,
+            poses,
         )
 
     @property
@@ -209,13 +250,17 @@ class SimulatedDrive:
     def _nearest(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], at: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the length of each ray, and what it hits: 0 for the ground, n for the n-th thing from 1."""
+        """Return the length of each ray, and what it hits: 0 for the ground, n for the n-th thing
+        from 1.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.where(directions[:, 2] < 0, -origins[:, 2] / directions[:, 2], np.inf)
             hit = np.zeros(len(at), np.int64)
             for number, thing in enumerate(self.things, 1):
                 box_T_world = invert(thing.world_T_box(at))
-                start = np.einsum("nij,nj->ni", box_T_world[:, :3, :3], origins) + box_T_world[:, :3, 3]
+                start = (
+                    np.einsum("nij,nj->ni", box_T_world[:, :3, :3], origins) + box_T_world[:, :3, 3]
+                )
                 ray = np.einsum("nij,nj->ni", box_T_world[:, :3, :3], directions)
                 half = np.array(thing.size) / 2
                 one, other = (-half - start) / ray, (half - start) / ray

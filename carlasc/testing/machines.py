@@ -1,4 +1,6 @@
-"""Random sequences of writes, kills and resumed runs on a store, compared with a model in memory. They need hypothesis.
+"""Random sequences of writes, kills and resumed runs on a store, compared with a model in memory.
+
+They need hypothesis.
 
 See `docs/howto/source.md` for an example. Run the `TestCase` of a subclass with pytest:
 
@@ -29,7 +31,9 @@ try:
     from hypothesis import strategies as st
     from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 except ImportError as error:
-    raise DependencyError("hypothesis is not installed", advice="install it with `pip install hypothesis`") from error
+    raise DependencyError(
+        "hypothesis is not installed", advice="install it with `pip install hypothesis`"
+    ) from error
 
 Key = tuple[str, str, int]
 """Path of a sequence, field and frame."""
@@ -42,14 +46,18 @@ LAST = 11
 
 
 class StoreMachine(RuleBasedStateMachine):
-    """Writes, overwrites and removes frames, abandons the sink like a killed process, resumes, finishes, and compares.
+    """Writes, overwrites and removes frames, abandons the sink like a killed process, resumes,
+    finishes, and compares.
 
-    A subclass defines `sink` and `read`. `model` has all written data; after each `finish`, the store must have exactly these data. A resumed
-    run writes the frames that the writer lacks, like every command of carlasc.
+    A subclass defines `sink` and `read`. `model` has all written data; after each `finish`, the
+    store must have exactly these data. A resumed run writes the frames that the writer lacks, like
+    every command of carlasc.
 
     Attributes:
-        rising: whether the frames of a field must be written in ascending order, so that none can be replaced.
-        reopens: whether a finished store can be extended. Otherwise, each `finish` is followed by a new store.
+        rising: whether the frames of a field must be written in ascending order, so that none can
+            be replaced.
+        reopens: whether a finished store can be extended. Otherwise, each `finish` is followed by a
+            new store.
         immediate: whether a frame survives if its process is killed after `write` has returned.
         ending: suffix of the names of stores.
         model: expected arrays by sequence, field and frame.
@@ -63,7 +71,9 @@ class StoreMachine(RuleBasedStateMachine):
     ending: str = ""
 
     def sink(self, out: Path) -> Sink:
-        """Return a sink that writes to `out`: a new store, an abandoned store or, with `reopens`, a finished store."""
+        """Return a sink that writes to `out`: a new store, an abandoned store or, with `reopens`, a
+        finished store.
+        """
         raise NotImplementedError
 
     def read(self, out: Path) -> Source:
@@ -84,7 +94,8 @@ class StoreMachine(RuleBasedStateMachine):
         self.documents: dict[tuple[str, str], bytes] = {}
         self._sink: Sink | None = None
         self._writers: dict[str, SequenceWriter] = {}
-        self._possible: dict[Key, list[NDArray[Any]]] = {}  # possible arrays of a frame that was replaced before a kill
+        # possible arrays of a frame that was replaced before a kill
+        self._possible: dict[Key, list[NDArray[Any]]] = {}
         self._killed = False
 
     def teardown(self) -> None:
@@ -101,7 +112,9 @@ class StoreMachine(RuleBasedStateMachine):
     def write(self, path: str, field: str, frame: int, seed: int) -> None:
         """Write a field of a frame, or replace it."""
         writer = self._writer(path)
-        if self.rising and frame <= max((key[2] for key in self.model if key[:2] == (path, field)), default=-1):
+        if self.rising and frame <= max(
+            (key[2] for key in self.model if key[:2] == (path, field)), default=-1
+        ):
             return
         if field.startswith(GRID) and (path, layout.params_file(GRID)) not in self.documents:
             self._write_document(path, layout.params_file(GRID), params(SIZE))
@@ -115,7 +128,10 @@ class StoreMachine(RuleBasedStateMachine):
 
     @rule(path=st.sampled_from(PATHS))
     def remove_grid(self, path: str) -> None:
-        """Remove a grid. A store that does not support this raises ConflictError and keeps the grid."""
+        """Remove a grid.
+
+        A store that does not support this raises ConflictError and keeps the grid.
+        """
         if (path, layout.params_file(GRID)) not in self.documents:
             return
         try:
@@ -158,7 +174,10 @@ class StoreMachine(RuleBasedStateMachine):
                 assert writer.has("points", frame) == ((path, "points", frame) in self.model)
 
     def _writer(self, path: str) -> SequenceWriter:
-        """Return the writer of a sequence. A new sequence gets a scan immediately, because readers may ignore sequences without frames."""
+        """Return the writer of a sequence.
+
+        A new sequence gets a scan immediately, because readers may ignore sequences without frames.
+        """
         if self._sink is None:
             self._resume()
         if path not in self._writers and self._sink is not None:
@@ -178,14 +197,18 @@ class StoreMachine(RuleBasedStateMachine):
         self.documents[path, name] = data
 
     def _resume(self) -> None:
-        """Open the store again, and write missing text files, and missing frames in ascending order."""
+        """Open the store again, and write missing text files, and missing frames in ascending
+        order.
+        """
         self._sink = self.sink(self.out)
         if not self._killed:
             return
         self._killed = False
         for path in sorted({key[0] for key in self.model}):
             writer = self._writers[path] = self._sink.sequence(path)
-            for (_, name), data in [(key, data) for key, data in self.documents.items() if key[0] == path]:
+            for (_, name), data in [
+                (key, data) for key, data in self.documents.items() if key[0] == path
+            ]:
                 writer.write_document(name, data)
             for _, field, frame in sorted(key for key in self.model if key[0] == path):
                 if not writer.has(field, frame):
@@ -206,14 +229,28 @@ class StoreMachine(RuleBasedStateMachine):
         for path, field, frame in sorted(keys):
             array = found[path].read(field, frame)
             data = published_bytes(field, array)
-            allowed = [self.model[path, field, frame], *self._possible.get((path, field, frame), [])]
+            allowed = [
+                self.model[path, field, frame],
+                *self._possible.get((path, field, frame), []),
+            ]
             assert data in [published_bytes(field, each) for each in allowed], (path, field, frame)
             self.model[path, field, frame] = np.array(array)
-        texts = {(path, name): found[path].read_document(name) for path in found for name in found[path].documents()}
+        texts = {
+            (path, name): found[path].read_document(name)
+            for path in found
+            for name in found[path].documents()
+        }
         assert texts == self.documents
 
 
 def _array(field: str, frame: int, seed: int) -> NDArray[Any]:
-    """Return a random array of a field. All fields of a frame have the same number of points: 0 to 3."""
+    """Return a random array of a field.
+
+    All fields of a frame have the same number of points: 0 to 3.
+    """
     rng = np.random.default_rng(seed)
-    return grid(rng, SIZE)[field.partition("/")[2]] if field.startswith(GRID) else scan(rng, (frame + 2) % 4)[field]
+    return (
+        grid(rng, SIZE)[field.partition("/")[2]]
+        if field.startswith(GRID)
+        else scan(rng, (frame + 2) % 4)[field]
+    )

@@ -1,4 +1,6 @@
-"""Viewing sequences: pictures and films, a page for any browser, recordings for other viewers, a window on the desktop."""
+"""Viewing sequences: pictures and films, a page for any browser, recordings for other viewers, a
+window on the desktop.
+"""
 
 import lazy_loader
 

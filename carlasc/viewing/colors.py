@@ -1,8 +1,9 @@
 """Colours of classes, of a prediction's errors, and of heights.
 
-The palette for colour-blind readers starts from the colours of Okabe and Ito. Any two of the paper's eleven classes differ by at least
-29 units of CIE 1976 L*a*b* under deuteranopia and protanopia (Machado et al. 2009, severity 1); with the paper's own colours the least
-difference is 7. Classes that belong to the same one of the eleven have shades of its colour.
+The palette for colour-blind readers starts from the colours of Okabe and Ito. Any two of the
+paper's eleven classes differ by at least 29 units of CIE 1976 L*a*b* under deuteranopia and
+protanopia (Machado et al. 2009, severity 1); with the paper's own colours the least difference is
+7. Classes that belong to the same one of the eleven have shades of its colour.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ _ACTORS = (  # by number, periodic
 )
 ACTORS = ClassTable(
     "actors",
-    {0: "free", 1: "no actor"} | {2 + k: f"actors {k or 12}, {(k or 12) + 12}, ..." for k in range(len(_ACTORS))},
+    {0: "free", 1: "no actor"}
+    | {2 + k: f"actors {k or 12}, {(k or 12) + 12}, ..." for k in range(len(_ACTORS))},
     {0: (255, 255, 255), 1: STATIC} | dict(enumerate(_ACTORS, 2)),
 )
 """Names and colours of actors by their numbers: `actor_ids` returns the ids."""
@@ -76,8 +78,12 @@ _RAMP = np.array(  # viridis at five positions: lightness increases from the fir
 
 
 def actor_ids(instances: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """Return the id in `ACTORS` of each number of an actor, of any shape; 0, no actor, has the id 1."""
-    return np.where(instances > 0, 2 + instances.astype(np.int64) % len(_ACTORS), 1).astype(np.uint8)
+    """Return the id in `ACTORS` of each number of an actor, of any shape; 0, no actor, has the id
+    1.
+    """
+    return np.where(instances > 0, 2 + instances.astype(np.int64) % len(_ACTORS), 1).astype(
+        np.uint8
+    )
 
 
 class Entry(NamedTuple):
@@ -86,8 +92,8 @@ class Entry(NamedTuple):
     Attributes:
         name: meaning of the colour.
         color: RGB, 0 to 255.
-        order: position in the legend: the id of a class; below 0 for entries before the classes, `AFTER_CLASSES` and more for
-            entries after them.
+        order: position in the legend: the id of a class; below 0 for entries before the classes,
+            `AFTER_CLASSES` and more for entries after them.
     """
 
     name: str
@@ -104,7 +110,8 @@ class ClassColors:
 
     Attributes:
         table: the class table.
-        palette: "class" (the colours of the table), "colorblind", or "height" (by height, for any class).
+        palette: "class" (the colours of the table), "colorblind", or "height" (by height, for any
+            class).
 
     Raises:
         ArgumentError: an unknown palette.
@@ -119,12 +126,19 @@ class ClassColors:
     @property
     def by_id(self) -> NDArray[np.uint8]:
         """(num_channels, 3) uint8 RGB by class id."""
-        return colorblind_palette(self.table) if self.palette == "colorblind" else self.table.palette
+        return (
+            colorblind_palette(self.table) if self.palette == "colorblind" else self.table.palette
+        )
 
     def tell_shapes(self, ids: NDArray[np.int64]) -> bool:
-        """Whether the colours of the (K,) ids that occur are useful. Without labels they are not, and colours by height are used."""
+        """Whether the colours of the (K,) ids that occur are useful.
+
+        Without labels they are not, and colours by height are used.
+        """
         without = {0, self.table.geometry_id, self.table.ground_id}
-        return self.palette != "height" and (self.table.geometry_id not in ids or not {*ids.tolist()} <= without)
+        return self.palette != "height" and (
+            self.table.geometry_id not in ids or not {*ids.tolist()} <= without
+        )
 
     def entries(self, ids: Iterable[int]) -> list[Entry]:
         """Return the legend of the given class ids, sorted by id, without free (0)."""
@@ -137,7 +151,9 @@ class ClassColors:
 
 
 def colorblind_palette(table: ClassTable) -> NDArray[np.uint8]:
-    """Return (num_channels, 3) uint8 RGB by class id, in colours that readers with red-green blindness can distinguish."""
+    """Return (num_channels, 3) uint8 RGB by class id, in colours that readers with red-green
+    blindness can distinguish.
+    """
     groups = _groups(table)
     palette = np.full((table.num_channels, 3), 128, np.uint8)
     for group, base in _GROUPS.items():
@@ -147,8 +163,8 @@ def colorblind_palette(table: ClassTable) -> NDArray[np.uint8]:
             key=lambda i: (table.names[i].lower() not in (family, family.removesuffix("s")), i),
         )
         for number, member in enumerate(members):
-            # the class named as the group, or the first one, has the group's colour; the others are blended with white, or with
-            # black if the group's colour is light
+            # the class named as the group, or the first one, has the group's colour; the others are
+            # blended with white, or with black if the group's colour is light
             target, most = (255, 0.7) if sum(base) < 480 else (0, 0.35)
             share = most * number / max(len(members) - 1, 1) if number else 0.0
             palette[member] = np.round((1 - share) * np.array(base) + share * target)
@@ -159,7 +175,9 @@ def height_colors(heights: NDArray[np.floating], lower: float, upper: float) -> 
     """Return (..., 3) uint8 RGB of heights: dark at `lower`, light at `upper`, both in metres."""
     position = np.clip((heights - lower) / max(upper - lower, 1e-9), 0, 1) * (len(_RAMP) - 1)
     places = np.arange(len(_RAMP))
-    return np.stack([np.interp(position, places, _RAMP[:, c]) for c in range(3)], axis=-1).astype(np.uint8)
+    return np.stack([np.interp(position, places, _RAMP[:, c]) for c in range(3)], axis=-1).astype(
+        np.uint8
+    )
 
 
 def height_entries(lower: float, upper: float) -> list[Entry]:
@@ -167,7 +185,9 @@ def height_entries(lower: float, upper: float) -> list[Entry]:
     heights = np.linspace(lower, upper, len(_RAMP))
     return [
         Entry(f"{height:+.1f} m", as_color(color), number - len(_RAMP))
-        for number, (height, color) in enumerate(zip(heights, height_colors(heights, lower, upper), strict=True))
+        for number, (height, color) in enumerate(
+            zip(heights, height_colors(heights, lower, upper), strict=True)
+        )
     ]
 
 
@@ -196,4 +216,7 @@ def _groups(table: ClassTable) -> dict[int, int]:
 
 def merge_legends(legends: Iterable[Iterable[Entry]]) -> list[Entry]:
     """Return the different entries of several legends, sorted by `order`."""
-    return sorted(dict.fromkeys(entry for legend in legends for entry in legend), key=lambda entry: entry.order)
+    return sorted(
+        dict.fromkeys(entry for legend in legends for entry in legend),
+        key=lambda entry: entry.order,
+    )

@@ -1,4 +1,6 @@
-"""Finding the sequence, the ground truth, the grids and the frames of a scene, and reading them in one class table."""
+"""Finding the sequence, the ground truth, the grids and the frames of a scene, and reading them in
+one class table.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.folder import FolderSequence
 
 SceneSource = str | os.PathLike[str] | Source | Sequence
-"""The source of a scene: anything that `carlasc.open` takes, a grid's folder, the file of one frame, a Source or a Sequence."""
+"""The source of a scene: anything that `carlasc.open` takes, a grid's folder, the file of one
+frame, a Source or a Sequence.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +67,8 @@ def find_sequence(source: SceneSource, name: str | None = None) -> FoundSequence
 
 
 def find_truth(truth: SceneSource, prediction: Sequence) -> FoundSequence:
-    """Find the ground truth of a prediction: the sequence with its path, with its name, or the only one.
+    """Find the ground truth of a prediction: the sequence with its path, with its name, or the only
+    one.
 
     Raises:
         MissingDataError: no sequence matches.
@@ -78,7 +83,11 @@ def find_truth(truth: SceneSource, prediction: Sequence) -> FoundSequence:
     if len(sequences) == 1:
         return FoundSequence(next(iter(sequences.values())))
     identity = (prediction.name, prediction.coordinates)
-    same_name = (sequence for sequence in sequences.values() if (sequence.name, sequence.coordinates) == identity)
+    same_name = (
+        sequence
+        for sequence in sequences.values()
+        if (sequence.name, sequence.coordinates) == identity
+    )
     match = sequences.get(prediction.path) or next(same_name, None)
     if match is None:
         raise MissingDataError(
@@ -104,14 +113,17 @@ def _open_part(source: str | os.PathLike[str] | Source) -> FoundSequence | None:
 
 
 def _open_file(path: Path) -> FoundSequence:
-    """Open the sequence that a frame's file belongs to; its folder is that of a grid or of one of a scan's fields."""
+    """Open the sequence that a frame's file belongs to; its folder is that of a grid or of one of a
+    scan's fields.
+    """
     folder = path.parent
     frame = layout.frame_of(path.name, path.suffix)
     is_scan = folder.name in layout.scan_folders()
     if frame is None or not (is_scan or (folder / layout.PARAMS).is_file()):
         raise FormatError(
             path,
-            expected=f"a file named by its frame number (six digits), in a folder of scans or beside {layout.PARAMS}",
+            expected=f"a file named by its frame number (six digits), in a folder of scans or "
+            f"beside {layout.PARAMS}",
             found="another file",
             advice=f"the geometry of a grid is in its {layout.PARAMS}",
         )
@@ -130,7 +142,9 @@ def _choose_sequence(source: Source, name: str | None) -> FoundSequence:
     same_name = (sequence for sequence in sequences.values() if sequence.name == name)
     match = sequences.get(name) or next(same_name, None)
     if match is None:
-        raise MissingDataError(source.location, expected=f"the sequence {name}", found=first_names(sequences))
+        raise MissingDataError(
+            source.location, expected=f"the sequence {name}", found=first_names(sequences)
+        )
     return FoundSequence(match)
 
 
@@ -144,16 +158,26 @@ def choose_grid(found: FoundSequence, name: str | None) -> str:
     names = list(found.sequence.grids)
     wanted = name or found.grid
     if wanted is None:
-        wanted = layout.EVALUATION if layout.EVALUATION in names else next(iter(names), layout.EVALUATION)
+        wanted = (
+            layout.EVALUATION
+            if layout.EVALUATION in names
+            else next(iter(names), layout.EVALUATION)
+        )
     if wanted not in names:
         raise MissingDataError(
-            found.sequence.location, expected=f"the grid {wanted}", found=", ".join(names) or "no grid"
+            found.sequence.location,
+            expected=f"the grid {wanted}",
+            found=", ".join(names) or "no grid",
         )
     return wanted
 
 
-def common_table(data: RemappedSequence, truth: RemappedSequence | None, wanted: ClassTable | None) -> ClassTable:
-    """Return the class table for all labels: the requested one, that of the data, or that of the ground truth."""
+def common_table(
+    data: RemappedSequence, truth: RemappedSequence | None, wanted: ClassTable | None
+) -> ClassTable:
+    """Return the class table for all labels: the requested one, that of the data, or that of the
+    ground truth.
+    """
     stored = [data.stored_table] + ([] if truth is None else [truth.stored_table])
     candidates = stored if wanted is None else [wanted]
     for table in candidates[:-1]:
@@ -172,17 +196,23 @@ def _check_remaps(stored: Iterable[ClassTable], target: ClassTable) -> None:
         remaps_between(table, target)
 
 
-def frames_with(data: RemappedSequence, truth: RemappedSequence | None, contents: tuple[str, ...]) -> NDArray[np.int64]:
+def frames_with(
+    data: RemappedSequence, truth: RemappedSequence | None, contents: tuple[str, ...]
+) -> NDArray[np.int64]:
     """Return the frames that have all contents."""
     own = {"scan": ("points",), "flow": ("points", "flow"), "truth": ()}
-    needed = [(data.sequence, name) for c in contents for name in own.get(c, (f"{data.grid}/labels",))]
+    needed = [
+        (data.sequence, name) for c in contents for name in own.get(c, (f"{data.grid}/labels",))
+    ]
     if truth is not None and {"truth", "errors"} & set(contents):
         needed.append((truth.sequence, f"{truth.grid}/labels"))
     frames: NDArray[np.int64] | None = None
     for sequence, name in needed:
         available = sequence.frames(name)
         if not len(available):
-            raise MissingDataError(sequence.location, expected=f"the field {name}", found=list_fields(sequence))
+            raise MissingDataError(
+                sequence.location, expected=f"the field {name}", found=list_fields(sequence)
+            )
         common = available if frames is None else np.intersect1d(frames, available)
         if frames is not None and not len(common):
             raise MissingDataError(
@@ -211,7 +241,8 @@ class RemappedSequence:
     Attributes:
         sequence: where frames are read from.
         grid: name of the grid that is read; "" for none.
-        stored: class table of the labels in the sequence; None takes those in the metadata of the grid and of the scans.
+        stored: class table of the labels in the sequence; None takes those in the metadata of the
+            grid and of the scans.
         shown: class table in which labels are returned; None leaves them as they are stored.
     """
 
@@ -234,7 +265,9 @@ class RemappedSequence:
 
     @property
     def scan_table(self) -> ClassTable:
-        """Class table of the scans' labels as they are stored: a prediction beside them may have another."""
+        """Class table of the scans' labels as they are stored: a prediction beside them may have
+        another.
+        """
         return self.sequence.metadata.classes if self.stored is None else self.stored
 
     def read_grid(self, frame: int) -> Grid:
@@ -244,7 +277,9 @@ class RemappedSequence:
             FormatError: the grid does not have the format, or a label is not in its class table.
         """
         grid = self.sequence.grid(self.grid, frame)
-        labels = self._remap(grid.labels, self.stored_table, f"{self.sequence.location}: {self.grid}, frame {frame}")
+        labels = self._remap(
+            grid.labels, self.stored_table, f"{self.sequence.location}: {self.grid}, frame {frame}"
+        )
         return replace(grid, labels=labels)
 
     def read_scan(self, frame: int) -> Scan:
@@ -262,7 +297,8 @@ class RemappedSequence:
         return replace(scan, labels=self._remap(scan.labels, self.scan_table, where))
 
     def read_boxes(self, frame: int) -> Boxes | None:
-        """Read the tracked boxes of a frame, in the table that is shown; None where it was not annotated.
+        """Read the tracked boxes of a frame, in the table that is shown; None where it was not
+        annotated.
 
         Raises:
             FormatError: the boxes do not have the format, or a label is not in its class table.
@@ -274,7 +310,8 @@ class RemappedSequence:
         """Read (4, 4) first_T_sensor of a frame; None if the sequence has no poses.
 
         Raises:
-            FormatError: the frame has no line in the file of poses, or its line is no rigid transform.
+            FormatError: the frame has no line in the file of poses, or its line is no rigid
+                transform.
         """
         try:
             pose = self.sequence.read_pose(frame)

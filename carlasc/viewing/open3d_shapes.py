@@ -1,4 +1,5 @@
-"""Open3D: how it is loaded, and how a window makes its geometry: meshes with light, lines and points.
+"""Open3D: how it is loaded, and how a window makes its geometry: meshes with light, lines and
+points.
 
 It needs libraries of the system: the error names the missing one, and what to install.
 """
@@ -22,7 +23,10 @@ _EDGE = 0.8  # brightness of the edges of voxels, relative to their faces
 
 
 class Shapes:
-    """Makes geometry of Open3D. Colours are RGB, 0 to 255; the colours of meshes include the light of sun and sky."""
+    """Makes geometry of Open3D.
+
+    Colours are RGB, 0 to 255; the colours of meshes include the light of sun and sky.
+    """
 
     def __init__(self, o3d: ModuleType) -> None:
         self._o3d: Any = o3d
@@ -33,19 +37,27 @@ class Shapes:
         light = self._light(mesh)[:, None] * mesh.openness
         indices = self._o3d.utility.Vector3iVector(triangles.astype(np.int32))
         shown = self._o3d.geometry.TriangleMesh(self._vectors(corners), indices)
-        shown.vertex_colors = self._vectors(np.clip(mesh.colors[:, None] / 255.0 * light[..., None], 0, 1))
+        shown.vertex_colors = self._vectors(
+            np.clip(mesh.colors[:, None] / 255.0 * light[..., None], 0, 1)
+        )
         return shown
 
     def edges(self, mesh: QuadMesh) -> Any:
-        """Return the edges of voxels as lines, darker than their faces and slightly in front of them."""
+        """Return the edges of voxels as lines, darker than their faces and slightly in front of
+        them.
+        """
         face, side = np.nonzero(mesh.edges)
         corners = mesh.corners + 4e-3 * mesh.normals[:, None]
         ends = np.stack([corners[face, side], corners[face, (side + 1) % 4]], axis=1)
         return self.lines(ends, mesh.colors[face] * _EDGE * self._light(mesh)[face, None])
 
     def lines(self, ends: NDArray[np.floating], colors: NDArray[Any]) -> Any:
-        """Return straight lines with the (L, 2, 3) ends, in the (L, 3) colours, or in one colour, (3,)."""
-        pairs = self._o3d.utility.Vector2iVector(np.arange(2 * len(ends), dtype=np.int32).reshape(-1, 2))
+        """Return straight lines with the (L, 2, 3) ends, in the (L, 3) colours, or in one colour,
+        (3,).
+        """
+        pairs = self._o3d.utility.Vector2iVector(
+            np.arange(2 * len(ends), dtype=np.int32).reshape(-1, 2)
+        )
         lines = self._o3d.geometry.LineSet(self._vectors(ends), pairs)
         lines.colors = self._vectors(np.broadcast_to(colors, (len(ends), 3)) / 255.0)
         return lines
@@ -57,7 +69,9 @@ class Shapes:
         return cloud
 
     def _light(self, mesh: QuadMesh) -> NDArray[np.floating]:
-        """Return the brightness of each face in the sun; a level face without shade has exactly its own colour."""
+        """Return the brightness of each face in the sun; a level face without shade has exactly its
+        own colour.
+        """
         lit = np.clip(mesh.normals @ _SUN, 0, None) / _SUN[2]
         return 0.58 + 0.42 * np.minimum(lit, 1.25)
 
@@ -85,16 +99,20 @@ def import_open3d() -> ModuleType:
     """Import Open3D.
 
     Raises:
-        DependencyError: Open3D is not installed, or a system library is missing; the advice says what to install.
+        DependencyError: Open3D is not installed, or a system library is missing; the advice says
+            what to install.
     """
     try:
         return importlib.import_module("open3d")
     except (ImportError, OSError) as error:
         missing = missing_library(str(error))
         if missing is None and isinstance(error, ImportError):
-            return import_extra("open3d", "view")  # the package is not installed, or the loader failed
+            # the package is not installed, or the loader failed
+            return import_extra("open3d", "view")
         problem = str(error) if missing is None else f"{missing} is missing"
-        raise DependencyError("open3d", problem=f"cannot be loaded: {problem}", advice=advice(missing)) from error
+        raise DependencyError(
+            "open3d", problem=f"cannot be loaded: {problem}", advice=advice(missing)
+        ) from error
 
 
 def missing_library(message: str) -> str | None:

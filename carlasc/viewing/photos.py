@@ -16,7 +16,9 @@ from carlasc.storage.camera_files import cameras_of, has_image, image_bytes, sca
 from carlasc.storage.protocol import Sequence
 
 _PHOTO_PX, _FRUSTUM_M = 400, 1.0  # width of an image, and length of the drawn frustum of its camera
-_QUALITY = 70  # of a JPEG: a third of the bytes of 90, and enough for an image of a few hundred pixels
+_QUALITY = (
+    70  # of a JPEG: a third of the bytes of 90, and enough for an image of a few hundred pixels
+)
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,18 @@ class Photo:
         return "png" if self.data.startswith(b"\x89PNG") else "jpeg"
 
     def frustum(self, depth_m: float) -> NDArray[np.float64]:
-        """Return (8, 2, 3) lines of the frustum of the camera up to a depth, in the frame of the scan."""
+        """Return (8, 2, 3) lines of the frustum of the camera up to a depth, in the frame of the
+        scan.
+        """
         width, height = self.camera.width, self.camera.height
         looks = self.camera.unproject([(0, 0), (width, 0), (width, height), (0, height)])
-        corners = transform_points(self.ego_T_camera, depth_m * looks / np.linalg.norm(looks, axis=1, keepdims=True))
+        corners = transform_points(
+            self.ego_T_camera, depth_m * looks / np.linalg.norm(looks, axis=1, keepdims=True)
+        )
         places = np.broadcast_to(self.ego_T_camera[:3, 3], (4, 3))
-        return np.concatenate([np.stack([places, corners], 1), np.stack([corners, np.roll(corners, -1, 0)], 1)])
+        return np.concatenate(
+            [np.stack([places, corners], 1), np.stack([corners, np.roll(corners, -1, 0)], 1)]
+        )
 
     def smaller(self, width: int) -> bytes:
         """Return the image as a JPEG of at most `width` pixels.
@@ -79,16 +87,21 @@ def photos_of(sequence: Sequence, frame: int, mirrored: bool) -> tuple[Photo, ..
     """
     found, mirror = [], np.diag([1.0, -1.0 if mirrored else 1.0, 1.0, 1.0])
     for camera in cameras_of(sequence).values():
-        place = scan_T_camera(sequence, camera, frame) if has_image(sequence, camera, frame) else None
+        place = (
+            scan_T_camera(sequence, camera, frame) if has_image(sequence, camera, frame) else None
+        )
         if place is not None:
             found.append(Photo(camera, mirror @ place, image_bytes(sequence, camera, frame)[0]))
     return tuple(found)
 
 
 def encode_photos(photos: tuple[Photo, ...]) -> dict[str, NDArray[Any]]:
-    """Encode the images of a frame for a page: `photos/NAME`, the bytes of a small JPEG, and `actors/cameras`, both ends of the lines of their frustums."""
+    """Encode the images of a frame for a page: `photos/NAME`, the bytes of a small JPEG, and
+    `actors/cameras`, both ends of the lines of their frustums.
+    """
     arrays: dict[str, NDArray[Any]] = {
-        f"photos/{photo.camera.name}": np.frombuffer(photo.smaller(_PHOTO_PX), np.uint8) for photo in photos
+        f"photos/{photo.camera.name}": np.frombuffer(photo.smaller(_PHOTO_PX), np.uint8)
+        for photo in photos
     }
     if photos:
         lines = np.concatenate([photo.frustum(_FRUSTUM_M) for photo in photos])

@@ -1,4 +1,5 @@
-"""Scenes: frames of a sequence with a grid, its ground truth, points, boxes and pose, all in one class table.
+"""Scenes: frames of a sequence with a grid, its ground truth, points, boxes and pose, all in one
+class table.
 
 Pictures, pages, recordings and windows take a `Scene` and read it with a `SceneReader`.
 """
@@ -49,20 +50,23 @@ class Scene:
     """The frames of a sequence to show, and the classes and colours. Nothing is read before `open`.
 
     Attributes:
-        source: a path or URL that `carlasc.open` takes, a grid's folder, the file of one frame, a Source or a Sequence.
+        source: a path or URL that `carlasc.open` takes, a grid's folder, the file of one frame, a
+            Source or a Sequence.
         sequence: path or name of the sequence in the source; None takes the first.
         frames: range of frame numbers; None takes all.
         every: show every N-th frame of the range.
         grid: name of the grid; None takes `evaluation`, or the first grid.
         truth: ground truth to compare the grid with; anything that `source` may be.
         truth_grid: name of the ground truth's grid; None as for `grid`.
-        classes: class table to show, such as "carlasc11"; None shows the grid's own classes, or those of the ground truth if
-            only these are common to both.
+        classes: class table to show, such as "carlasc11"; None shows the grid's own classes, or
+            those of the ground truth if only these are common to both.
         source_classes: class table of the labels in `source`; None takes the one in its metadata.
-        palette: "class" (the colours of the class table), "colorblind", or "height" (by height; for pictures only).
+        palette: "class" (the colours of the class table), "colorblind", or "height" (by height; for
+            pictures only).
 
     Raises:
-        ArgumentError: an unknown class table or palette, an invalid range of frames, or `every` below 1.
+        ArgumentError: an unknown class table or palette, an invalid range of frames, or `every`
+            below 1.
     """
 
     source: SceneSource
@@ -90,11 +94,13 @@ class Scene:
         """Find the sequence, the grids, the frames and a common class table.
 
         Args:
-            what: names from `CONTENTS`, or one string of them separated by commas; only frames that have all of them are
-                taken. None takes the grid, with a ground truth also the truth and the errors; or the scan if there is no grid.
+            what: names from `CONTENTS`, or one string of them separated by commas; only frames that
+                have all of them are taken. None takes the grid, with a ground truth also the truth
+                and the errors; or the scan if there is no grid.
 
         Raises:
-            ArgumentError: an unknown content, one that needs a ground truth, or classes that cannot be shown in one table.
+            ArgumentError: an unknown content, one that needs a ground truth, or classes that cannot
+                be shown in one table.
             MissingDataError: a sequence, grid or frame does not exist.
             FormatError: the data do not have the format.
         """
@@ -122,17 +128,25 @@ class Scene:
             return ("grid",) if self.truth is None else ("grid", "truth", "errors")
         if "points" in found.sequence.fields():
             return ("scan",)
-        raise MissingDataError(found.sequence.location, expected="a grid or points", found=list_fields(found.sequence))
+        raise MissingDataError(
+            found.sequence.location, expected="a grid or points", found=list_fields(found.sequence)
+        )
 
     def _check_contents(self, what: str | Iterable[str]) -> tuple[str, ...]:
         contents = tuple(what.split(",") if isinstance(what, str) else what)
         for name in contents:
             if name not in CONTENTS:
-                raise ArgumentError("what", expected=f"one or more of {', '.join(CONTENTS)}", found=repr(name))
+                raise ArgumentError(
+                    "what", expected=f"one or more of {', '.join(CONTENTS)}", found=repr(name)
+                )
             if name in ("truth", "errors") and self.truth is None:
-                raise ArgumentError("what", problem=f"{name} needs a ground truth", advice="give it with `truth`")
+                raise ArgumentError(
+                    "what", problem=f"{name} needs a ground truth", advice="give it with `truth`"
+                )
         if not contents:
-            raise ArgumentError("what", expected=f"one or more of {', '.join(CONTENTS)}", found="nothing")
+            raise ArgumentError(
+                "what", expected=f"one or more of {', '.join(CONTENTS)}", found="nothing"
+            )
         return contents
 
     def _choose_frames(self, found: FoundSequence, available: NDArray[np.int64]) -> tuple[int, ...]:
@@ -160,7 +174,8 @@ class GridPanel:
     """One of the grids that are shown side by side.
 
     Attributes:
-        title: "prediction", "truth", "errors"; or the size of the grid if there is only one; "actors" for its voxels by actor.
+        title: "prediction", "truth", "errors"; or the size of the grid if there is only one;
+            "actors" for its voxels by actor.
         spec: geometry.
         colors: colours of its labels.
         name: "prediction", "truth", "errors"; or "grid" if there is only one; "actors".
@@ -177,9 +192,11 @@ class FrameContent:
     """The contents of one frame.
 
     Attributes:
-        grids: one for each panel of the scene. In the panel "errors", labels are outcomes (`carlasc.metrics.VoxelOutcome`); in the panel
-            "actors", ids of `carlasc.viewing.colors.ACTORS`.
-        scan: the points, with labels, flow and instances where the sequence has them; None if the frame has no points.
+        grids: one for each panel of the scene. In the panel "errors", labels are outcomes
+            (`carlasc.metrics.VoxelOutcome`); in the panel "actors", ids of
+            `carlasc.viewing.colors.ACTORS`.
+        scan: the points, with labels, flow and instances where the sequence has them; None if the
+            frame has no points.
         time_s: seconds since the first frame, or None if the sequence has no times.
         boxes: tracked boxes, sensor frame; None where the frame was not annotated.
         pose: (4, 4) first_T_sensor, or None if the sequence has no poses.
@@ -239,15 +256,21 @@ class SceneReader:
         return self.axes == "left"
 
     def right_handed(self) -> SceneReader:
-        """Return a reader of the same frames in right-handed axes (y to the left), for programs that need these."""
+        """Return a reader of the same frames in right-handed axes (y to the left), for programs
+        that need these.
+        """
         return replace(self, mirrored=True) if self.left_handed else self
 
     def with_actors(self) -> SceneReader:
-        """Return a reader of the same frames that also shows the voxels by actor, if the grid has the field `actors`."""
+        """Return a reader of the same frames that also shows the voxels by actor, if the grid has
+        the field `actors`.
+        """
         return replace(self, by_actor=self.has(f"{self.data.grid}/instance"))
 
     def has(self, field: str) -> bool:
-        """Whether some frame of the sequence has a field, such as "points" or "flow" (see `carlasc.storage.layout`)."""
+        """Whether some frame of the sequence has a field, such as "points" or "flow" (see
+        `carlasc.storage.layout`).
+        """
         return field in self.data.sequence.fields()
 
     @property
@@ -284,10 +307,13 @@ class SceneReader:
         boxes = scan.boxes if scan is not None else self.data.read_boxes(frame)
         if scan is None and self.mirrored and boxes is not None:
             boxes = mirror_boxes(boxes)
-        return FrameContent(self._read_grids(frame), scan, self.read_time(frame), boxes, self.read_pose(frame))
+        return FrameContent(
+            self._read_grids(frame), scan, self.read_time(frame), boxes, self.read_pose(frame)
+        )
 
     def read_scan(self, frame: int) -> Scan | None:
-        """Read the points of a frame with all of their fields, without those that are not finite; None if it has no points.
+        """Read the points of a frame with all of their fields, without those that are not finite;
+        None if it has no points.
 
         Raises:
             FormatError: the data do not have the format.
@@ -303,7 +329,8 @@ class SceneReader:
         return self.has("flow") or self.has(f"{self.data.grid}/velocity")
 
     def read_motion(self, frame: int, scan: Scan | None) -> Scan | None:
-        """Return the moving points of a frame with flow, or the centres of moving voxels if points have no flow; None if motion is not known.
+        """Return the moving points of a frame with flow, or the centres of moving voxels if points
+        have no flow; None if motion is not known.
 
         Raises:
             FormatError: the data do not have the format.
@@ -314,12 +341,19 @@ class SceneReader:
         if not data.grid or frame not in data.frames_with(name):
             return None
         moving = data.sequence.read(name, frame)
-        check_velocity(moving, data.spec.num_voxels, f"{data.sequence.location}: {name} of frame {frame}")
-        points = data.spec.from_axes(data.spec.centers().reshape(-1, 3)[moving["voxel"]]).astype(np.float32)
-        labels, actors = (
-            a.reshape(-1)[moving["voxel"]] for a in (data.read_grid(frame).labels, self._instances(frame))
+        check_velocity(
+            moving, data.spec.num_voxels, f"{data.sequence.location}: {name} of frame {frame}"
         )
-        found = Scan(points, labels.astype(np.uint32), moving["velocity"].astype(np.float32), actors)
+        points = data.spec.from_axes(data.spec.centers().reshape(-1, 3)[moving["voxel"]]).astype(
+            np.float32
+        )
+        labels, actors = (
+            a.reshape(-1)[moving["voxel"]]
+            for a in (data.read_grid(frame).labels, self._instances(frame))
+        )
+        found = Scan(
+            points, labels.astype(np.uint32), moving["velocity"].astype(np.float32), actors
+        )
         return mirror_scan(found) if self.mirrored else found
 
     def read_time(self, frame: int) -> float | None:
@@ -330,22 +364,27 @@ class SceneReader:
             return None
 
     def read_pose(self, frame: int) -> Transform | None:
-        """Return (4, 4) first_T_sensor of a frame, or None if neither the sequence nor its ground truth has poses.
+        """Return (4, 4) first_T_sensor of a frame, or None if neither the sequence nor its ground
+        truth has poses.
 
         Raises:
-            FormatError: the frame has no line in the file of poses, or its line is not a rigid transform.
+            FormatError: the frame has no line in the file of poses, or its line is not a rigid
+                transform.
         """
         found = (data.read_pose(frame) for data in (self.data, self.truth) if data is not None)
         pose = next((pose for pose in found if pose is not None), None)
         return mirror_poses(pose) if self.mirrored and pose is not None else pose
 
     def path_of_ego(self) -> NDArray[np.float64]:
-        """Return the (F, 3) positions of the sensor in all frames, metres in the frame of the first scan; none without poses."""
+        """Return the (F, 3) positions of the sensor in all frames, metres in the frame of the first
+        scan; none without poses.
+        """
         poses = [pose for pose in map(self.read_pose, self.frames) if pose is not None]
         return np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
 
     def read_picture(self, frame: int) -> bytes | None:
-        """Return the bird's-eye camera picture of a frame as its JPEG bytes, or None if it has none.
+        """Return the bird's-eye camera picture of a frame as its JPEG bytes, or None if it has
+        none.
 
         Raises:
             FormatError: the data do not have the format.
@@ -373,5 +412,7 @@ class SceneReader:
             grids += [truth, Grid(truth.spec, compare_grids(grids[0], truth), truth.counts)]
         if self.by_actor:
             ids = actor_ids(self._instances(frame))
-            grids.append(replace(grids[0], labels=np.where(grids[0].labels > 0, ids, 0).astype(np.uint8)))
+            grids.append(
+                replace(grids[0], labels=np.where(grids[0].labels > 0, ids, 0).astype(np.uint8))
+            )
         return tuple(map(mirror_voxels, grids) if self.mirrored else grids)

@@ -50,10 +50,14 @@ def check_target(out: Path, endings: Sequence[str], overwrite: bool) -> None:
         ConflictError: the file exists, and `overwrite` is not given.
     """
     if out.suffix.lower() not in endings:
-        raise ArgumentError("out", expected=f"a file name that ends in {' or '.join(endings)}", found=str(out))
+        raise ArgumentError(
+            "out", expected=f"a file name that ends in {' or '.join(endings)}", found=str(out)
+        )
     if out.is_dir():
         raise ArgumentError("out", expected="a file name", found=f"the folder {out}")
     if out.exists() and not overwrite:
         raise ConflictError(
-            out, problem="the file exists", advice="choose another name, or replace it with `overwrite=True`"
+            out,
+            problem="the file exists",
+            advice="choose another name, or replace it with `overwrite=True`",
         )

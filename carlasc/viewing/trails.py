@@ -27,7 +27,8 @@ class Trail(NamedTuple):
     Attributes:
         actor: number of the track, or of the instance without boxes.
         label: class id.
-        points: (K, 3) float64 metres in the world, the frame of the first scan; the last is in the present frame.
+        points: (K, 3) float64 metres in the world, the frame of the first scan; the last is in the
+            present frame.
     """
 
     actor: int
@@ -37,35 +38,52 @@ class Trail(NamedTuple):
 
 @dataclass
 class Trails:
-    """Collects the positions of actors over the frames of a sequence, forwards or backwards. It keeps `LONGEST` frames around the last one."""
+    """Collects the positions of actors over the frames of a sequence, forwards or backwards.
 
-    _seen: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)  # positions of actors, by frame
+    It keeps `LONGEST` frames around the last one.
+    """
 
-    def follow(self, position: int, content: FrameContent, moving: Scan | None) -> tuple[Trail, ...]:
+    # positions of actors, by frame
+    _seen: dict[int, dict[int, NDArray[np.float64]]] = field(default_factory=dict)
+
+    def follow(
+        self, position: int, content: FrameContent, moving: Scan | None
+    ) -> tuple[Trail, ...]:
         """Return the trails of the actors in a frame that have moved; empty without poses.
 
-        The position of an actor is that of its box. Without boxes, it is the mean of the points of its instance, or of its voxels, if
-        these move.
+        The position of an actor is that of its box. Without boxes, it is the mean of the points of
+        its instance, or of its voxels, if these move.
 
         Args:
             position: index of the frame in the order of frames.
             content: the frame.
-            moving: the moving points or voxels, with flow, as `SceneReader.read_motion` returns them.
+            moving: the moving points or voxels, with flow, as `SceneReader.read_motion` returns
+                them.
         """
         if content.pose is None:
             return ()
         actors = list(_actors(content, moving))
-        self._seen = {at: places for at, places in self._seen.items() if abs(at - position) < LONGEST}
-        self._seen[position] = {actor: transform_points(content.pose, center) for actor, _, center in actors}
+        self._seen = {
+            at: places for at, places in self._seen.items() if abs(at - position) < LONGEST
+        }
+        self._seen[position] = {
+            actor: transform_points(content.pose, center) for actor, _, center in actors
+        }
         ways = defaultdict(list)
         for at in sorted(at for at in self._seen if at <= position):
             for actor, place in self._seen[at].items():
                 ways[actor].append(place)
         trails = (Trail(actor, label, np.array(ways[actor])) for actor, label, _ in actors)
-        return tuple(trail for trail in trails if np.linalg.norm(np.ptp(trail.points, axis=0)) >= _LEAST_WAY_M)
+        return tuple(
+            trail
+            for trail in trails
+            if np.linalg.norm(np.ptp(trail.points, axis=0)) >= _LEAST_WAY_M
+        )
 
 
-def _actors(content: FrameContent, moving: Scan | None) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
+def _actors(
+    content: FrameContent, moving: Scan | None
+) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
     """Yield the number, the class and the (3,) position of each actor, in the frame of the sensor."""
     boxes = content.boxes
     if boxes is not None:
@@ -80,6 +98,8 @@ def _actors(content: FrameContent, moving: Scan | None) -> Iterator[tuple[int, i
     actors, first, group = np.unique(scan.instances[chosen], return_index=True, return_inverse=True)
     points = scan.points[chosen].astype(np.float64)
     count = np.bincount(group.reshape(-1), minlength=len(actors))
-    middles = np.stack([np.bincount(group.reshape(-1), points[:, a], len(actors)) for a in range(3)], axis=1)
+    middles = np.stack(
+        [np.bincount(group.reshape(-1), points[:, a], len(actors)) for a in range(3)], axis=1
+    )
     labels = np.zeros(len(points), np.int64) if scan.labels is None else scan.labels[chosen]
     yield from zip(actors.tolist(), labels[first].tolist(), middles / count[:, None], strict=True)

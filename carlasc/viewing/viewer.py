@@ -23,7 +23,10 @@ from carlasc.viewing.scene import Scene, SceneReader, as_scene
 from carlasc.viewing.targets import ViewResult, check_target, first_frames
 from carlasc.viewing.window import show_window
 
-_WRITERS: dict[str, Callable[[Path, SceneReader], RecordingWriter]] = {".rrd": RerunWriter, ".mcap": FoxgloveWriter}
+_WRITERS: dict[str, Callable[[Path, SceneReader], RecordingWriter]] = {
+    ".rrd": RerunWriter,
+    ".mcap": FoxgloveWriter,
+}
 RECORDINGS = tuple(_WRITERS)
 """Endings of the names of recordings: Rerun's, and the one that Foxglove reads."""
 
@@ -47,8 +50,13 @@ def write_recording(
     max_points = None if full_points else MAX_POINTS
     if full_points and report is not None:
         size = estimate_size(reader, out.suffix, max_points)
-        report(f"{out}: about {size / 1e6:,.0f} MB: {len(reader.frames)} frames with all of their points")
-    write_output(out, lambda file: _write(reader, Path(file.name), out.suffix, max_points, progress))
+        report(
+            f"{out}: about {size / 1e6:,.0f} MB: {len(reader.frames)} frames with all of their "
+            f"points"
+        )
+    write_output(
+        out, lambda file: _write(reader, Path(file.name), out.suffix, max_points, progress)
+    )
     titles = tuple(panel.title for panel in reader.panels)
     return ViewResult(
         out, reader.path, titles, reader.frames, out.stat().st_size, time.monotonic() - started, reader.notes
@@ -56,7 +64,8 @@ def write_recording(
 
 
 def estimate_size(reader: SceneReader, ending: str, max_points: int | None) -> int:
-    """Return the approximate size of a recording in bytes, from temporary copies of the first, the middle and the last frame.
+    """Return the approximate size of a recording in bytes, from temporary copies of the first, the
+    middle and the last frame.
 
     Args:
         reader: the scene, right-handed.
@@ -131,23 +140,27 @@ def view(
     progress: Callable[[int, int], None] | None = None,
     report: Callable[[str], None] | None = None,
 ) -> ViewResult | None:
-    """Write a scene as a page for any browser or as a recording, or, without `out`, show it in a window until it is closed.
+    """Write a scene as a page for any browser or as a recording, or, without `out`, show it in a
+    window until it is closed.
 
     Args:
-        source: a `Scene`; or anything that a scene's `source` may be. Its palette is "class" or "colorblind". A file of a scene
-            without `frames` shows the first 60 frames.
-        out: file name. Its ending gives the format: .html is a page in one file, .rrd a recording for Rerun, .mcap a recording for
-            Foxglove. A name without an ending is the folder of a page for a web server: the browser fetches frames when it shows them, and
-            without `frames` the page shows the whole sequence. None opens a window.
+        source: a `Scene`; or anything that a scene's `source` may be. Its palette is "class" or
+            "colorblind". A file of a scene without `frames` shows the first 60 frames.
+        out: file name. Its ending gives the format: .html is a page in one file, .rrd a recording
+            for Rerun, .mcap a recording for Foxglove. A name without an ending is the folder of a
+            page for a web server: the browser fetches frames when it shows them, and without
+            `frames` the page shows the whole sequence. None opens a window.
         thin_m: points in a page are thinned to one per cell of this side length, metres.
-        beside: another run of the same sequence, which a page compares with `source` on both sides of a divider. Anything that a
-            scene's `source` may be; of several sequences, the one with the same path or name is taken.
-        beside_grid: name of its grid; None as for the grid of `source`. Without `beside`, another grid of `source` itself.
+        beside: another run of the same sequence, which a page compares with `source` on both sides
+            of a divider. Anything that a scene's `source` may be; of several sequences, the one
+            with the same path or name is taken.
+        beside_grid: name of its grid; None as for the grid of `source`. Without `beside`, another
+            grid of `source` itself.
         full_points: whether a recording keeps all points; otherwise at most 30,000 of each frame.
         overwrite: whether an existing file is replaced.
         progress: called with (frames done, frames in all) while a file is written.
-        report: called with lines of text: for a recording with `full_points`, its approximate size; for a window, the keys and the
-            classes, and after each key its effect.
+        report: called with lines of text: for a recording with `full_points`, its approximate size;
+            for a window, the keys and the classes, and after each key its effect.
 
     Returns:
         The file and its contents; None for a window.
@@ -158,8 +171,8 @@ def view(
         FormatError: the data do not have the format.
         ConflictError: `out` exists.
         StorageError: `out` cannot be written; nothing is left behind.
-        DependencyError: the SDK of Rerun or of Foxglove is missing; or for a window, Open3D or a library that it needs is
-            missing, or there is no screen.
+        DependencyError: the SDK of Rerun or of Foxglove is missing; or for a window, Open3D or a
+            library that it needs is missing, or there is no screen.
     """
     scene = as_scene(source)
     if scene.palette == "height":
@@ -171,13 +184,22 @@ def view(
         raise ArgumentError("out", expected=expected, found=str(out))
     is_recording = ending in RECORDINGS
     if (beside is not None or beside_grid is not None) and (target is None or is_recording):
-        raise ArgumentError("beside", expected="a page, .html or a folder", found=str(out or "a window"))
+        raise ArgumentError(
+            "beside", expected="a page, .html or a folder", found=str(out or "a window")
+        )
     if target is not None and is_recording:
         return write_recording(
-            scene, target, full_points=full_points, overwrite=overwrite, progress=progress, report=report
+            scene,
+            target,
+            full_points=full_points,
+            overwrite=overwrite,
+            progress=progress,
+            report=report,
         )
     if full_points:
-        raise ArgumentError("full_points", expected="a recording, .rrd or .mcap", found=str(out or "a window"))
+        raise ArgumentError(
+            "full_points", expected="a recording, .rrd or .mcap", found=str(out or "a window")
+        )
     if target is not None:
         return write_page(
             scene,

@@ -72,7 +72,11 @@ class Window:
     """
 
     def __init__(
-        self, reader: SceneReader, *, size: tuple[int, int] = (1280, 800), report: Callable[[str], None] | None = None
+        self,
+        reader: SceneReader,
+        *,
+        size: tuple[int, int] = (1280, 800),
+        report: Callable[[str], None] | None = None,
     ) -> None:
         """Open the window.
 
@@ -100,7 +104,9 @@ class Window:
         self._draw()
 
     def tick(self) -> bool:
-        """Draw, and go to the next frame when it is due while playing; return False after the window was closed."""
+        """Draw, and go to the next frame when it is due while playing; return False after the
+        window was closed.
+        """
         if self.state.playing and time.monotonic() >= self._due:
             self._due = time.monotonic() + FRAME_PERIOD_S
             self.step(1)
@@ -131,7 +137,9 @@ class Window:
         if number < len(listed):
             entry = listed[number]
             self.state.hidden ^= {entry.order}
-            self.report(f"{entry.name}: {'hidden' if entry.order in self.state.hidden else 'shown'}")
+            self.report(
+                f"{entry.name}: {'hidden' if entry.order in self.state.hidden else 'shown'}"
+            )
             self._draw()
 
     def show_all(self) -> None:
@@ -140,7 +148,9 @@ class Window:
         self._draw()
 
     def next_panel(self) -> None:
-        """Switch to the next panel of the scene: prediction, truth and errors, or the grid, and its voxels by actor."""
+        """Switch to the next panel of the scene: prediction, truth and errors, or the grid, and its
+        voxels by actor.
+        """
         if len(self.reader.panels) > 1:
             self.state.panel = (self.state.panel + 1) % len(self.reader.panels)
             self.state.hidden.clear()
@@ -149,7 +159,10 @@ class Window:
 
     @property
     def classes(self) -> list[Entry]:
-        """The classes that can be hidden: all classes of the panel's table except free. `order` is the class id."""
+        """The classes that can be hidden: all classes of the panel's table except free.
+
+        `order` is the class id.
+        """
         colors = self.reader.colors if self._panel is None else self._panel.colors
         return colors.entries(colors.table.names)
 
@@ -174,7 +187,9 @@ class Window:
         self._ways: tuple[Trail, ...] = self._trails.follow(position, self._content, self._moving)
 
     def _open(self, size: tuple[int, int]) -> None:
-        no_screen = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        no_screen = sys.platform == "linux" and not (
+            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        )
         if no_screen or not self._visualizer.create_window(f"carlasc: {self.reader.name}", *size):
             raise DependencyError(
                 "window",
@@ -184,14 +199,20 @@ class Window:
             )
 
     def _frame_camera(self) -> None:
-        """Draw the rim of the extent, so that all frames have one scale, and look from behind and above."""
+        """Draw the rim of the extent, so that all frames have one scale, and look from behind and
+        above.
+        """
         options = self._visualizer.get_render_option()
         options.background_color = np.array(_BACKGROUND)
         options.light_on = False  # the colours include the light
         options.point_size = 2.5
         options.mesh_show_back_face = True
         panels, scan = self.reader.panels, self._content.scan
-        corners = grid_extent(panels[0].spec) if panels else scan_extent(scan or Scan(np.empty((0, 3), np.float32)))
+        corners = (
+            grid_extent(panels[0].spec)
+            if panels
+            else scan_extent(scan or Scan(np.empty((0, 3), np.float32)))
+        )
         lower, upper = corners.min(0), corners.max(0)
         rim = np.array([(x, y, lower[2]) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], np.float64)
         rim[:, :2] = lower[:2] + rim[:, :2] * (upper - lower)[:2]
@@ -215,11 +236,15 @@ class Window:
             ord("A"): self.show_all,
             ord("R"): self._reset_camera,
         }
-        simple |= {ord(key.upper()): partial(self.toggle_layer, layer) for key, layer in LAYERS.items()}
+        simple |= {
+            ord(key.upper()): partial(self.toggle_layer, layer) for key, layer in LAYERS.items()
+        }
         for key, action in simple.items():
             self._visualizer.register_key_callback(key, partial(_call, action))
         for digit in range(10):
-            self._visualizer.register_key_action_callback(ord(str(digit)), partial(self._on_digit, (digit - 1) % 10))
+            self._visualizer.register_key_action_callback(
+                ord(str(digit)), partial(self._on_digit, (digit - 1) % 10)
+            )
 
     def _on_digit(self, place: int, _: Any, action: int, modifiers: int) -> bool:
         if action == _PRESSED:
@@ -260,7 +285,9 @@ class Window:
         return self._shapes.mesh(mesh)
 
     def _points(self) -> Any:
-        """Return the points in the colours of their classes, or of their actors if the panel shows actors."""
+        """Return the points in the colours of their classes, or of their actors if the panel shows
+        actors.
+        """
         scan = self._content.scan
         if scan is None:
             return None
@@ -268,7 +295,8 @@ class Window:
         if panel is not None and panel.name == "actors" and scan.instances is not None:
             colors, ids = panel.colors, palette.actor_ids(scan.instances)
         ids = np.zeros(len(scan), np.uint8) if ids is None else ids
-        hidden = self.state.hidden if panel is None or panel.colors is colors else set[int]()  # ids of the panel
+        # ids of the panel
+        hidden = self.state.hidden if panel is None or panel.colors is colors else set[int]()
         shown, by_id = ~np.isin(ids, list(hidden)), colors.by_id.copy()
         by_id[0] = palette.UNLABELLED
         return self._shapes.points(scan.points[shown], by_id[ids[shown]]) if shown.any() else None
@@ -278,10 +306,16 @@ class Window:
             return None
         tails, vectors = motion_arrows(self._moving)
         inside = self._within(tails)
-        return self._shapes.mesh(arrows(tails[inside], vectors[inside], palette.ARROW, 0.24)) if inside.any() else None
+        return (
+            self._shapes.mesh(arrows(tails[inside], vectors[inside], palette.ARROW, 0.24))
+            if inside.any()
+            else None
+        )
 
     def _within(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which of (N, 3) positions are in the drawn scene: above or below the grid if points are not shown."""
+        """Return which of (N, 3) positions are in the drawn scene: above or below the grid if
+        points are not shown.
+        """
         if self._panel is None or "points" in self.state.layers:
             return np.ones(len(places), np.bool_)
         spec = self._panel.spec
@@ -289,26 +323,40 @@ class Window:
         return spec.index(spec.to_axes(places * [1, 1, 0] + [0, 0, middle]))[1]
 
     def _boxes(self) -> Any:
-        """Return the edges of the boxes, and a bar to the front of each, in the colours of their classes."""
+        """Return the edges of the boxes, and a bar to the front of each, in the colours of their
+        classes.
+        """
         boxes = self._content.boxes
         if boxes is None or not len(boxes):
             return None
         ends = box_lines(boxes)
-        return self._shapes.lines(ends, np.repeat(self.reader.colors.by_id[boxes.labels], len(ends) // len(boxes), 0))
+        return self._shapes.lines(
+            ends, np.repeat(self.reader.colors.by_id[boxes.labels], len(ends) // len(boxes), 0)
+        )
 
     def _tracks(self) -> Any:
         """Return the tracks of the actors, in the colours of their classes."""
         if not self._ways or self._content.pose is None:
             return None
-        ends = np.concatenate([np.stack([way.points[:-1], way.points[1:]], axis=1) for way in self._ways])
-        labels = np.repeat([way.label for way in self._ways], [len(way.points) - 1 for way in self._ways])
+        ends = np.concatenate(
+            [np.stack([way.points[:-1], way.points[1:]], axis=1) for way in self._ways]
+        )
+        labels = np.repeat(
+            [way.label for way in self._ways], [len(way.points) - 1 for way in self._ways]
+        )
         ends = transform_points(invert(self._content.pose), ends.reshape(-1, 3)).reshape(-1, 2, 3)
         inside = self._within(ends[:, 1])
-        return self._shapes.lines(ends[inside], self.reader.colors.by_id[labels[inside]]) if inside.any() else None
+        return (
+            self._shapes.lines(ends[inside], self.reader.colors.by_id[labels[inside]])
+            if inside.any()
+            else None
+        )
 
 
 def show_window(scene: Scene, *, report: Callable[[str], None] | None = None) -> None:
-    """Show a scene in a window until it is closed; see `carlasc.viewing.view` for the arguments and errors."""
+    """Show a scene in a window until it is closed; see `carlasc.viewing.view` for the arguments and
+    errors.
+    """
     window = Window(scene.open(), report=report)
     for line in help_lines(window):
         window.report(line)
@@ -323,9 +371,14 @@ def help_lines(window: Window) -> list[str]:
     """Return what the keys do, and the class of each digit key."""
     marks = ("", "Shift+", "Ctrl+")
     digits = [
-        f"{marks[number // 10]}{(number + 1) % 10} {entry.name}" for number, entry in enumerate(window.classes[:30])
+        f"{marks[number // 10]}{(number + 1) % 10} {entry.name}"
+        for number, entry in enumerate(window.classes[:30])
     ]
-    return [*window.reader.notes, *(f"{keys:<12} {what}" for keys, what in KEYS.items()), ", ".join(digits)]
+    return [
+        *window.reader.notes,
+        *(f"{keys:<12} {what}" for keys, what in KEYS.items()),
+        ", ".join(digits),
+    ]
 
 
 def _call(action: Callable[[], None], _: Any) -> bool:

@@ -1,1 +1,4 @@
-"""Converters of other data sets into the CarlaSC layout. `carlasc` finds them through the entry-point group `carlasc.converters`."""
+"""Converters of other data sets into the CarlaSC layout.
+
+`carlasc` finds them through the entry-point group `carlasc.converters`.
+"""

@@ -11,7 +11,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting.protocol import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory
+from carlasc.converting.protocol import (
+    Cloud,
+    Converter,
+    FrameHandle,
+    Recording,
+    Sensor,
+    Split,
+    Trajectory,
+)
 from carlasc.core import CameraModel
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import translation
@@ -25,8 +33,14 @@ _SPLITS: dict[str, Split] = {"train": "Train", "val": "Val", "test": "Test"}
 _LEVELS = 4  # depth of a log below the given folder: root/sensor/train/LOG, and one more
 _SENSORS = ("up_lidar", "down_lidar")  # lasers 0 to 31, and 32 to 63
 _LASERS = 32
-_AXLE_HEIGHT_M = 0.33  # the origin of the vehicle's frame is the rear axle: measured on the ground points of two logs
-_ASSUMED_M = (1.35, 0.0, 1.58)  # midway between the two LiDARs, which are 0.11 m apart, as calibrated in log 7fab2350
+# the origin of the vehicle's frame is the rear axle: measured on the ground points of two logs
+_AXLE_HEIGHT_M = 0.33
+# midway between the two LiDARs, which are 0.11 m apart, as calibrated in log 7fab2350
+_ASSUMED_M = (
+    1.35,
+    0.0,
+    1.58,
+)
 _INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
 _NEAR_NS = 100_000_000  # an image that is farther from a frame in time does not belong to it
 _QUATERNION, _TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
@@ -53,7 +67,9 @@ class Argoverse2(Converter):
         """
         root = self.source.resolve()
         patterns = ("*/" * level + "sensors/lidar" for level in range(_LEVELS + 1))
-        logs = {path.parents[1] for pattern in patterns for path in root.glob(pattern) if path.is_dir()}
+        logs = {
+            path.parents[1] for pattern in patterns for path in root.glob(pattern) if path.is_dir()
+        }
         if not logs:
             raise MissingDataError(
                 self.source,
@@ -67,8 +83,9 @@ class Argoverse2(Converter):
 class Argoverse2Log(Recording):
     """One log.
 
-    Frames are the existing and the annotated sweeps. A frame therefore keeps its number if other files of the log are missing, and tracks
-    have their annotated length. Times begin at the first frame.
+    Frames are the existing and the annotated sweeps. A frame therefore keeps its number if other
+    files of the log are missing, and tracks have their annotated length. Times begin at the first
+    frame.
 
     Attributes:
         folder: its folder.
@@ -86,10 +103,14 @@ class Argoverse2Log(Recording):
 
     @cached_property
     def _annotated(self) -> NDArray[np.int64]:
-        """(A,) timestamps of the annotated sweeps in nanoseconds, increasing; none if nothing is annotated."""
+        """(A,) timestamps of the annotated sweeps in nanoseconds, increasing; none if nothing is
+        annotated.
+        """
         if not self._annotations.is_file():
             return np.zeros(0, np.int64)
-        return np.unique(read_columns(self._annotations, ("timestamp_ns",))["timestamp_ns"].astype(np.int64))
+        return np.unique(
+            read_columns(self._annotations, ("timestamp_ns",))["timestamp_ns"].astype(np.int64)
+        )
 
     @cached_property
     def _timeline(self) -> NDArray[np.int64]:
@@ -98,8 +119,14 @@ class Argoverse2Log(Recording):
 
     @cached_property
     def _missing(self) -> tuple[list[tuple[int, int]], int]:
-        """Number and timestamp of annotated sweeps without a file between sweeps with files; and the number of others without a file."""
-        missing = [(number, at) for number, at in enumerate(self._timeline.tolist()) if at not in self._sweeps]
+        """Number and timestamp of annotated sweeps without a file between sweeps with files; and
+        the number of others without a file.
+        """
+        missing = [
+            (number, at)
+            for number, at in enumerate(self._timeline.tolist())
+            if at not in self._sweeps
+        ]
         sweeps = list(self._sweeps)
         between = [row for row in missing if sweeps and sweeps[0] < row[1] < sweeps[-1]]
         return between, len(missing) - len(between)
@@ -109,11 +136,17 @@ class Argoverse2Log(Recording):
         """The sweeps that exist."""
         found = enumerate(self._timeline.tolist())
         count = len(self.sensors)
-        return [Sweep(str(self._sweeps[at]), number, count) for number, at in found if at in self._sweeps]
+        return [
+            Sweep(str(self._sweeps[at]), number, count)
+            for number, at in found
+            if at in self._sweeps
+        ]
 
     @cached_property
     def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
-        """The upper and the lower LiDAR; one sensor at an assumed position if the log has no calibration."""
+        """The upper and the lower LiDAR; one sensor at an assumed position if the log has no
+        calibration.
+        """
         if not self._calibration.is_file():
             mount = translation(_ASSUMED_M)
             height = round(_ASSUMED_M[2] + _AXLE_HEIGHT_M, 2)
@@ -124,12 +157,19 @@ class Argoverse2Log(Recording):
         if lacking := [name for name in _SENSORS if name not in names]:
             found = ", ".join(names) or "none"
             raise FormatError(
-                where, expected=f"a row for each of {', '.join(_SENSORS)}", found=f"no {lacking[0]} in {found}"
+                where,
+                expected=f"a row for each of {', '.join(_SENSORS)}",
+                found=f"no {lacking[0]} in {found}",
             )
         poses = poses_of(_stack(table, _QUATERNION), _stack(table, _TRANSLATION), where)
         mounts = [poses[names.index(name)] for name in _SENSORS]
         return [
-            Sensor(name, mount, points_in="vehicle", height_m=round(float(mount[2, 3]) + _AXLE_HEIGHT_M, 2))
+            Sensor(
+                name,
+                mount,
+                points_in="vehicle",
+                height_m=round(float(mount[2, 3]) + _AXLE_HEIGHT_M, 2),
+            )
             for name, mount in zip(_SENSORS, mounts, strict=True)
         ]
 
@@ -146,7 +186,9 @@ class Argoverse2Log(Recording):
         return self.folder / "city_SE3_egovehicle.feather"
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
-        """Return the poses of the vehicle in the city's frame, at their own times: about 100 a second."""
+        """Return the poses of the vehicle in the city's frame, at their own times: about 100 a
+        second.
+        """
         if not self._poses.is_file():
             return None
         table = read_columns(self._poses, ("timestamp_ns", *_QUATERNION, *_TRANSLATION))
@@ -158,25 +200,34 @@ class Argoverse2Log(Recording):
         return self._seconds(self._timeline)
 
     def _seconds(self, timestamps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return seconds after the first frame. Nanoseconds are subtracted as integers, because float64 would round them to 64 ns."""
+        """Return seconds after the first frame.
+
+        Nanoseconds are subtracted as integers, because float64 would round them to 64 ns.
+        """
         start = self._timeline[0] if len(self._timeline) else 0
         return (timestamps.astype(np.int64) - start) * 1e-9
 
     def cameras(self) -> Sequence[CameraModel]:
-        """Return the ring and stereo cameras, with the images nearest in time to each frame; none without their calibration."""
+        """Return the ring and stereo cameras, with the images nearest in time to each frame; none
+        without their calibration.
+        """
         path = self.folder / "calibration" / "intrinsics.feather"
         if not path.is_file() or not self._calibration.is_file():
             return ()
         table = read_columns(path, _INTRINSICS, ("sensor_name",))
         places = read_columns(self._calibration, (*_QUATERNION, *_TRANSLATION), ("sensor_name",))
-        poses = poses_of(_stack(places, _QUATERNION), _stack(places, _TRANSLATION), str(self._calibration))
+        poses = poses_of(
+            _stack(places, _QUATERNION), _stack(places, _TRANSLATION), str(self._calibration)
+        )
         by_name = dict(zip(places["sensor_name"].tolist(), poses, strict=True))
         found = []
         for row, name in enumerate(table["sensor_name"].tolist()):
             if name not in by_name:
                 expected = f"a row for each of {', '.join(table['sensor_name'].tolist())}"
                 raise FormatError(self._calibration, expected=expected, found=f"no {name}")
-            fx, fy, cx, cy, k1, k2, k3, width, height = (float(table[key][row]) for key in _INTRINSICS)
+            fx, fy, cx, cy, k1, k2, k3, width, height = (
+                float(table[key][row]) for key in _INTRINSICS
+            )
             times, images = self._images_of(name)
             found.append(
                 CameraModel(
@@ -194,24 +245,37 @@ class Argoverse2Log(Recording):
         return found
 
     def _images_of(self, name: str) -> tuple[NDArray[np.float64] | None, tuple[str, ...] | None]:
-        """Return the time and the path of the image nearest to each frame; None if the camera has no images."""
+        """Return the time and the path of the image nearest to each frame; None if the camera has
+        no images.
+        """
         folder = self.folder / "sensors" / "cameras" / name
-        paths = {int(path.stem): path for path in folder.glob("*.jpg") if path.stem.isascii() and path.stem.isdigit()}
+        paths = {
+            int(path.stem): path
+            for path in folder.glob("*.jpg")
+            if path.stem.isascii() and path.stem.isdigit()
+        }
         if not paths:
             return None, None
         nearest, near, images = nearest_images(paths, self._timeline, _NEAR_NS)
         return np.where(near, self._seconds(nearest), np.nan), images
 
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the boxes of the annotated sweeps. Tracks are numbered by the order of their UUIDs."""
+        """Return the boxes of the annotated sweeps.
+
+        Tracks are numbered by the order of their UUIDs.
+        """
         path = self._annotations
         if not path.is_file():
             return None
         numbers = ("timestamp_ns", *_QUATERNION, *_TRANSLATION, *_SIZE)
         table = read_columns(path, numbers, ("track_uuid", "category"))
-        tracks = np.unique(table["track_uuid"], return_inverse=True)[1].astype(np.uint32) + np.uint32(1)
+        tracks = np.unique(table["track_uuid"], return_inverse=True)[1].astype(
+            np.uint32
+        ) + np.uint32(1)
         labels = _labels(table["category"], str(path))
-        centers, quaternions, sizes = (_stack(table, names) for names in (_TRANSLATION, _QUATERNION, _SIZE))
+        centers, quaternions, sizes = (
+            _stack(table, names) for names in (_TRANSLATION, _QUATERNION, _SIZE)
+        )
         found = {}
         for number, at in enumerate(self._timeline.tolist()):
             own = table["timestamp_ns"] == at
@@ -219,7 +283,9 @@ class Argoverse2Log(Recording):
                 continue  # this sweep was not annotated
             annotated = np.ones(np.count_nonzero(own), np.bool_)
             try:
-                found[number] = Boxes(tracks[own], labels[own], centers[own], quaternions[own], sizes[own], annotated)
+                found[number] = Boxes(
+                    tracks[own], labels[own], centers[own], quaternions[own], sizes[own], annotated
+                )
             except FormatError as error:
                 raise error.within(f"{path}: timestamp {at}") from error
         return found
@@ -228,7 +294,12 @@ class Argoverse2Log(Recording):
         """Return the annotated sweeps without a file that are between sweeps with files."""
         lidar = self.folder / "sensors" / "lidar"
         errors = (
-            (number, MissingDataError(lidar / f"{at}.feather", expected="an annotated sweep", found="no such file"))
+            (
+                number,
+                MissingDataError(
+                    lidar / f"{at}.feather", expected="an annotated sweep", found="no such file"
+                ),
+            )
             for number, at in self._missing[0]
         )
         return [(number, str(error)) for number, error in errors]
@@ -239,12 +310,14 @@ class Argoverse2Log(Recording):
         if not self._calibration.is_file():
             place = ", ".join(f"{value:.2f}" for value in _ASSUMED_M)
             notes.append(
-                f"{self._calibration} does not exist: both LiDARs count as one, whose rays begin at ({place}) m in the frame of the"
+                f"{self._calibration} does not exist: both LiDARs count as one, whose rays begin "
+                f"at ({place}) m in the frame of the"
                 " vehicle, as assumed from another log"
             )
         if outside := self._missing[1]:
             notes.append(
-                f"{self.folder}: {outside} annotated sweeps before the first and after the last file do not exist"
+                f"{self.folder}: {outside} annotated sweeps before the first and after the last "
+                f"file do not exist"
             )
         return notes
 
@@ -267,9 +340,15 @@ class Sweep(FrameHandle):
         table = read_columns(Path(self.location), names)
         count, lasers = len(table["x"]), table["laser_number"]
         if not count:
-            raise FormatError(self.location, expected="points", found="an empty table", advice="download it again")
+            raise FormatError(
+                self.location, expected="points", found="an empty table", advice="download it again"
+            )
         if lasers.max() >= 2 * _LASERS:
-            raise FormatError(self.location, expected=f"laser numbers 0..{2 * _LASERS - 1}", found=str(lasers.max()))
+            raise FormatError(
+                self.location,
+                expected=f"laser numbers 0..{2 * _LASERS - 1}",
+                found=str(lasers.max()),
+            )
         points = np.empty((count, 4), np.float32)
         for column, name in enumerate(("x", "y", "z", "intensity")):
             points[:, column] = table[name]
@@ -278,7 +357,10 @@ class Sweep(FrameHandle):
         if self.sensors == 1:
             return (Cloud(points, seconds=seconds),)
         upper = lasers < _LASERS
-        return tuple(Cloud(points[own], seconds=seconds[own], sensor=k) for k, own in enumerate((upper, ~upper)))
+        return tuple(
+            Cloud(points[own], seconds=seconds[own], sensor=k)
+            for k, own in enumerate((upper, ~upper))
+        )
 
 
 def _is_sweep(path: Path) -> bool:

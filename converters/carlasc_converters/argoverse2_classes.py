@@ -1,12 +1,15 @@
-"""The classes of Argoverse 2: the categories of its boxes, and two classes for points outside of boxes."""
+"""The classes of Argoverse 2: the categories of its boxes, and two classes for points outside of
+boxes.
+"""
 
 from __future__ import annotations
 
 from carlasc.core.classes import ClassTable, Color, Remap
 from carlasc.core.tables import CARLA
 
-# The ids are those of the data set's scene flow labels: the categories in alphabetical order, from 1.
-# Points have no labels. The last two ids, which the data set does not have, are for points outside of boxes.
+# The ids are those of the data set's scene flow labels: the categories in alphabetical order, from
+# 1. Points have no labels. The last two ids, which the data set does not have, are for points
+# outside of boxes.
 _CATEGORIES: tuple[tuple[str, Color, str], ...] = (  # name, colour, class of CARLA
     ("NONE", (255, 255, 255), "Free"),
     ("ANIMAL", (70, 130, 180), "Dynamic"),
@@ -51,14 +54,22 @@ _STANDING = (
     "SIGN",
     "STOP_SIGN",
 )
-_PEOPLE = ("ANIMAL", "DOG", "OFFICIAL_SIGNALER", "PEDESTRIAN")  # and animals: their shape changes as they walk
+# and animals: their shape changes as they walk
+_PEOPLE = (
+    "ANIMAL",
+    "DOG",
+    "OFFICIAL_SIGNALER",
+    "PEDESTRIAN",
+)
 _NO_BOXES = ("NONE", "BACKGROUND", "GROUND")
 
 ARGOVERSE2 = ClassTable(
     "argoverse2",
     {index: name for name, index in _IDS.items()},
     {index: color for index, (_, color, _) in enumerate(_CATEGORIES)},
-    movable=frozenset(index for name, index in _IDS.items() if name not in (*_STANDING, *_NO_BOXES)),
+    movable=frozenset(
+        index for name, index in _IDS.items() if name not in (*_STANDING, *_NO_BOXES)
+    ),
     deformable=frozenset(_IDS[name] for name in _PEOPLE),
     ground=frozenset({_IDS["GROUND"]}),
     geometry_only=_IDS["BACKGROUND"],

@@ -39,13 +39,25 @@ class Bag(Converter):
         source: Path,
         *,
         topics: Annotated[
-            str | None, "Topics of points, one per LiDAR, with commas. The messages of the first are the frames."
+            str | None,
+            "Topics of points, one per LiDAR, with commas. The messages of the first are the "
+            "frames.",
         ] = None,
-        pose_topic: Annotated[str | None, "Topic of the poses, or /tf. Needed only if there are several."] = None,
-        pose_frame: Annotated[str | None, "Coordinate frame of the poses, if the messages do not name it."] = None,
-        world_frame: Annotated[str | None, "Reference frame of poses from /tf, such as odom, map or world."] = None,
-        time_unit: Annotated[TimeUnit, "Unit of the times of points. auto: from the duration of a scan."] = "auto",
-        deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = False,
+        pose_topic: Annotated[
+            str | None, "Topic of the poses, or /tf. Needed only if there are several."
+        ] = None,
+        pose_frame: Annotated[
+            str | None, "Coordinate frame of the poses, if the messages do not name it."
+        ] = None,
+        world_frame: Annotated[
+            str | None, "Reference frame of poses from /tf, such as odom, map or world."
+        ] = None,
+        time_unit: Annotated[
+            TimeUnit, "Unit of the times of points. auto: from the duration of a scan."
+        ] = "auto",
+        deskewed: Annotated[
+            bool, "The points are already corrected for the motion of the vehicle."
+        ] = False,
     ) -> None:
         super().__init__(source)
         self.options = BagOptions(topics, pose_topic, pose_frame, world_frame, time_unit, deskewed)
@@ -74,9 +86,13 @@ class BagOptions:
 
 
 class BagRecording(Recording):
-    """A bag. The messages of the first LiDAR are its frames. Messages of other LiDARs belong to the nearest frame in time.
+    """A bag.
 
-    Its times begin at the first frame. The frame of the vehicle is the one with poses, or `base_link`, or the first LiDAR.
+    The messages of the first LiDAR are its frames. Messages of other LiDARs belong to the nearest
+    frame in time.
+
+    Its times begin at the first frame. The frame of the vehicle is the one with poses, or
+    `base_link`, or the first LiDAR.
     """
 
     split = "Train"
@@ -85,7 +101,9 @@ class BagRecording(Recording):
         self._files, self._options, self.location = files, options, files.location
         self.name = sequence_name(files.paths[0].name.split(".")[0].removesuffix("_0"))
         self._pose_note, self._notes = "", list[str]()
-        self._lidars = [LidarTopic(topic, options.time_unit) for topic in files.clouds(options.topics)]
+        self._lidars = [
+            LidarTopic(topic, options.time_unit) for topic in files.clouds(options.topics)
+        ]
 
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
@@ -93,9 +111,16 @@ class BagRecording(Recording):
         first, *others = self._lidars
         near = [lidar.nearest(first.stamps) for lidar in others]
         frames = list[FrameHandle]()
-        for number, (place, stamp) in enumerate(zip(first.places, first.stamps.tolist(), strict=True)):
-            parts = [(0, place, first.unit), *((k, rows[number], others[k - 1].unit) for k, rows in enumerate(near, 1))]
-            given = tuple(CloudPlace(k, found, unit) for k, found, unit in parts if found is not None)
+        for number, (place, stamp) in enumerate(
+            zip(first.places, first.stamps.tolist(), strict=True)
+        ):
+            parts = [
+                (0, place, first.unit),
+                *((k, rows[number], others[k - 1].unit) for k, rows in enumerate(near, 1)),
+            ]
+            given = tuple(
+                CloudPlace(k, found, unit) for k, found, unit in parts if found is not None
+            )
             frames.append(BagFrame(number, f"{place}: message {number}", stamp, given))
         return frames
 
@@ -119,11 +144,13 @@ class BagRecording(Recording):
         return self._seconds(self._lidars[0].stamps)
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
-        """Return the poses of the topic of poses, or of the tree of transforms; None if the bag has neither.
+        """Return the poses of the topic of poses, or of the tree of transforms; None if the bag has
+        neither.
 
         Raises:
             ArgumentError: there are several topics of poses, and none is named.
-            MissingDataError: no transforms lead from the LiDAR to the frame of the poses, or from there to the world.
+            MissingDataError: no transforms lead from the LiDAR to the frame of the poses, or from
+                there to the world.
             FormatError: a pose is not valid, or poses and scans were not recorded at the same time.
         """
         topic = self._files.poses(self._options.pose_topic)
@@ -147,12 +174,16 @@ class BagRecording(Recording):
         own = self._lidars[0].stamps
         if stamps[-1] < own[0] or stamps[0] > own[-1]:
             expected = f"poses between {own[0] / 1e9:.3f} and {own[-1] / 1e9:.3f} s, the times of the scans"
-            raise FormatError(where, expected=expected, found=f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s")
+            raise FormatError(
+                where, expected=expected, found=f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s"
+            )
         self._pose_note = f"{where}: the poses are those of {self._unplaced or self._vehicle}"
         return Trajectory(poses, self._seconds(stamps), where)
 
     def cameras(self) -> Sequence[CameraModel]:
-        """Return the cameras that transforms place on the vehicle, with the image nearest to each frame."""
+        """Return the cameras that transforms place on the vehicle, with the image nearest to each
+        frame.
+        """
         found, stamps = list[CameraModel](), self._lidars[0].stamps
         for camera in self._cameras.values():
             if not self._tree.connected(camera.frame, self._vehicle):
@@ -160,7 +191,10 @@ class BagRecording(Recording):
                 self._notes.append(note)
                 continue
             rows = self._images[camera.name]
-            taken = [np.nan if row is None else float(camera.images[0][row] - stamps[0]) * 1e-9 for row in rows]
+            taken = [
+                np.nan if row is None else float(camera.images[0][row] - stamps[0]) * 1e-9
+                for row in rows
+            ]
             place = self._tree.lookup(self._vehicle, camera.frame, stamps[:1])[0]
             found.append(camera.model(place, np.array(taken) if len(camera.images[0]) else None))
         return found
@@ -177,17 +211,27 @@ class BagRecording(Recording):
     @cached_property
     def _images(self) -> dict[str, list[int | None]]:
         """The row of the image of each frame, by camera."""
-        return {name: camera.nearest(self._lidars[0].stamps) for name, camera in self._cameras.items()}
+        return {
+            name: camera.nearest(self._lidars[0].stamps) for name, camera in self._cameras.items()
+        }
 
     def notes(self) -> list[str]:
         """Return notes on incomplete files, and on what was assumed."""
-        notes = [*self._files.notes(), *self._notes, *(note for lidar in self._lidars for note in lidar.notes)]
+        notes = [
+            *self._files.notes(),
+            *self._notes,
+            *(note for lidar in self._lidars for note in lidar.notes),
+        ]
         if self._pose_note:
             assumed = self._pose_child == "" and not self._options.pose_frame
-            notes.append(self._pose_note + (", which is assumed: the messages do not name it" if assumed else ""))
+            notes.append(
+                self._pose_note
+                + (", which is assumed: the messages do not name it" if assumed else "")
+            )
         if self._pose_note and self._unplaced:
             notes.append(
-                f"{self.location}: no transforms lead from {self._lidars[0].frame} to {self._unplaced}: both are taken as the same frame"
+                f"{self.location}: no transforms lead from {self._lidars[0].frame} to "
+                f"{self._unplaced}: both are taken as the same frame"
             )
         return list(dict.fromkeys(notes))
 
@@ -201,7 +245,9 @@ class BagRecording(Recording):
 
     @cached_property
     def _pose_child(self) -> str | None:
-        """The frame of the poses by their messages, empty if they do not name it; None without exactly one topic of poses."""
+        """The frame of the poses by their messages, empty if they do not name it; None without
+        exactly one topic of poses.
+        """
         try:
             topic = self._files.poses(self._options.pose_topic)
             if topic is None or topic.channel.type in TRANSFORMS:
@@ -214,7 +260,9 @@ class BagRecording(Recording):
     def _unplaced(self) -> str | None:
         """The frame of the poses, if no transforms lead there from the first LiDAR."""
         wanted = self._options.pose_frame or self._pose_child
-        return wanted if wanted and not self._tree.connected(self._lidars[0].frame, wanted) else None
+        return (
+            wanted if wanted and not self._tree.connected(self._lidars[0].frame, wanted) else None
+        )
 
     @cached_property
     def _vehicle(self) -> str:
@@ -225,7 +273,10 @@ class BagRecording(Recording):
         return wanted if wanted and not self._unplaced else next(bases, lidar)
 
     def _placed(self, topic: Topic) -> Iterator[PlacedFrame]:
-        """Yield the poses or transforms of a topic. Of a topic of paths, the last message is read, which holds the whole path."""
+        """Yield the poses or transforms of a topic.
+
+        Of a topic of paths, the last message is read, which holds the whole path.
+        """
         places, errors = list(topic.places()), list[FormatError]()
         for place in places[-1:] if topic.channel.type == PATH else places:
             try:
@@ -233,27 +284,47 @@ class BagRecording(Recording):
             except FormatError as error:
                 errors.append(error)
         if errors:
-            self._notes.append(f"{errors[0]}: so {len(errors)} of {len(places)} messages are left out")
+            self._notes.append(
+                f"{errors[0]}: so {len(errors)} of {len(places)} messages are left out"
+            )
 
-    def _poses_of_tree(self, *, required: bool) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return times and poses of the vehicle in the world; None if the vehicle does not move in the tree."""
+    def _poses_of_tree(
+        self, *, required: bool
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Return times and poses of the vehicle in the world; None if the vehicle does not move in
+        the tree.
+        """
         line, wanted = self._tree.ancestors(self._vehicle), self._options.world_frame
-        world = next((name for name in ((wanted,) if wanted else (*_WORLDS, line[-1])) if name in line), None)
+        world = next(
+            (name for name in ((wanted,) if wanted else (*_WORLDS, line[-1])) if name in line), None
+        )
         edges = [] if world is None else self._tree.edges(self._vehicle, world)
         moving = [edge for edge in edges if edge.moves]
         if world is not None and moving:
             stamps = max(moving, key=len).values[0]
             return stamps, self._tree.lookup(world, self._vehicle, stamps)
         if required or wanted:
-            raise self._no_path(self._lidars[0].frame, wanted or _WORLDS[0], 'estimate poses with `poses="kiss-icp"`')
+            raise self._no_path(
+                self._lidars[0].frame,
+                wanted or _WORLDS[0],
+                'estimate poses with `poses="kiss-icp"`',
+            )
         if self._tree.moves:
-            self._notes.append(f"{self.location}: transforms do not say how {self._vehicle} moves, only {self._tree}")
+            self._notes.append(
+                f"{self.location}: transforms do not say how {self._vehicle} moves, only "
+                f"{self._tree}"
+            )
         return None
 
     def _no_path(self, frame: str, target: str, advice: str) -> MissingDataError:
         expected = f"transforms from {frame} to {target}"
-        return MissingDataError(self.location, expected=expected, found=f"only {self._tree}", advice=advice)
+        return MissingDataError(
+            self.location, expected=expected, found=f"only {self._tree}", advice=advice
+        )
 
     def _seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return seconds after the first frame. Nanoseconds are subtracted as integers, because float64 would round them to 256 ns."""
+        """Return seconds after the first frame.
+
+        Nanoseconds are subtracted as integers, because float64 would round them to 256 ns.
+        """
         return (stamps - self._lidars[0].stamps[0]) * 1e-9

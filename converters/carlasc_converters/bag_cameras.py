@@ -1,4 +1,6 @@
-"""The cameras of a bag: projections from CameraInfo, and images from Image or CompressedImage in the same namespace."""
+"""The cameras of a bag: projections from CameraInfo, and images from Image or CompressedImage in
+the same namespace.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,13 @@ from carlasc.core.cameras import Lens
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError, reading
 from carlasc.storage.camera_files import encode_image
-from carlasc_converters.bag_messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGES, decode, read_stamp
+from carlasc_converters.bag_messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGES,
+    decode,
+    read_stamp,
+)
 from carlasc_converters.bag_topics import BagFiles, MessagePlace, Topic
 from carlasc_converters.image_files import nearest_rows
 
@@ -23,7 +31,13 @@ _MODELS: dict[str, tuple[Lens, tuple[int, ...]]] = {
     "rational_polynomial": ("radial-tangential", (8,)),
     "equidistant": ("fisheye", (4,)),
 }
-_CHANNELS = {"mono8": (0,), "rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
+_CHANNELS = {
+    "mono8": (0,),
+    "rgb8": (0, 1, 2),
+    "bgr8": (2, 1, 0),
+    "rgba8": (0, 1, 2),
+    "bgra8": (2, 1, 0),
+}
 _WIDTHS = {"mono8": 1, "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4}
 _ENDINGS = {b"\xff\xd8": "jpg", b"\x89PNG"[:2]: "png"}
 
@@ -59,12 +73,16 @@ class BagCamera:
     def images(self) -> tuple[NDArray[np.int64], list[MessagePlace]]:
         """(N,) increasing times of the images, nanoseconds, and their positions."""
         places = [] if self.topic is None else list(self.topic.places())
-        stamps = np.array([read_stamp(place.read(), place.channel, str(place)) for place in places], np.int64)
+        stamps = np.array(
+            [read_stamp(place.read(), place.channel, str(place)) for place in places], np.int64
+        )
         times, first = np.unique(stamps, return_index=True)
         return times, [places[row] for row in first.tolist()]
 
     def nearest(self, frames: NDArray[np.int64]) -> list[int | None]:
-        """Return the row of the image nearest to each of (F,) times, nanoseconds; None if it is nearer to another frame."""
+        """Return the row of the image nearest to each of (F,) times, nanoseconds; None if it is
+        nearer to another frame.
+        """
         times, _ = self.images
         if not len(times):
             return [None] * len(frames)
@@ -81,20 +99,28 @@ class BagCamera:
         """
         info, where = self.message, str(self.info)
         with reading(where, "a message of type CameraInfo"):
-            given = {key: np.array(getattr(info, key.lower(), getattr(info, key, ())), np.float64) for key in "DKP"}
+            given = {
+                key: np.array(getattr(info, key.lower(), getattr(info, key, ())), np.float64)
+                for key in "DKP"
+            }
             kind, distortion = str(info.distortion_model), given["D"]
             width, height = int(info.width), int(info.height)
             rectified = (
                 self.topic is not None
-                and "rect" in self.topic.channel.topic.removesuffix("/compressed").rpartition("/")[2]
+                and "rect"
+                in self.topic.channel.topic.removesuffix("/compressed").rpartition("/")[2]
             )
             matrix = given["P"].reshape(3, 4)[:, :3] if rectified else given["K"].reshape(3, 3)
         model: Lens = "pinhole"
         if not rectified and distortion.any():
             model, counts = _MODELS.get(kind, ("pinhole", ()))
             if len(distortion) not in counts:
-                expected = "one of the models " + ", ".join(f"{name} ({n[-1]})" for name, (_, n) in _MODELS.items())
-                raise FormatError(where, expected=expected, found=f"{kind!r} with {len(distortion)} coefficients")
+                expected = "one of the models " + ", ".join(
+                    f"{name} ({n[-1]})" for name, (_, n) in _MODELS.items()
+                )
+                raise FormatError(
+                    where, expected=expected, found=f"{kind!r} with {len(distortion)} coefficients"
+                )
         coefficients = tuple(distortion.tolist()) if model != "pinhole" else ()
         return CameraModel(
             name=self.name,
@@ -122,7 +148,9 @@ class BagCamera:
                     raise FormatError(where, expected="a JPEG or PNG", found=str(message.format))
                 return ending, data.tobytes()
             if message.encoding not in _CHANNELS:
-                raise FormatError(where, expected=f"one of {', '.join(_CHANNELS)}", found=repr(message.encoding))
+                raise FormatError(
+                    where, expected=f"one of {', '.join(_CHANNELS)}", found=repr(message.encoding)
+                )
             rows = data[: message.height * message.step].reshape(message.height, message.step)
             wide = _WIDTHS[message.encoding]
             pixels = rows[:, : message.width * wide].reshape(message.height, message.width, wide)
@@ -131,7 +159,9 @@ class BagCamera:
 
 
 def find_cameras(files: BagFiles) -> list[BagCamera]:
-    """Return the cameras of a bag, by the name of their topics; of several topics of images, the compressed one is read, because its messages are files."""
+    """Return the cameras of a bag, by the name of their topics; of several topics of images, the
+    compressed one is read, because its messages are files.
+    """
     images, found = files.of_types(IMAGES), []
     for topic in files.of_types((CAMERA_INFO,)):
         space = topic.channel.topic.rpartition("/")[0] + "/"

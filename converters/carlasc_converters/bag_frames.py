@@ -18,7 +18,9 @@ from carlasc_converters.bag_topics import MessagePlace, Topic
 from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds
 
 _PACKETS_HZ = 150  # messages that are more frequent are packets, because no LiDAR turns so fast
-_OWN_CLOCK_S = 1.0  # times of points that differ more from the time of the message are from another clock
+_OWN_CLOCK_S = (
+    1.0  # times of points that differ more from the time of the message are from another clock
+)
 _PROBES = 5  # number of messages from which the unit of the times of points is found
 
 
@@ -37,13 +39,17 @@ class LidarTopic:
             raise FormatError(
                 f"{topic.parts[0][0]}: {self.name}",
                 expected="a message for each turn of the LiDAR",
-                found=f"{len(topic)} messages, {1 / max(period, 1e-9):.0f} per second, of a packet each",
+                found=f"{len(topic)} messages, {1 / max(period, 1e-9):.0f} per second, of a "
+                f"packet each",
                 advice="set the driver to publish full turns, and replay its packets",
             )
 
     @cached_property
     def _read(self) -> tuple[NDArray[np.int64], list[MessagePlace]]:
-        """The time and position of each message, by time. An unreadable message follows the one before it; reading its frame reports the error."""
+        """The time and position of each message, by time.
+
+        An unreadable message follows the one before it; reading its frame reports the error.
+        """
         found, places = list[int | None](), list(self._topic.places())
         for place in places:
             try:
@@ -55,11 +61,13 @@ class LidarTopic:
         for stamp in found:
             stamps.append(stamps[-1] + 1 if stamp is None else stamp)
         del stamps[0]
-        known = np.array(stamps, np.int64) if any(found) else self._topic.times  # the fields were not filled in
+        # the fields were not filled in
+        known = np.array(stamps, np.int64) if any(found) else self._topic.times
         times, first = np.unique(known, return_index=True)
         if len(times) < len(stamps):
             self.notes.append(
-                f"{self.name}: {len(stamps) - len(times)} messages have the time of another one, and are left out"
+                f"{self.name}: {len(stamps) - len(times)} messages have the time of another one, "
+                f"and are left out"
             )
         return times, [places[row] for row in first]
 
@@ -118,14 +126,22 @@ class LidarTopic:
         return "auto"
 
     def nearest(self, stamps: NDArray[np.int64]) -> list[MessagePlace | None]:
-        """Return the message nearest to each time; None if it is farther away than the interval of messages."""
+        """Return the message nearest to each time; None if it is farther away than the interval of
+        messages.
+        """
         own = self.stamps
         reach = float(np.median(np.diff(own))) if len(own) > 1 else float("inf")
         rows = np.searchsorted((own[:-1] + own[1:]) // 2, stamps)
         near = np.abs(own[rows] - stamps) <= reach
         if not near.all():
-            self.notes.append(f"{self.name}: has no message near {np.count_nonzero(~near)} of {len(stamps)} frames")
-        return [self.places[row] if there else None for row, there in zip(rows.tolist(), near.tolist(), strict=True)]
+            self.notes.append(
+                f"{self.name}: has no message near {np.count_nonzero(~near)} of {len(stamps)} "
+                f"frames"
+            )
+        return [
+            self.places[row] if there else None
+            for row, there in zip(rows.tolist(), near.tolist(), strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -158,7 +174,10 @@ class BagFrame(FrameHandle):
     clouds: tuple[CloudPlace, ...]
 
     def read(self) -> Sequence[Cloud]:
-        """Read the points of each LiDAR. Points that are NaN or at the origin are no returns, and left out."""
+        """Read the points of each LiDAR.
+
+        Points that are NaN or at the origin are no returns, and left out.
+        """
         return [self._read(cloud) for cloud in self.clouds]
 
     def _read(self, cloud: CloudPlace) -> Cloud:
@@ -174,7 +193,9 @@ class BagFrame(FrameHandle):
             points[:, :3] = transform_points(message.pose, points[:, :3])
         points[:, 3] = np.nan_to_num(points[:, 3])
         seconds = self._seconds_of(message, fields.get("time"), cloud.unit, where)
-        return Cloud(points, seconds=None if seconds is None else seconds[seen], sensor=cloud.sensor)
+        return Cloud(
+            points, seconds=None if seconds is None else seconds[seen], sensor=cloud.sensor
+        )
 
     def _seconds_of(
         self, message: CloudMessage, times: NDArray[np.generic] | None, unit: TimeUnit, where: str

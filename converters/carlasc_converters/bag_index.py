@@ -1,6 +1,8 @@
-"""The index of the messages in a file of a bag, from one pass over the records, so that any message can be read alone.
+"""The index of the messages in a file of a bag, from one pass over the records, so that any message
+can be read alone.
 
-The pass does not need the index at the end of a file: of a file that was cut short, all messages before the cut are read.
+The pass does not need the index at the end of a file: of a file that was cut short, all messages
+before the cut are read.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from carlasc.errors import FormatError, import_extra
 
 EXTRA = "bags"
 PLACE = np.dtype([("time", "<i8"), ("chunk", "<i8"), ("offset", "<i8")])
-"""The position of a message: time of its recording, nanoseconds; start of its chunk, -1 without one; its place in the chunk or file."""
+"""The position of a message: time of its recording, nanoseconds; start of its chunk, -1 without
+one; its place in the chunk or file.
+"""
 
 
 @dataclass(frozen=True)
@@ -86,9 +90,13 @@ def decompressed(data: bytes, codec: str, where: str) -> bytes:
         )
     zstd = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
     unpack: Callable[[bytes], bytes] = (
-        decompress if codec == "bz2" else import_extra("lz4.frame" if codec == "lz4" else zstd, EXTRA).decompress
+        decompress
+        if codec == "bz2"
+        else import_extra("lz4.frame" if codec == "lz4" else zstd, EXTRA).decompress
     )
     try:
         return unpack(data)
     except Exception as error:  # each codec has its own errors
-        raise FormatError(where, expected=f"a chunk compressed with {codec}", found=f"damage ({error})") from error
+        raise FormatError(
+            where, expected=f"a chunk compressed with {codec}", found=f"damage ({error})"
+        ) from error

@@ -1,8 +1,9 @@
 """Messages of bags with points, poses or transforms: the types, and how they are read.
 
-Definitions: sensor_msgs, nav_msgs and geometry_msgs of ROS as rosbags has them; tf2_msgs/TFMessage of
-https://docs.ros.org/en/noetic/api/tf2_msgs/html/msg/TFMessage.html; CustomMsg and CustomPoint of Livox of the read-me pages of
-https://github.com/Livox-SDK/livox_ros_driver and https://github.com/Livox-SDK/livox_ros_driver2.
+Definitions: sensor_msgs, nav_msgs and geometry_msgs of ROS as rosbags has them; tf2_msgs/TFMessage
+of https://docs.ros.org/en/noetic/api/tf2_msgs/html/msg/TFMessage.html; CustomMsg and CustomPoint of
+Livox of the read-me pages of https://github.com/Livox-SDK/livox_ros_driver and
+https://github.com/Livox-SDK/livox_ros_driver2.
 """
 
 from __future__ import annotations
@@ -36,13 +37,16 @@ POSES = (
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMAGES = ("sensor_msgs/msg/Image", COMPRESSED_IMAGE)
-TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
+TRANSFORMS = (
+    "tf2_msgs/msg/TFMessage",
+    "tf/msg/tfMessage",
+    "foxglove.FrameTransform",
+    "foxglove.FrameTransforms",
+)
 
 _TRANSFORM_TEXT = "geometry_msgs/TransformStamped[] transforms\n"
 _POINT_TEXT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-_CUSTOM_TEXT = (
-    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
-)
+_CUSTOM_TEXT = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
 _TEXTS = dict.fromkeys(TRANSFORMS[:2], _TRANSFORM_TEXT) | {
     f"{package}/msg/{name}": text
     for package in ("livox_ros_driver", "livox_ros_driver2")
@@ -73,7 +77,9 @@ class CloudMessage:
 
 def is_readable(channel: Channel) -> bool:
     """Return whether a type in CLOUDS, POSES, TRANSFORMS or IMAGES exists in an encoding."""
-    return _ENCODINGS.get(channel.encoding) == ("foxglove" if channel.type.startswith("foxglove.") else "ros")
+    return _ENCODINGS.get(channel.encoding) == (
+        "foxglove" if channel.type.startswith("foxglove.") else "ros"
+    )
 
 
 def read_cloud(data: bytes, channel: Channel, where: str) -> CloudMessage:
@@ -88,9 +94,14 @@ def read_cloud(data: bytes, channel: Channel, where: str) -> CloudMessage:
             return _foxglove_cloud(message, where)
         stamp, frame = _stamp(message.header.stamp), _frame(message.header.frame_id)
         if channel.type in _LIVOX:
-            rows = [(p.offset_time, p.x, p.y, p.z, p.reflectivity, p.tag, p.line) for p in message.points]
+            rows = [
+                (p.offset_time, p.x, p.y, p.z, p.reflectivity, p.tag, p.line)
+                for p in message.points
+            ]
             points = np.array(rows, _POINT)
-            return CloudMessage(stamp, frame, {name: points[name] for name in _POINT.names or ()}, time_unit="ns")
+            return CloudMessage(
+                stamp, frame, {name: points[name] for name in _POINT.names or ()}, time_unit="ns"
+            )
         return CloudMessage(stamp, frame, read_columns(message, where))
 
 
@@ -130,16 +141,26 @@ def read_placed(data: bytes, channel: Channel, where: str) -> list[PlacedFrame]:
             ]  # fmt: skip
         if channel.type in TRANSFORMS:
             return [
-                _placed(one.header, one.child_frame_id, one.transform.translation, one.transform.rotation)
+                _placed(
+                    one.header,
+                    one.child_frame_id,
+                    one.transform.translation,
+                    one.transform.rotation,
+                )
                 for one in message.transforms
             ]
         placed = []
         for one in message.poses if channel.type == PATH else [message]:
-            pose = one.pose if hasattr(one.pose, "position") else one.pose.pose  # the other one has a covariance
+            # the other one has a covariance
+            pose = one.pose if hasattr(one.pose, "position") else one.pose.pose
             header = one.header if one.header.frame_id else message.header
             placed.append(
                 _placed(
-                    one.header, getattr(one, "child_frame_id", ""), pose.position, pose.orientation, header.frame_id
+                    one.header,
+                    getattr(one, "child_frame_id", ""),
+                    pose.position,
+                    pose.orientation,
+                    header.frame_id,
                 )
             )
         return placed
@@ -163,17 +184,24 @@ def decode(data: bytes, channel: Channel, where: str) -> Any:
 def _store(encoding: str) -> Any:
     """Return the message types of rosbags, with added types that it does not have."""
     types = import_extra("rosbags.typesys", EXTRA)
-    store = types.get_typestore(types.Stores.ROS1_NOETIC if encoding == "ros1" else types.Stores.ROS2_HUMBLE)
+    store = types.get_typestore(
+        types.Stores.ROS1_NOETIC if encoding == "ros1" else types.Stores.ROS2_HUMBLE
+    )
     for name, text in _TEXTS.items():
         store.register(
-            {key: value for key, value in types.get_types_from_msg(text, name).items() if key not in store.fielddefs}
+            {
+                key: value
+                for key, value in types.get_types_from_msg(text, name).items()
+                if key not in store.fielddefs
+            }
         )
     return store
 
 
 def _foxglove_cloud(message: Any, where: str) -> CloudMessage:
     fields = [
-        (field.name, field.offset, foxglove_messages.FIELD_TYPES.get(field.type, "V"), 1) for field in message.fields
+        (field.name, field.offset, foxglove_messages.FIELD_TYPES.get(field.type, "V"), 1)
+        for field in message.fields
     ]
     data = np.frombuffer(message.data, np.uint8)
     columns = unpack_fields(data, fields, message.point_stride, where)
@@ -183,12 +211,18 @@ def _foxglove_cloud(message: Any, where: str) -> CloudMessage:
     return CloudMessage(_stamp(message.timestamp), _frame(message.frame_id), columns, pose)
 
 
-def _placed(header: Any, child: str, position: Any, rotation: Any, parent: str | None = None) -> PlacedFrame:
+def _placed(
+    header: Any, child: str, position: Any, rotation: Any, parent: str | None = None
+) -> PlacedFrame:
     parent = header.frame_id if parent is None else parent
-    return PlacedFrame(_stamp(header.stamp), _frame(parent), _frame(child), _numbers(position, rotation))
+    return PlacedFrame(
+        _stamp(header.stamp), _frame(parent), _frame(child), _numbers(position, rotation)
+    )
 
 
-def _numbers(position: Any, rotation: Any) -> tuple[float, float, float, float, float, float, float]:
+def _numbers(
+    position: Any, rotation: Any
+) -> tuple[float, float, float, float, float, float, float]:
     return position.x, position.y, position.z, rotation.w, rotation.x, rotation.y, rotation.z
 
 

@@ -22,7 +22,9 @@ _KINDS = (ros1_bag, mcap_file, db3_file)
 _ENDINGS = (".bag", ".bag.active", ".mcap", ".db3")
 _PACKED = (".db3.zstd", ".mcap.zstd")
 _LEVELS = 3  # how deep below the given folder a bag may be
-_ZSTD = b"\x28\xb5\x2f\xfd"  # start of a single compressed message of ROS 2; CDR never begins like this
+_ZSTD = (
+    b"\x28\xb5\x2f\xfd"  # start of a single compressed message of ROS 2; CDR never begins like this
+)
 _PART = re.compile(r"_(\d+)$")
 _EXPECTED = "a bag: .bag, .db3, .mcap"
 
@@ -114,7 +116,9 @@ class BagFiles:
             for number, channel in index.channels.items():
                 rows = index.places(number)
                 if len(rows):
-                    self.topics.setdefault(channel.topic, Topic(channel)).parts.append((str(path), channel, rows))
+                    self.topics.setdefault(channel.topic, Topic(channel)).parts.append(
+                        (str(path), channel, rows)
+                    )
 
     @property
     def location(self) -> str:
@@ -125,7 +129,11 @@ class BagFiles:
     def of_types(self, types: Sequence[str]) -> list[Topic]:
         """Return the topics of some types, by name, in an encoding that is read."""
         found = sorted(self.topics.items())
-        return [topic for _, topic in found if topic.channel.type in types and is_readable(topic.channel)]
+        return [
+            topic
+            for _, topic in found
+            if topic.channel.type in types and is_readable(topic.channel)
+        ]
 
     def clouds(self, names: str | None) -> list[Topic]:
         """Return the named topics of points, or the only one.
@@ -135,7 +143,8 @@ class BagFiles:
 
         Raises:
             MissingDataError: the bag has no topic of points.
-            ArgumentError: the bag has several and none is named, or a named one does not exist or does not hold points.
+            ArgumentError: the bag has several and none is named, or a named one does not exist or
+                does not hold points.
         """
         found = self.of_types(CLOUDS)
         if names:
@@ -144,16 +153,20 @@ class BagFiles:
             lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
             raise MissingDataError(
                 self.location,
-                expected="a topic of points: PointCloud2, CustomMsg of Livox, or PointCloud of Foxglove",
+                expected="a topic of points: PointCloud2, CustomMsg of Livox, or PointCloud of "
+                "Foxglove",
                 found="; ".join([_listed(list(self.topics.values())), *lost]),
-                advice="" if lost else "if the bag holds packets of a LiDAR, replay them with its driver",
+                advice=""
+                if lost
+                else "if the bag holds packets of a LiDAR, replay them with its driver",
             )
         if len(found) > 1:
             raise ArgumentError(
                 "topics",
                 expected=f"one or several of {_listed(found)} in {self.location}",
                 found="none",
-                advice="name the LiDARs, separated by commas; the messages of the first become the frames",
+                advice="name the LiDARs, separated by commas; the messages of the first become "
+                "the frames",
             )
         return found
 
@@ -161,7 +174,8 @@ class BagFiles:
         """Return the named topic of poses, or the only one; None without one.
 
         Raises:
-            ArgumentError: the bag has several and none is named, or the named one does not exist or does not hold poses.
+            ArgumentError: the bag has several and none is named, or the named one does not exist or
+                does not hold poses.
         """
         found = self.of_types(POSES)
         if name:
@@ -175,26 +189,36 @@ class BagFiles:
         """Return notes on files that are incomplete."""
         lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
         if len(self.paths) > 1:
-            lost.append(f"{len(self.paths)} files are parts of one recording: {self.paths[0].name} and the next")
+            lost.append(
+                f"{len(self.paths)} files are parts of one recording: {self.paths[0].name} and "
+                f"the next"
+            )
         return lost
 
     def _named(self, option: str, name: str, found: Sequence[Topic]) -> Topic:
-        if (topic := next((topic for topic in found if topic.channel.topic == name), None)) is not None:
+        if (
+            topic := next((topic for topic in found if topic.channel.topic == name), None)
+        ) is not None:
             return topic
         other = self.topics.get(name)
         said = f"{name!r}" if other is None else f"{other}, which is not read"
-        raise ArgumentError(option, expected=f"one of {_listed(found)} in {self.location}", found=said)
+        raise ArgumentError(
+            option, expected=f"one of {_listed(found)} in {self.location}", found=said
+        )
 
 
 def find_bags(source: Path) -> list[list[Path]]:
-    """Return the files of each recording in a file or a folder: parts _0, _1, ... of one bag belong together.
+    """Return the files of each recording in a file or a folder: parts _0, _1, ... of one bag belong
+    together.
 
     Raises:
         MissingDataError: no file exists.
     """
     if source.is_file():
         return [[source]]
-    patterns = ("*/" * level + f"*{ending}" for level in range(_LEVELS) for ending in (*_ENDINGS, *_PACKED))
+    patterns = (
+        "*/" * level + f"*{ending}" for level in range(_LEVELS) for ending in (*_ENDINGS, *_PACKED)
+    )
     files = sorted(path for pattern in patterns for path in source.glob(pattern) if path.is_file())
     bags = [path for path in files if path.name.endswith(_ENDINGS)]
     if not bags:

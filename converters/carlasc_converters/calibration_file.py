@@ -15,7 +15,9 @@ from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc_converters.files import opening, read_text
 from carlasc_converters.rigid import poses_of
 
-_EXPECTED = "sensors, each with translation (x, y, z) and rotation (qx, qy, qz, qw), or with matrix (4 x 4)"
+_EXPECTED = (
+    "sensors, each with translation (x, y, z) and rotation (qx, qy, qz, qw), or with matrix (4 x 4)"
+)
 _DIRECTIONS = {
     "f": (1, 0, 0),
     "b": (-1, 0, 0),
@@ -36,8 +38,15 @@ def read_calibration(path: Path) -> dict[str, Transform]:
     """
     text = read_text(path, _EXPECTED)
     with opening(path, _EXPECTED, "see the page docs/sets/scans.md for an example"):
-        values = json.loads(text) if path.suffix.lower() == ".json" else import_extra("yaml", "scans").safe_load(text)
-        sensors = {str(name): _pose(entry, f"{path}: sensor {name}") for name, entry in values["sensors"].items()}
+        values = (
+            json.loads(text)
+            if path.suffix.lower() == ".json"
+            else import_extra("yaml", "scans").safe_load(text)
+        )
+        sensors = {
+            str(name): _pose(entry, f"{path}: sensor {name}")
+            for name, entry in values["sensors"].items()
+        }
     if not sensors:
         raise FormatError(path, expected=_EXPECTED, found="no sensors")
     return sensors
@@ -56,13 +65,16 @@ def axes_named(name: str) -> Transform:
     """Return (4, 4) from axes that are named by their directions to x forward, y to the left, z up.
 
     Args:
-        name: a letter for x, y and z each: f(orward), b(ackward), l(eft), r(ight), u(p), d(own). "flu" are those of ROS, "fru" the
-            left-handed ones of CARLA and Unreal, "rfu" have y forward, "rdf" are a camera's.
+        name: a letter for x, y and z each: f(orward), b(ackward), l(eft), r(ight), u(p), d(own).
+            "flu" are those of ROS, "fru" the left-handed ones of CARLA and Unreal, "rfu" have y
+            forward, "rdf" are a camera's.
 
     Raises:
         ArgumentError: the letters are not three directions at right angles.
     """
-    columns = np.array([_DIRECTIONS.get(letter, (0, 0, 0)) for letter in name.lower()], np.float64).T
+    columns = np.array(
+        [_DIRECTIONS.get(letter, (0, 0, 0)) for letter in name.lower()], np.float64
+    ).T
     if (
         columns.shape != (3, 3)
         or not np.array_equal(np.abs(columns).sum(axis=0), [1, 1, 1])
@@ -70,7 +82,8 @@ def axes_named(name: str) -> Transform:
     ):
         raise ArgumentError(
             "source_axes",
-            expected="directions of x, y and z, such as flu (forward, left, up), fru, rfu, frd or rdf",
+            expected="directions of x, y and z, such as flu (forward, left, up), fru, rfu, frd or "
+            "rdf",
             found=repr(name),
         )
     transform = np.eye(4)

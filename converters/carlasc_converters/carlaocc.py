@@ -1,6 +1,8 @@
-"""CarlaOcc: scans of a semantic LiDAR in CARLA 0.10, and voxel grids made from the meshes of its towns.
+"""CarlaOcc: scans of a semantic LiDAR in CARLA 0.10, and voxel grids made from the meshes of its
+towns.
 
-The files: https://carlaocc.readthedocs.io, and the project's own code (`data_saver.py`, `gen_pano_occ.py`, `data_converter.py`).
+The files: https://carlaocc.readthedocs.io, and the project's own code (`data_saver.py`,
+`gen_pano_occ.py`, `data_converter.py`).
 """
 
 from __future__ import annotations
@@ -15,7 +17,16 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Split, Trajectory, VoxelContent
+from carlasc.converting import (
+    Cloud,
+    Converter,
+    FrameHandle,
+    Recording,
+    Sensor,
+    Split,
+    Trajectory,
+    VoxelContent,
+)
 from carlasc.core.benchmarks import CARLAOCC, CARLAOCC_TO_CARLA
 from carlasc.core.geometry import check_rigid
 from carlasc.core.grids import GridSpec
@@ -24,7 +35,8 @@ from carlasc.metrics.grids import CARLAOCC_GRIDS, read_geometry, read_voxels, se
 from carlasc_converters.files import opening, read_text
 from carlasc_converters.ply import PlyVertices
 
-_PERIOD_S = 0.1  # the simulation runs at 10 frames per second, and the set's own loader gives frame i the time 0.1 i
+# the simulation runs at 10 frames per second, and the set's own loader gives frame i the time 0.1 i
+_PERIOD_S = 0.1
 _SCANS, _PROPERTIES = "semantic_lidar", ("x", "y", "z", "ObjIdx", "ObjTag")
 
 
@@ -32,9 +44,7 @@ class CarlaOcc(Converter):
     """Reads CarlaOcc, or one of its sequences."""
 
     title: ClassVar[str] = "CarlaOcc: CARLA 0.10 with voxels from meshes"
-    citation = (
-        "Y. Feng et al., An Instance-Centric Panoptic Occupancy Prediction Benchmark for Autonomous Driving, CVPR 2026"
-    )
+    citation = "Y. Feng et al., An Instance-Centric Panoptic Occupancy Prediction Benchmark for Autonomous Driving, CVPR 2026"
     simulated = True
     classes = CARLAOCC
     to_carla = CARLAOCC_TO_CARLA
@@ -46,7 +56,9 @@ class CarlaOcc(Converter):
         self,
         source: Path,
         *,
-        voxels: Annotated[str | None, "Grid that is read: a folder in occupancy/, such as vs_0_2_forward_view."] = None,
+        voxels: Annotated[
+            str | None, "Grid that is read: a folder in occupancy/, such as vs_0_2_forward_view."
+        ] = None,
     ) -> None:
         super().__init__(source)
         self.voxels = voxels
@@ -69,11 +81,24 @@ class CarlaOcc(Converter):
                 advice="give the folder that holds them, after the archives are unpacked",
             )
         splits = _read_splits(folders[0].parent)
-        existing = sorted({path.name for folder in folders for path in folder.glob("occupancy/*") if path.is_dir()})
+        existing = sorted(
+            {
+                path.name
+                for folder in folders
+                for path in folder.glob("occupancy/*")
+                if path.is_dir()
+            }
+        )
         if self.voxels is not None and self.voxels not in existing:
-            raise ArgumentError("voxels", expected=f"one of {', '.join(existing) or 'no grids'}", found=self.voxels)
-        grid = self.voxels or next((name for name in (*CARLAOCC_GRIDS, *existing) if name in existing), None)
-        return [CarlaOccRecording(folder, splits.get(folder.name, "Train"), grid) for folder in folders]
+            raise ArgumentError(
+                "voxels", expected=f"one of {', '.join(existing) or 'no grids'}", found=self.voxels
+            )
+        grid = self.voxels or next(
+            (name for name in (*CARLAOCC_GRIDS, *existing) if name in existing), None
+        )
+        return [
+            CarlaOccRecording(folder, splits.get(folder.name, "Train"), grid) for folder in folders
+        ]
 
 
 class CarlaOccRecording(Recording):
@@ -98,7 +123,9 @@ class CarlaOccRecording(Recording):
         grids = self._grid_files
         reference = str(next(iter(grids.values()), ""))
         return [
-            CarlaOccFrame(number, str(path), str(grids[number]) if number in grids else None, reference)
+            CarlaOccFrame(
+                number, str(path), str(grids[number]) if number in grids else None, reference
+            )
             for number, path in _numbered(self.folder / _SCANS, ".ply").items()
         ]
 
@@ -115,7 +142,8 @@ class CarlaOccRecording(Recording):
         """Return poses/lidar.txt: the number of a frame and 16 numbers per line, right-handed.
 
         Raises:
-            FormatError: a line has other values, a transform is not rigid, frames do not increase, or a frame has no pose.
+            FormatError: a line has other values, a transform is not rigid, frames do not increase,
+                or a frame has no pose.
         """
         path = self.folder / "poses" / "lidar.txt"
         if not path.is_file():
@@ -123,9 +151,17 @@ class CarlaOccRecording(Recording):
         with opening(path, "17 numbers per line"):
             rows = np.loadtxt(path, ndmin=2)
         if rows.shape[1] != 17:
-            raise FormatError(path, expected="17 numbers per line: frame and 4 x 4 pose", found=str(rows.shape[1]))
-        if missing := sorted({frame.number for frame in self.frames} - set(rows[:, 0].astype(int).tolist())):
-            raise FormatError(path, expected=f"a pose for frame {missing[0]}", found=f"none for {len(missing)} frames")
+            raise FormatError(
+                path, expected="17 numbers per line: frame and 4 x 4 pose", found=str(rows.shape[1])
+            )
+        if missing := sorted(
+            {frame.number for frame in self.frames} - set(rows[:, 0].astype(int).tolist())
+        ):
+            raise FormatError(
+                path,
+                expected=f"a pose for frame {missing[0]}",
+                found=f"none for {len(missing)} frames",
+            )
         poses = check_rigid(rows[:, 1:].reshape(-1, 4, 4), str(path))
         return Trajectory(poses, rows[:, 0] * _PERIOD_S, str(path))
 
@@ -140,7 +176,13 @@ class CarlaOccRecording(Recording):
         return [
             (
                 number,
-                str(MissingDataError(self.folder / _SCANS / f"{number:04d}.ply", expected="a scan", found="no file")),
+                str(
+                    MissingDataError(
+                        self.folder / _SCANS / f"{number:04d}.ply",
+                        expected="a scan",
+                        found="no file",
+                    )
+                ),
             )
             for number in sorted(set(self._grid_files) - scanned)
         ]
@@ -170,7 +212,9 @@ class CarlaOccFrame(FrameHandle):
         """
         rows = PlyVertices.open(self.location, _PROPERTIES).read()
         if not len(rows):
-            raise FormatError(self.location, expected="points", found="none", advice="copy it again")
+            raise FormatError(
+                self.location, expected="points", found="none", advice="copy it again"
+            )
         points = np.zeros((len(rows), 4), np.float32)
         for column, name in enumerate("xyz"):
             points[:, column] = rows[name]
@@ -180,7 +224,9 @@ class CarlaOccFrame(FrameHandle):
         return (Cloud(points, labels, instances),)
 
     def read_voxels(self) -> VoxelContent | None:
-        """Read the grid of the frame: voxels in meshes have a class, all others are free. All voxels are known.
+        """Read the grid of the frame: voxels in meshes have a class, all others are free.
+
+        All voxels are known.
 
         Raises:
             FormatError: the file is not a grid, or its geometry differs from that of the others.
@@ -200,12 +246,18 @@ class CarlaOccFrame(FrameHandle):
 def _numbered(folder: Path, suffix: str) -> dict[int, Path]:
     """Return the files with names such as 0012.ply by number, in order."""
     paths = folder.iterdir() if folder.is_dir() else ()
-    named = [path for path in paths if path.suffix == suffix and path.stem.isascii() and path.stem.isdigit()]
+    named = [
+        path
+        for path in paths
+        if path.suffix == suffix and path.stem.isascii() and path.stem.isdigit()
+    ]
     return {int(path.stem): path for path in sorted(named, key=lambda path: int(path.stem))}
 
 
 def _read_splits(root: Path) -> dict[str, Split]:
-    """Return the split of each sequence: the one with most of its frames, by lines "town sequence frame"."""
+    """Return the split of each sequence: the one with most of its frames, by lines "town sequence
+    frame".
+    """
     counts: dict[str, Counter[Split]] = {}
     names: tuple[tuple[str, Split], ...] = (("train", "Train"), ("val", "Val"), ("test", "Test"))
     for file, split in names:

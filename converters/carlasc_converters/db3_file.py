@@ -18,15 +18,21 @@ _EXPECTED = "a bag of ROS 2: a database with topics and messages"
 
 
 def index_file(path: Path) -> FileIndex:
-    """Return the index of the messages of a file; of a file that is cut short, those that SQLite can still read."""
+    """Return the index of the messages of a file; of a file that is cut short, those that SQLite
+    can still read.
+    """
     index, rows, size = FileIndex(str(path)), array("q"), path.stat().st_size
     with path.open("rb") as file:
         head = file.read(32)
     page = int.from_bytes(head[16:18], "big")
     whole = (65536 if page == 1 else page) * int.from_bytes(head[28:32], "big")
     with _database(str(path)) as database:
-        topics = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-        index.channels = {number: Channel(name, kind, encoding) for number, name, kind, encoding in topics}
+        topics = database.execute(
+            "SELECT id, name, type, serialization_format FROM topics"
+        ).fetchall()
+        index.channels = {
+            number: Channel(name, kind, encoding) for number, name, kind, encoding in topics
+        }
         try:
             for row in database.execute("SELECT topic_id, timestamp, id FROM messages ORDER BY id"):
                 rows.extend(row)
@@ -71,9 +77,12 @@ def _database(path: str) -> Iterator[sqlite3.Connection]:
     try:
         database = sqlite3.connect(f"{Path(path).resolve().as_uri()}?{mode}", uri=True)
         try:
-            database.execute("PRAGMA writable_schema = ON")  # otherwise, SQLite does not open files that are cut short
+            # otherwise, SQLite does not open files that are cut short
+            database.execute("PRAGMA writable_schema = ON")
             yield database
         finally:
             database.close()
     except sqlite3.Error as error:
-        raise FormatError(path, expected=_EXPECTED, found=f"another file, or a damaged one ({error})") from error
+        raise FormatError(
+            path, expected=_EXPECTED, found=f"another file, or a damaged one ({error})"
+        ) from error

@@ -12,7 +12,9 @@ from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc_converters.files import opening
 
 
-def read_columns(path: Path, names: Sequence[str], texts: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+def read_columns(
+    path: Path, names: Sequence[str], texts: Sequence[str] = ()
+) -> dict[str, NDArray[Any]]:
     """Read columns of a Feather file.
 
     Args:
@@ -25,14 +27,18 @@ def read_columns(path: Path, names: Sequence[str], texts: Sequence[str] = ()) ->
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it is not a Feather file, lacks a column, or has a column of another type or with missing values.
+        FormatError: it is not a Feather file, lacks a column, or has a column of another type or
+            with missing values.
         DependencyError: pyarrow is not installed.
     """
     feather = import_extra("pyarrow.feather", "parquet")
     if not path.is_file():
-        raise MissingDataError(path, expected="a Feather file", found="nothing", advice="download it again")
+        raise MissingDataError(
+            path, expected="a Feather file", found="nothing", advice="download it again"
+        )
     with opening(path, "a Feather file"):
-        table = feather.read_table(str(path), use_threads=False)  # frames are already read in parallel
+        # frames are already read in parallel
+        table = feather.read_table(str(path), use_threads=False)
         table.validate(full=True)
     if lacking := [name for name in (*names, *texts) if name not in table.column_names]:
         found = ", ".join(table.column_names) or "no columns"

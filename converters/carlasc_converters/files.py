@@ -1,4 +1,6 @@
-"""Reading the files of other data sets: errors of the system or of other libraries become errors that name the file."""
+"""Reading the files of other data sets: errors of the system or of other libraries become errors
+that name the file.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def opening(path: str | os.PathLike[str], expected: str, advice: str = COPY) -> 
         try:
             yield
         except FileNotFoundError:
-            raise MissingDataError(path, expected=expected, found="nothing", advice=_MISSING) from None
+            raise MissingDataError(
+                path, expected=expected, found="nothing", advice=_MISSING
+            ) from None
 
 
 def sequence_name(name: str) -> str:
@@ -73,7 +77,9 @@ def read_bytes(path: str | os.PathLike[str], expected: str = "a file", advice: s
         return Path(path).read_bytes()
 
 
-def read_text(path: str | os.PathLike[str], expected: str = "a text file", advice: str = COPY) -> str:
+def read_text(
+    path: str | os.PathLike[str], expected: str = "a text file", advice: str = COPY
+) -> str:
     """Return a whole text file in UTF-8.
 
     Raises:
@@ -84,7 +90,9 @@ def read_text(path: str | os.PathLike[str], expected: str = "a text file", advic
         return Path(path).read_text("utf-8")
 
 
-def read_arrays(path: str | Path, formats: Mapping[str, ArrayFormat], advice: str) -> list[NDArray[Any]]:
+def read_arrays(
+    path: str | Path, formats: Mapping[str, ArrayFormat], advice: str
+) -> list[NDArray[Any]]:
     """Return some arrays of an .npz file, in the order of their names. No pickle is read.
 
     Args:
@@ -94,7 +102,8 @@ def read_arrays(path: str | Path, formats: Mapping[str, ArrayFormat], advice: st
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: it is not an .npz file, is damaged, or lacks an array; or an array has another type, shape or size.
+        FormatError: it is not an .npz file, is damaged, or lacks an array; or an array has another
+            type, shape or size.
     """
     try:
         with open_npz(path) as arrays:

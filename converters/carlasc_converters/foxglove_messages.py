@@ -1,6 +1,8 @@
-"""Foxglove's own messages of points and poses, as protobuf or JSON: https://docs.foxglove.dev/docs/sdk/schemas.
+"""Foxglove's own messages of points and poses, as protobuf or JSON:
+https://docs.foxglove.dev/docs/sdk/schemas.
 
-Protobuf is decoded with a table of the needed fields and their published numbers, without a library.
+Protobuf is decoded with a table of the needed fields and their published numbers, without a
+library.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from struct import unpack_from
 from types import SimpleNamespace
 from typing import Any
 
-# Fields by number: name and kind: a name of another table, with [] if repeated, or "text", "bytes", "number", "fixed32" or "double".
+# Fields by number: name and kind: a name of another table, with [] if repeated, or "text", "bytes",
+# "number", "fixed32" or "double".
 _STAMPED = {1: ("timestamp", "time")}
 _MESSAGES: dict[str, dict[int, tuple[str, str]]] = {
     "time": {1: ("sec", "number"), 2: ("nsec", "number")},
@@ -44,7 +47,9 @@ FIELD_TYPES = dict(enumerate("u1 i1 u2 i2 u4 i4 f4 f8".split(), 1))
 
 
 def read_message(data: bytes, kind: str, encoding: str) -> Any:
-    """Return a message with its fields as attributes, by their names in Foxglove's JSON. Fields that are not set have empty values.
+    """Return a message with its fields as attributes, by their names in Foxglove's JSON.
+
+    Fields that are not set have empty values.
 
     Args:
         data: the message.
@@ -54,7 +59,11 @@ def read_message(data: bytes, kind: str, encoding: str) -> Any:
     Raises:
         ValueError, struct.error, LookupError: the data are not such a message.
     """
-    return _from_json(json.loads(data), kind) if encoding == "json" else _from_protobuf(memoryview(data), kind)
+    return (
+        _from_json(json.loads(data), kind)
+        if encoding == "json"
+        else _from_protobuf(memoryview(data), kind)
+    )
 
 
 def _from_json(value: Any, kind: str) -> Any:
@@ -67,7 +76,11 @@ def _from_json(value: Any, kind: str) -> Any:
         if name in value:
             inner = of.removesuffix("[]")
             given = value[name]
-            setattr(message, name, [_from_json(one, inner) for one in given] if inner != of else _from_json(given, of))
+            setattr(
+                message,
+                name,
+                [_from_json(one, inner) for one in given] if inner != of else _from_json(given, of),
+            )
     return message
 
 
@@ -94,12 +107,18 @@ def _value(value: Any, kind: str) -> Any:
 def _empty(kind: str) -> SimpleNamespace:
     fields = _MESSAGES[kind].values()
     return SimpleNamespace(
-        **{name: [] if of.endswith("[]") else _EMPTY[of] if of in _EMPTY else _empty(of) for name, of in fields}
+        **{
+            name: [] if of.endswith("[]") else _EMPTY[of] if of in _EMPTY else _empty(of)
+            for name, of in fields
+        }
     )
 
 
 def _wire(data: memoryview) -> Iterator[tuple[int, Any]]:
-    """Yield the number of each field and its value: a number, or bytes. See https://protobuf.dev/programming-guides/encoding."""
+    """Yield the number of each field and its value: a number, or bytes.
+
+    See https://protobuf.dev/programming-guides/encoding.
+    """
     at = 0
     while at < len(data):
         key, at = _varint(data, at)

@@ -1,4 +1,6 @@
-"""The class table of given labels: a table of carlasc or of a converter, by name, or from a JSON file."""
+"""The class table of given labels: a table of carlasc or of a converter, by name, or from a JSON
+file.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,12 @@ from carlasc.storage.predictions import read_table
 
 
 def classes_given(name: str) -> tuple[ClassTable, Remap | None]:
-    """Return a class table, and the map of its ids to CarlaSC's; None if no map exists, or if they are CarlaSC's.
+    """Return a class table, and the map of its ids to CarlaSC's; None if no map exists, or if they
+    are CarlaSC's.
 
     Args:
-        name: the name of a table, or the path of a JSON file with a table as carlasc.json has it, or of a carlasc.json.
+        name: the name of a table, or the path of a JSON file with a table as carlasc.json has it,
+            or of a carlasc.json.
 
     Raises:
         ArgumentError: neither a table nor a file has this name.
@@ -33,7 +37,10 @@ def _table(name: str) -> ClassTable:
     for converter in converter_names():
         try:
             table = load_converter(converter).classes
-        except (DependencyError, AttributeError):  # a broken converter, or one without a class table
+        except (
+            DependencyError,
+            AttributeError,
+        ):  # a broken converter, or one without a class table
             continue
         if table.name == name:
             return table

@@ -24,7 +24,8 @@ def nearest_rows(stamps: NDArray[np.int64], frames: NDArray[np.int64]) -> NDArra
 def nearest_images(
     paths: Mapping[int, Path], frames: NDArray[np.int64], within: int
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_], tuple[str, ...]]:
-    """Return the stamp of the image nearest to each frame, whether it is near enough, and its absolute path, "" where it is not.
+    """Return the stamp of the image nearest to each frame, whether it is near enough, and its
+    absolute path, "" where it is not.
 
     Args:
         paths: the images by stamp; one at least.
@@ -34,5 +35,8 @@ def nearest_images(
     stamps = np.array(sorted(paths), np.int64)
     nearest = stamps[nearest_rows(stamps, frames)]
     near = np.abs(nearest - frames) < within
-    found = (str(paths[at].absolute()) if ok else "" for at, ok in zip(nearest.tolist(), near, strict=True))
+    found = (
+        str(paths[at].absolute()) if ok else ""
+        for at, ok in zip(nearest.tolist(), near, strict=True)
+    )
     return nearest, near, tuple(found)

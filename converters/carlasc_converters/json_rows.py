@@ -1,4 +1,6 @@
-"""Rows of large JSON tables, one after the other, so that only the values that are kept need memory."""
+"""Rows of large JSON tables, one after the other, so that only the values that are kept need
+memory.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ def read_rows(
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: the file is not a list of objects or is cut short, or an object lacks a key or has a wrong value.
+        FormatError: the file is not a list of objects or is cut short, or an object lacks a key or
+            has a wrong value.
     """
     wanted = [(kinds or {}).get(key, str) for key in keys]
     for number, row in enumerate(_objects(path)):
@@ -43,13 +46,21 @@ def read_rows(
             values = tuple(row[key] for key in keys)
             for key, value, kind in zip(keys, values, wanted, strict=True):
                 if not _is_of(value, kind):
-                    name = f"a list of {kind} numbers" if isinstance(kind, int) else f"a value of type {kind.__name__}"
+                    name = (
+                        f"a list of {kind} numbers"
+                        if isinstance(kind, int)
+                        else f"a value of type {kind.__name__}"
+                    )
                     found = f"{str(value)[:40]!r} in row {number}"
-                    raise FormatError(path, expected=f"{name} under {key!r}", found=found, advice=_OTHER)
+                    raise FormatError(
+                        path, expected=f"{name} under {key!r}", found=found, advice=_OTHER
+                    )
             yield values
         except KeyError as error:
             found = f"{', '.join(row)} in row {number}"
-            raise FormatError(path, expected=f"the key {error} in each row", found=found, advice=_OTHER) from error
+            raise FormatError(
+                path, expected=f"the key {error} in each row", found=found, advice=_OTHER
+            ) from error
 
 
 def _is_of(value: object, kind: type | int) -> bool:
@@ -63,7 +74,9 @@ def _is_of(value: object, kind: type | int) -> bool:
 
 def _is_number(value: object) -> bool:
     """Return whether a value is a finite number that fits into 64 bits."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _TOO_LARGE
+    return (
+        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _TOO_LARGE
+    )
 
 
 def _objects(path: Path) -> Iterator[dict[str, Any]]:
@@ -77,15 +90,21 @@ def _objects(path: Path) -> Iterator[dict[str, Any]]:
         while text[(at := _end_of_gap(text, at)) : at + 1] != "]":
             try:
                 row, at = decode(text, at)
-            except json.JSONDecodeError as error:  # the row goes on in the next chunk, or is damaged
+            except (
+                json.JSONDecodeError
+            ) as error:  # the row goes on in the next chunk, or is damaged
                 more = file.read(_CHUNK) if len(text) - at < _LONGEST_ROW else ""
                 if not more:
                     found = f"text that ends or is damaged after {count} rows ({error.msg})"
-                    raise FormatError(path, expected=_EXPECTED, found=found, advice=_UNPACK) from error
+                    raise FormatError(
+                        path, expected=_EXPECTED, found=found, advice=_UNPACK
+                    ) from error
                 text, at = text[at:] + more, 0
                 continue
             if not isinstance(row, dict):
-                raise FormatError(path, expected=_EXPECTED, found=f"{type(row).__name__} in row {count}")
+                raise FormatError(
+                    path, expected=_EXPECTED, found=f"{type(row).__name__} in row {count}"
+                )
             yield row
             count += 1
 

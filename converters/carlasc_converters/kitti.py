@@ -1,4 +1,6 @@
-"""SemanticKITTI, and KITTI odometry data without labels: see the format page, `docs/format.md#semantickitti`."""
+"""SemanticKITTI, and KITTI odometry data without labels: see the format page,
+`docs/format.md#semantickitti`.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ class SemanticKitti(KittiConverter):
 
     title: ClassVar[str] = "SemanticKITTI, or KITTI odometry data without labels"
     citation = (
-        "J. Behley et al., SemanticKITTI, ICCV 2019; A. Geiger, P. Lenz, R. Urtasun, Are we ready for "
+        "J. Behley et al., SemanticKITTI, ICCV 2019; A. Geiger, P. Lenz, R. Urtasun, Are we ready "
+        "for "
         "Autonomous Driving?, CVPR 2012"
     )
     classes = SEMANTICKITTI
@@ -59,11 +62,16 @@ class SemanticKitti(KittiConverter):
             MissingDataError: no sequence exists.
         """
         folders = find_sequences(self.source)
-        return [KittiRecording(folder, f"KITTI_{folder.name}", _split_of(folder.name)) for folder in folders]
+        return [
+            KittiRecording(folder, f"KITTI_{folder.name}", _split_of(folder.name))
+            for folder in folders
+        ]
 
 
 class KittiRecording(Recording):
-    """One sequence: a folder with velodyne/, labels/, voxels/, poses.txt, calib.txt and times.txt. The LiDAR is its vehicle.
+    """One sequence: a folder with velodyne/, labels/, voxels/, poses.txt, calib.txt and times.txt.
+
+    The LiDAR is its vehicle.
 
     Attributes:
         folder: this folder.
@@ -86,18 +94,27 @@ class KittiRecording(Recording):
         return KittiFrame(str(self.folder), number, self.has_labels)
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
-        """Return inv(Tr) @ P @ Tr for each pose P in poses.txt, because the file holds poses of the left camera."""
+        """Return inv(Tr) @ P @ Tr for each pose P in poses.txt, because the file holds poses of the
+        left camera.
+        """
         path = next((path for path in self._pose_files() if path.is_file()), None)
         if path is None:
             return None
         camera_poses = layout.decode_poses(read_bytes(path), str(path))
         camera_T_lidar = self._calibration(path, force=force)
-        poses = multiply(inverse_of(camera_T_lidar), check_rigid(camera_poses, str(path)), camera_T_lidar)
+        poses = multiply(
+            inverse_of(camera_T_lidar), check_rigid(camera_poses, str(path)), camera_T_lidar
+        )
         return Trajectory(poses, where=str(path))
 
     def _pose_files(self) -> tuple[Path, ...]:
-        """Return the possible files of poses: in the sequence, or, for KITTI odometry, in poses/ beside sequences/."""
-        return self.folder / "poses.txt", self.folder.parent.parent / "poses" / f"{self.folder.name}.txt"
+        """Return the possible files of poses: in the sequence, or, for KITTI odometry, in poses/
+        beside sequences/.
+        """
+        return (
+            self.folder / "poses.txt",
+            self.folder.parent.parent / "poses" / f"{self.folder.name}.txt",
+        )
 
     def _calibration(self, poses: Path, *, force: bool) -> Transform:
         path = self.folder / "calib.txt"
@@ -110,8 +127,11 @@ class KittiRecording(Recording):
         raise error(
             path,
             expected=f"Tr, which takes LiDAR points to the camera whose poses {poses.name} holds",
-            found="no such file" if found is None else f"only {', '.join(found.values) or 'other lines'}",
-            advice='copy calib.txt of the KITTI odometry data, estimate poses from the scans with `poses="kiss-icp"`, or, if the'
+            found="no such file"
+            if found is None
+            else f"only {', '.join(found.values) or 'other lines'}",
+            advice="copy calib.txt of the KITTI odometry data, estimate poses from the scans with "
+            '`poses="kiss-icp"`, or, if the'
             " poses are those of the LiDAR, accept them with `force=True`",
         )
 
@@ -137,11 +157,16 @@ class KittiRecording(Recording):
     def problems(self) -> list[tuple[int, str]]:
         """Return the frames that have labels or voxels, but no scan."""
         scanned = {frame.number for frame in self.frames}
-        others = {*frames_of(self.folder / "labels", ".label"), *frames_of(self.folder / "voxels", ".label")}
+        others = {
+            *frames_of(self.folder / "labels", ".label"),
+            *frames_of(self.folder / "voxels", ".label"),
+        }
         found = []
         for number in sorted(others - scanned):
             file = self.folder / "velodyne" / f"{number:06d}.bin"
-            error = MissingDataError(file, expected="a scan beside its labels", found="no such file")
+            error = MissingDataError(
+                file, expected="a scan beside its labels", found="no such file"
+            )
             found.append((number, str(error)))
         return found
 
@@ -183,8 +208,8 @@ class KittiFrame(FrameHandle):
         both = read_array(self._label_file, np.dtype("<u4"), 1)[:, 0]
         labels = both.astype(np.uint16)  # keeps the low 16 bits
         actors = both >> 16
-        # SemanticKITTI numbers the instances of each class from 1, so the class is part of an actor's number.
-        # A car gets the same number whether it moves or not.
+        # SemanticKITTI numbers the instances of each class from 1, so the class is part of an
+        # actor's number. A car gets the same number whether it moves or not.
         return labels, np.where(actors > 0, _CLASS_PART[labels] | actors, np.uint32(0))
 
     def read_voxels(self) -> VoxelContent | None:
@@ -193,19 +218,25 @@ class KittiFrame(FrameHandle):
 
 
 def find_sequences(root: Path) -> list[Path]:
-    """Return the folders of the sequences: those in `sequences/` or `dataset/sequences/`, or the folder itself.
+    """Return the folders of the sequences: those in `sequences/` or `dataset/sequences/`, or the
+    folder itself.
 
     Raises:
         MissingDataError: no sequence exists.
     """
     if not root.is_dir():
         raise MissingDataError(
-            root, expected="a folder", found="a file" if root.exists() else "nothing", advice="check the path"
+            root,
+            expected="a folder",
+            found="a file" if root.exists() else "nothing",
+            advice="check the path",
         )
     if (root / "velodyne").is_dir():
         return [root.resolve()]
     for folder in (root / "sequences", root / "dataset" / "sequences", root):
-        if folder.is_dir() and (found := sorted(path for path in folder.iterdir() if (path / "velodyne").is_dir())):
+        if folder.is_dir() and (
+            found := sorted(path for path in folder.iterdir() if (path / "velodyne").is_dir())
+        ):
             return found
     raise MissingDataError(
         root,
@@ -216,7 +247,9 @@ def find_sequences(root: Path) -> list[Path]:
 
 
 def _split_of(name: str) -> Split:
-    """Return the split of a sequence by its number; folders with other names belong to the training split."""
+    """Return the split of a sequence by its number; folders with other names belong to the training
+    split.
+    """
     number = int(name) if name.isascii() and name.isdigit() else 0
     return "Val" if number == _VALIDATION else "Test" if _TEST_FIRST <= number <= 21 else "Train"
 

@@ -1,4 +1,6 @@
-"""The classes of KITTI-360: the ids, names and colours of `labels.py` in its tools (github.com/autonomousvision/kitti360Scripts)."""
+"""The classes of KITTI-360: the ids, names and colours of `labels.py` in its tools
+(github.com/autonomousvision/kitti360Scripts).
+"""
 
 from __future__ import annotations
 
@@ -61,4 +63,6 @@ KITTI360 = ClassTable(
     ground=frozenset({6, 7, 8, 9, 10, 22}),
     geometry_only=44,
 )
-KITTI360_TO_CARLA = Remap("kitti360_to_carla", KITTI360, CARLA, {i: carla for i, (_, _, carla) in enumerate(_CLASSES)})
+KITTI360_TO_CARLA = Remap(
+    "kitti360_to_carla", KITTI360, CARLA, {i: carla for i, (_, _, carla) in enumerate(_CLASSES)}
+)

@@ -1,6 +1,7 @@
 """Labels of KITTI-360's scans, from its accumulated point clouds, because scans have no labels.
 
-A cloud covers a window of frames. `static/` holds static points; `dynamic/` holds moving points, with the frame of each as its time stamp.
+A cloud covers a window of frames. `static/` holds static points; `dynamic/` holds moving points,
+with the frame of each as its time stamp.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ from carlasc_converters.ply import PlyVertices
 MAX_DISTANCE_M = 0.2  # a point farther than this from every labelled one stays unlabelled
 _WINDOW = re.compile(r"(\d{10})_(\d{10})\.ply")
 _PER_CLASS = 1000  # instance = 1000 * class + number in the class, 0 for none
-_MAX_CLASS = 65535  # values that do not fit into 16 bits are no classes, and are reported as this one
+_MAX_CLASS = (
+    65535  # values that do not fit into 16 bits are no classes, and are reported as this one
+)
 _COLUMNS = ("x", "y", "z", "semantic", "instance")
 
 
@@ -51,14 +54,21 @@ class Labelled:
         spatial = import_extra("scipy.spatial", "kitti")
         points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
         check_finite(points, where)
-        # An unbalanced tree is built several times faster, and searched as fast if points are on surfaces.
-        tree = spatial.cKDTree(points, leafsize=32, compact_nodes=False, balanced_tree=False) if len(rows) else None
+        # An unbalanced tree is built several times faster, and searched as fast if points are on
+        # surfaces.
+        tree = (
+            spatial.cKDTree(points, leafsize=32, compact_nodes=False, balanced_tree=False)
+            if len(rows)
+            else None
+        )
         labels = np.clip(rows["semantic"], 0, _MAX_CLASS).astype(np.uint16)
         numbered = np.clip(rows["instance"], 0, None).astype(np.uint32)
         return cls(tree, labels, np.where(numbered % _PER_CLASS > 0, numbered, 0).astype(np.uint32))
 
     def nearest(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the distance and the index of the nearest point for each of (M, 3) points; infinite if none is near enough."""
+        """Return the distance and the index of the nearest point for each of (M, 3) points;
+        infinite if none is near enough.
+        """
         if self.tree is None:
             return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
         finite = np.asarray(np.isfinite(points).all(axis=1))
@@ -70,14 +80,18 @@ class Labelled:
 
 
 def windows_of(static: Path) -> dict[str, tuple[int, int]]:
-    """Return the first and the last frame of each window, by the name of its file; empty if the folder does not exist."""
+    """Return the first and the last frame of each window, by the name of its file; empty if the
+    folder does not exist.
+    """
     names: Iterable[str] = (path.name for path in static.iterdir()) if static.is_dir() else ()
     found = {name: match for name in sorted(names) if (match := _WINDOW.fullmatch(name))}
     return {name: (int(match[1]), int(match[2])) for name, match in found.items()}
 
 
 def window_at(windows: dict[str, tuple[int, int]], frame: int) -> str | None:
-    """Return the window in which a frame is farthest from both ends, because windows overlap; None without a window."""
+    """Return the window in which a frame is farthest from both ends, because windows overlap; None
+    without a window.
+    """
     depths = {name: min(frame - first, last - frame) for name, (first, last) in windows.items()}
     best = max(depths, key=lambda name: depths[name], default=None)
     return best if best is not None and depths[best] >= 0 else None
@@ -86,7 +100,8 @@ def window_at(windows: dict[str, tuple[int, int]], frame: int) -> str | None:
 def label_points(
     folder: Path, window: str, frame: int, world: NDArray[np.float64]
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint32]]:
-    """Return the class and the instance of each point of a scan: those of the nearest labelled point within `MAX_DISTANCE_M`.
+    """Return the class and the instance of each point of a scan: those of the nearest labelled
+    point within `MAX_DISTANCE_M`.
 
     Static points are used in all frames of the window, moving points only in their own frame.
 
@@ -102,13 +117,20 @@ def label_points(
     """
     labels, instances = np.zeros(len(world), np.uint16), np.zeros(len(world), np.uint32)
     nearest = np.full(len(world), np.inf)
-    moving = _moving(str(folder / "dynamic" / window), frame) if (folder / "dynamic" / window).is_file() else None
+    moving = (
+        _moving(str(folder / "dynamic" / window), frame)
+        if (folder / "dynamic" / window).is_file()
+        else None
+    )
     static = str(folder / "static" / window)
     for cloud in (_standing(static, version_of(static, "labelled points")), moving):
         if cloud is not None:
             distances, indices = cloud.nearest(world)
             nearer = distances < nearest
-            labels[nearer], instances[nearer] = cloud.labels[indices[nearer]], cloud.instances[indices[nearer]]
+            labels[nearer], instances[nearer] = (
+                cloud.labels[indices[nearer]],
+                cloud.instances[indices[nearer]],
+            )
             nearest = np.minimum(nearest, distances)
     return labels, instances
 

@@ -1,4 +1,7 @@
-"""The classes of KITTI's tracked boxes, in its raw data and its tracking benchmark. Points have no labels there."""
+"""The classes of KITTI's tracked boxes, in its raw data and its tracking benchmark.
+
+Points have no labels there.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,9 @@ KITTI = ClassTable(
     ground=frozenset({1}),
     geometry_only=2,
 )
-KITTI_TO_CARLA = Remap("kitti_to_carla", KITTI, CARLA, {i: carla for i, (_, _, carla) in enumerate(_CLASSES)})
+KITTI_TO_CARLA = Remap(
+    "kitti_to_carla", KITTI, CARLA, {i: carla for i, (_, _, carla) in enumerate(_CLASSES)}
+)
 
 ONLY_IN_VIEW = "boxes exist only in the view of the front camera: elsewhere, objects have no boxes"
 _OTHER_NAMES = {"Person": "Person_sitting", "Person (sitting)": "Person_sitting"}
@@ -40,14 +45,17 @@ _TYPES = {name: index for index, name in KITTI.names.items() if index in KITTI.m
 
 
 def class_of(kind: str, where: str) -> int:
-    """Return the id of a type of object, as KITTI's files write it; `where` is the file and the place named in errors.
+    """Return the id of a type of object, as KITTI's files write it; `where` is the file and the
+    place named in errors.
 
     Raises:
         FormatError: KITTI has no such type.
     """
     name = _OTHER_NAMES.get(kind, kind)
     if name not in _TYPES:
-        raise FormatError(where, expected=f"a type of object: one of {', '.join(_TYPES)}", found=repr(kind))
+        raise FormatError(
+            where, expected=f"a type of object: one of {', '.join(_TYPES)}", found=repr(kind)
+        )
     return _TYPES[name]
 
 
@@ -74,7 +82,9 @@ class BoxRows:
         *,
         annotated: bool = True,
     ) -> None:
-        """Add a box, if its frame has a scan: its track, its class, the (4, 4) pose of its centre, and length, width, height."""
+        """Add a box, if its frame has a scan: its track, its class, the (4, 4) pose of its centre,
+        and length, width, height.
+        """
         if frame in self._rows:
             self._rows[frame].append((track, label, lidar_T_box, size, annotated))
 

@@ -1,4 +1,6 @@
-"""The cameras of KITTI's car: rectified pinholes, whose projections P0 to P3 are from the rectified frame of the first one."""
+"""The cameras of KITTI's car: rectified pinholes, whose projections P0 to P3 are from the rectified
+frame of the first one.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from carlasc.errors import FormatError
 from carlasc_converters.kitti_files import Calibration
 
 SIZE = (1242, 375)
-"""Columns and rows of most of KITTI's rectified images, which differ by a few pixels from day to day."""
+"""Columns and rows of most of KITTI's rectified images, which differ by a few pixels from day to
+day.
+"""
 
 
 def rectified_cameras(
@@ -26,7 +30,8 @@ def rectified_cameras(
 ) -> list[CameraModel]:
     """Return the cameras whose projections a calibration has, in the frame of the LiDAR.
 
-    Scans and images have the same times, because the scanner triggers the cameras. The size of the images is that of the first existing one.
+    Scans and images have the same times, because the scanner triggers the cameras. The size of the
+    images is that of the first existing one.
 
     Args:
         calibration: a file with lines of 12 numbers.
@@ -45,7 +50,9 @@ def rectified_cameras(
             continue
         numbers = calibration.values[key]
         if len(numbers) != 12:
-            raise FormatError(calibration.path, expected=f"12 numbers after {key}", found=str(len(numbers)))
+            raise FormatError(
+                calibration.path, expected=f"12 numbers after {key}", found=str(len(numbers))
+            )
         rows = np.reshape(numbers, (3, 4))
         if rows[0, 0] <= 0 or rows[1, 1] <= 0 or (rows[2, :3] != (0, 0, 1)).any():
             expected = f"fx 0 cx, 0 fy cy, 0 0 1 and a translation after {key}"
@@ -63,7 +70,9 @@ def rectified_cameras(
                 height=height,
                 matrix=rows[:, :3],
                 sensor_T_camera=invert(rectified_T_lidar) @ rectified_T_camera,
-                images=tuple(there.get(frame, "") for frame in range(last + 1)) if existing else None,
+                images=tuple(there.get(frame, "") for frame in range(last + 1))
+                if existing
+                else None,
             )
         )
     return found

@@ -1,4 +1,6 @@
-"""The common parts of the KITTI data sets: the car and its scanner, and the files of scans, calibrations and time stamps."""
+"""The common parts of the KITTI data sets: the car and its scanner, and the files of scans,
+calibrations and time stamps.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ class KittiConverter(Converter):
 
 
 def read_lines(path: Path, expected: str, content: str) -> list[str]:
-    """Return the lines of a text file, without spaces at their ends and without empty lines at the end of the file.
+    """Return the lines of a text file, without spaces at their ends and without empty lines at the
+    end of the file.
 
     Args:
         path: the file.
@@ -68,7 +71,8 @@ def read_array(path: str, dtype: np.dtype[Any], columns: int) -> NDArray[Any]:
 
 
 def read_scan(path: str) -> NDArray[np.float32]:
-    """Read a scan: (N, 4) float32 x forward, y left, z up in metres, and reflectance 0 to 1, in the frame of the scanner.
+    """Read a scan: (N, 4) float32 x forward, y left, z up in metres, and reflectance 0 to 1, in the
+    frame of the scanner.
 
     Raises:
         MissingDataError: the file does not exist.
@@ -83,10 +87,11 @@ def read_scan(path: str) -> NDArray[np.float32]:
 def sweep_seconds(points: NDArray[np.float32], period_s: float) -> NDArray[np.float32]:
     """Return (N,) the time of each point after the time of its scan, from its azimuth.
 
-    The scanner turns once in `period_s`. A sweep begins behind the car and passes the left side, the front (at the time of the scan) and
-    the right side: clockwise, seen from above. KITTI-360's tools correct scans for motion in the same way (`CurlVelodyneData`). The
-    documentation of KITTI's raw data says that the scanner turns counter-clockwise; with that direction, the scans of a drive agree less
-    than without any correction, and with this one they agree best.
+    The scanner turns once in `period_s`. A sweep begins behind the car and passes the left side,
+    the front (at the time of the scan) and the right side: clockwise, seen from above. KITTI-360's
+    tools correct scans for motion in the same way (`CurlVelodyneData`). The documentation of
+    KITTI's raw data says that the scanner turns counter-clockwise; with that direction, the scans
+    of a drive agree less than without any correction, and with this one they agree best.
     """
     return (np.arctan2(points[:, 1], points[:, 0]) * (-period_s / (2 * np.pi))).astype(np.float32)
 
@@ -113,7 +118,9 @@ class Calibration:
 
     @classmethod
     def read(cls, path: Path, expected: str = "a name and numbers per line") -> Calibration:
-        """Read a file. Names may end in a colon or not. Lines with other values, such as a date, are ignored.
+        """Read a file.
+
+        Names may end in a colon or not. Lines with other values, such as a date, are ignored.
 
         Args:
             path: the file.
@@ -134,10 +141,12 @@ class Calibration:
         return cls(path, values)
 
     def transform(self, *names: str) -> Transform:
-        """Return the (4, 4) transform of the first of some names that exists: three rows of four numbers.
+        """Return the (4, 4) transform of the first of some names that exists: three rows of four
+        numbers.
 
         Raises:
-            FormatError: no name exists, the number of its values is wrong, or the transform is not rigid.
+            FormatError: no name exists, the number of its values is wrong, or the transform is not
+                rigid.
         """
         return self._rigid(np.reshape(self._numbers(12, *names), (3, 4)), names[0])
 
@@ -146,8 +155,13 @@ class Calibration:
         return self._rigid(np.reshape(self._numbers(9, *names), (3, 3)), names[0])
 
     def rotation_and_translation(self) -> Transform:
-        """Return the same for KITTI's raw data, whose files have a rotation `R` and a translation `T`."""
-        rotation, place = np.reshape(self._numbers(9, "R"), (3, 3)), np.reshape(self._numbers(3, "T"), (3, 1))
+        """Return the same for KITTI's raw data, whose files have a rotation `R` and a translation
+        `T`.
+        """
+        rotation, place = (
+            np.reshape(self._numbers(9, "R"), (3, 3)),
+            np.reshape(self._numbers(3, "T"), (3, 1)),
+        )
         return self._rigid(np.hstack([rotation, place]), "R, T")
 
     def _numbers(self, count: int, *names: str) -> list[float]:
@@ -159,7 +173,12 @@ class Calibration:
         values = self.values[name]
         if len(values) != count:
             where = f"after {name}:" if name else "in a line"
-            raise FormatError(self.path, expected=f"{count} numbers {where}", found=str(len(values)), advice=_AGAIN)
+            raise FormatError(
+                self.path,
+                expected=f"{count} numbers {where}",
+                found=str(len(values)),
+                advice=_AGAIN,
+            )
         return values
 
     def _rigid(self, rows: NDArray[np.float64], name: str) -> Transform:
@@ -169,7 +188,9 @@ class Calibration:
 
 
 def read_stamps(path: Path) -> NDArray[np.datetime64]:
-    """Read timestamps.txt: (F,) datetime64[ns], a line "2011-09-26 13:02:25.964389445" per frame. An empty line is no time (NaT).
+    """Read timestamps.txt: (F,) datetime64[ns], a line "2011-09-26 13:02:25.964389445" per frame.
+
+    An empty line is no time (NaT).
 
     Raises:
         MissingDataError: the file does not exist.
@@ -206,8 +227,8 @@ class FrameTimes:
     def read(cls, path: Path, frames: Sequence[int]) -> FrameTimes:
         """Read a file of time stamps, of which line i belongs to frame i. Time 0 is the first one.
 
-        In a file with exactly one line per scan, lines are in the order of the scans. Missing times of frames without a scan are
-        interpolated.
+        In a file with exactly one line per scan, lines are in the order of the scans. Missing times
+        of frames without a scan are interpolated.
 
         Args:
             path: timestamps.txt.
@@ -223,14 +244,20 @@ class FrameTimes:
         known = ~np.isnat(stamps)
         if without := sorted(set(frames) - set(numbers[known].tolist())):
             found = f"none for frame {without[0]}"
-            raise FormatError(path, expected=f"a time for each frame up to {frames[-1]}", found=found, advice=_AGAIN)
+            raise FormatError(
+                path,
+                expected=f"a time for each frame up to {frames[-1]}",
+                found=found,
+                advice=_AGAIN,
+            )
         numbers, stamps = numbers[known], stamps[known]
         seconds = cls(stamps[0], np.empty(0)).of(stamps)
         if not (np.diff(seconds) > 0).all():
             found = f"none at frame {numbers[int(np.argmin(np.diff(seconds))) + 1]}"
             raise FormatError(path, expected="times that increase", found=found, advice=_AGAIN)
         every = np.arange(max(int(numbers[-1]), frames[-1]) + 1)
-        before = np.clip(numbers[0] - every, 0, None) * _period(numbers, seconds)  # frames before the first time
+        # frames before the first time
+        before = np.clip(numbers[0] - every, 0, None) * _period(numbers, seconds)
         return cls(stamps[0], np.interp(every, numbers, seconds) - before)
 
     def of(self, stamps: NDArray[np.datetime64]) -> NDArray[np.float64]:
@@ -244,7 +271,11 @@ class FrameTimes:
 
 
 def _period(numbers: NDArray[np.integer], seconds: NDArray[np.float64]) -> float:
-    return float(np.median(np.diff(seconds) / np.diff(numbers))) if len(seconds) > 1 else layout.FRAME_PERIOD_S
+    return (
+        float(np.median(np.diff(seconds) / np.diff(numbers)))
+        if len(seconds) > 1
+        else layout.FRAME_PERIOD_S
+    )
 
 
 def _is_number(text: str) -> bool:

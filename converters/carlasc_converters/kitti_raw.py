@@ -1,4 +1,7 @@
-"""KITTI's raw data: scans, poses of the navigation system, and tracked boxes (tracklets). See `docs/sets/kitti-raw.md`."""
+"""KITTI's raw data: scans, poses of the navigation system, and tracked boxes (tracklets).
+
+See `docs/sets/kitti-raw.md`.
+"""
 
 from __future__ import annotations
 
@@ -51,18 +54,22 @@ class KittiRaw(KittiConverter):
             MissingDataError: none exists.
         """
         for pattern in (f"{_SCANS}/data", f"*/{_SCANS}/data", f"*/*/{_SCANS}/data"):
-            if found := sorted(path.parents[1].resolve() for path in self.source.glob(pattern) if path.is_dir()):
+            if found := sorted(
+                path.parents[1].resolve() for path in self.source.glob(pattern) if path.is_dir()
+            ):
                 return [RawDrive(folder) for folder in found]
         raise MissingDataError(
             self.source,
-            expected=f"2011_09_26/2011_09_26_drive_0001_sync/{_SCANS}/data/ and so on, one date, or one drive",
+            expected=f"2011_09_26/2011_09_26_drive_0001_sync/{_SCANS}/data/ and so on, one date, "
+            f"or one drive",
             found="none" if self.source.is_dir() else "no folder",
             advice="give the folder that holds the dates",
         )
 
 
 class RawDrive(Recording):
-    """One drive: a folder with velodyne_points/, oxts/ and tracklet_labels.xml, in the folder of its date. The LiDAR is its vehicle.
+    """One drive: a folder with velodyne_points/, oxts/ and tracklet_labels.xml, in the folder of
+    its date. The LiDAR is its vehicle.
 
     Attributes:
         folder: this folder.
@@ -81,7 +88,10 @@ class RawDrive(Recording):
         """The frames that have a scan."""
         if not self._numbers:
             return []
-        return [RawFrame(str(self.folder / _SCANS / "data"), number, self._times.period_s) for number in self._numbers]
+        return [
+            RawFrame(str(self.folder / _SCANS / "data"), number, self._times.period_s)
+            for number in self._numbers
+        ]
 
     @cached_property
     def _numbers(self) -> list[int]:
@@ -97,14 +107,18 @@ class RawDrive(Recording):
         return frames_of(self.folder / "oxts" / "data", ".txt")
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
-        """Return the poses of the LiDAR at the times of the packets in oxts/; packets whose time does not increase are left out."""
+        """Return the poses of the LiDAR at the times of the packets in oxts/; packets whose time
+        does not increase are left out.
+        """
         if not self._packets:
             return None
         path = self.folder / "oxts" / "timestamps.txt"
         stamps = read_stamps(path)
         if self._packets[-1] >= len(stamps) or np.isnat(stamps[self._packets]).any():
             found = f"{len(stamps)} lines" if self._packets[-1] >= len(stamps) else "an empty line"
-            raise FormatError(path, expected=f"a time for each packet up to {self._packets[-1]}", found=found)
+            raise FormatError(
+                path, expected=f"a time for each packet up to {self._packets[-1]}", found=found
+            )
         seconds = self._times.of(stamps[self._packets])
         world_T_lidar = world_T_imu(np.stack([self._packet(n) for n in self._packets])) @ invert(
             self._lidar_T_imu(force)
@@ -116,7 +130,9 @@ class RawDrive(Recording):
         path = self.folder / "oxts" / "data" / f"{number:010d}.txt"
         packets = read_packets(path)
         if len(packets) != 1:
-            raise FormatError(path, expected="one line", found=str(len(packets)), advice="copy it again")
+            raise FormatError(
+                path, expected="one line", found=str(len(packets)), advice="copy it again"
+            )
         return packets[0]
 
     def _lidar_T_imu(self, force: bool) -> Transform:
@@ -131,7 +147,9 @@ class RawDrive(Recording):
         return self._times.seconds
 
     def cameras(self) -> Sequence[CameraModel]:
-        """Return the rectified cameras; none without the date's calib_cam_to_cam.txt and calib_velo_to_cam.txt."""
+        """Return the rectified cameras; none without the date's calib_cam_to_cam.txt and
+        calib_velo_to_cam.txt.
+        """
         paths = [self.folder.parent / f"calib_{name}.txt" for name in ("cam_to_cam", "velo_to_cam")]
         if not all(path.is_file() for path in paths):
             return ()
@@ -154,7 +172,8 @@ class RawDrive(Recording):
         found = []
         if self._packets and (without := sorted(set(self._numbers) - set(self._packets))):
             found.append(
-                f"{len(without)} frames have no packet in oxts/ (first {without[0]}): their poses are interpolated"
+                f"{len(without)} frames have no packet in oxts/ (first {without[0]}): their poses "
+                f"are interpolated"
             )
         return found + ([ONLY_IN_VIEW] if (self.folder / "tracklet_labels.xml").is_file() else [])
 

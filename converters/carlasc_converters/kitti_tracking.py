@@ -1,4 +1,7 @@
-"""KITTI's tracking benchmark: scans and tracked boxes, and poses from OXTS files if they exist. See `docs/sets/kitti-tracking.md`."""
+"""KITTI's tracking benchmark: scans and tracked boxes, and poses from OXTS files if they exist.
+
+See `docs/sets/kitti-tracking.md`.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +33,15 @@ from carlasc_converters.kitti_files import (
 from carlasc_converters.oxts import read_packets, world_T_imu
 
 PERIOD_S = 0.1033  # mean time between the scans of KITTI's raw data: the benchmark has no times
-_SPLITS: tuple[tuple[str, Split, str], ...] = (("training", "Train", ""), ("testing", "Test", "test"))
+_SPLITS: tuple[tuple[str, Split, str], ...] = (
+    ("training", "Train", ""),
+    ("testing", "Test", "test"),
+)
 _IGNORED = "DontCare"  # a region of the image without a box in space
 _MAX_TRACK = 2**32 - 1  # tracks are kept as uint32, and count from 1
-_COLUMNS = 17  # frame, track, type, truncated, occluded, alpha, box in the image (4), h w l, x y z, rotation about y
+# frame, track, type, truncated, occluded, alpha, box in the image (4), h w l, x y z, rotation about
+# y
+_COLUMNS = 17
 
 
 class KittiTracking(KittiConverter):
@@ -54,12 +62,20 @@ class KittiTracking(KittiConverter):
         for part, split, prefix in _SPLITS:
             folder = self.source if self.source.name == part else self.source / part
             scans = folder.resolve() / "velodyne"
-            names = sorted(path.name for path in scans.iterdir() if path.is_dir()) if scans.is_dir() else []
-            found += [TrackingSequence(scans.parent, name, f"KITTI_tracking_{prefix}{name}", split) for name in names]
+            names = (
+                sorted(path.name for path in scans.iterdir() if path.is_dir())
+                if scans.is_dir()
+                else []
+            )
+            found += [
+                TrackingSequence(scans.parent, name, f"KITTI_tracking_{prefix}{name}", split)
+                for name in names
+            ]
         if not found:
             raise MissingDataError(
                 self.source,
-                expected="training/velodyne/0000/ and so on, or one of the folders training and testing",
+                expected="training/velodyne/0000/ and so on, or one of the folders training and "
+                "testing",
                 found="none" if self.source.is_dir() else "no folder",
                 advice="give the folder that holds training/",
             )
@@ -67,7 +83,8 @@ class KittiTracking(KittiConverter):
 
 
 class TrackingSequence(Recording):
-    """One sequence: the folder velodyne/0000, and the files 0000.txt of label_02/, calib/ and oxts/. The LiDAR is its vehicle.
+    """One sequence: the folder velodyne/0000, and the files 0000.txt of label_02/, calib/ and
+    oxts/. The LiDAR is its vehicle.
 
     Attributes:
         folder: the folder training or testing.
@@ -96,7 +113,8 @@ class TrackingSequence(Recording):
         return Calibration.read(self._file("calib"), purpose)
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
-        """Return the poses of the LiDAR from oxts/, of which line i belongs to frame i; None without that file.
+        """Return the poses of the LiDAR from oxts/, of which line i belongs to frame i; None
+        without that file.
 
         A file with exactly one line per scan goes by their order.
         """
@@ -137,10 +155,13 @@ class TrackingSequence(Recording):
             return self.folder / name / self.number / f"{frame:06d}.png"
 
         projections = {f"image_0{number}": f"P{number}" for number in range(4)}
-        return rectified_cameras(calibration, _camera_T_lidar(calibration), projections, image_of, self._numbers)
+        return rectified_cameras(
+            calibration, _camera_T_lidar(calibration), projections, image_of, self._numbers
+        )
 
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the boxes of label_02/ in the frame of the LiDAR; tracks count from 1: those of the file plus 1.
+        """Return the boxes of label_02/ in the frame of the LiDAR; tracks count from 1: those of
+        the file plus 1.
 
         Boxes exist only in the view of the camera.
         """
@@ -153,17 +174,26 @@ class TrackingSequence(Recording):
         )
         lidar_T_camera = invert(_camera_T_lidar(calibration))
         rows = BoxRows(str(path), self._numbers)
-        for line, row in enumerate(map(str.split, filter(None, read_lines(path, "boxes", "a line per box"))), 1):
+        for line, row in enumerate(
+            map(str.split, filter(None, read_lines(path, "boxes", "a line per box"))), 1
+        ):
             where = f"{path}: line {line}"
             if len(row) < _COLUMNS:
-                raise FormatError(where, expected=f"{_COLUMNS} columns", found=str(len(row)), advice="copy it again")
+                raise FormatError(
+                    where,
+                    expected=f"{_COLUMNS} columns",
+                    found=str(len(row)),
+                    advice="copy it again",
+                )
             if row[2] == _IGNORED:
                 continue
             try:
                 frame, track = int(row[0]), int(row[1])
                 height, width, length, x, y, z, turn = map(float, row[10:_COLUMNS])
             except ValueError as error:
-                raise FormatError(where, expected="numbers but in column 3", found=str(error)) from error
+                raise FormatError(
+                    where, expected="numbers but in column 3", found=str(error)
+                ) from error
             if not 0 <= track < _MAX_TRACK:
                 raise FormatError(where, expected=f"a track 0..{_MAX_TRACK - 1}", found=str(track))
             camera_T_box = _camera_T_box(np.array([x, y - height / 2, z]), turn)
@@ -203,7 +233,9 @@ def _camera_T_lidar(calibration: Calibration) -> Transform:
 
 
 def _camera_T_box(center: NDArray[np.float64], turn_rad: float) -> Transform:
-    """Return the pose of a box in the camera's frame (x right, y down, z forward), from its rotation about y."""
+    """Return the pose of a box in the camera's frame (x right, y down, z forward), from its
+    rotation about y.
+    """
     forward, up = np.array([np.cos(turn_rad), 0.0, -np.sin(turn_rad)]), np.array([0.0, -1.0, 0.0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)

@@ -1,4 +1,7 @@
-"""SemanticKITTI's voxel files: uint16 labels, and masks of one bit per voxel. See the format page, `docs/format.md#semantickitti`."""
+"""SemanticKITTI's voxel files: uint16 labels, and masks of one bit per voxel.
+
+See the format page, `docs/format.md#semantickitti`.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,12 @@ def unpack_bits(data: bytes, size: tuple[int, int, int], where: str) -> NDArray[
     """
     voxels = int(np.prod(size))
     if len(data) != -(-voxels // 8):
-        raise FormatError(where, expected=f"{-(-voxels // 8)} bytes of packed bits", found=str(len(data)), advice=_COPY)
+        raise FormatError(
+            where,
+            expected=f"{-(-voxels // 8)} bytes of packed bits",
+            found=str(len(data)),
+            advice=_COPY,
+        )
     return np.unpackbits(np.frombuffer(data, np.uint8), count=voxels).reshape(size).astype(np.bool_)
 
 

@@ -33,7 +33,9 @@ def index_file(path: Path) -> FileIndex:
             kind, length = unpack("<BQ", head) if len(head) == _HEAD else (0, size)
             if at + _HEAD + length > size or not kind:
                 if not ended:
-                    walk.index.lost = f"it is cut short at byte {at} of {size}, and what follows is lost"
+                    walk.index.lost = (
+                        f"it is cut short at byte {at} of {size}, and what follows is lost"
+                    )
                 break
             ended = ended or kind == _END
             if kind == _CHUNK:
@@ -73,10 +75,16 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
             data = file.read(length)
     else:
         content = _read_chunk(path, chunk, version_of(path))
-        kind, length = unpack_from("<BQ", content, offset) if offset + _HEAD <= len(content) else (0, 0)
+        kind, length = (
+            unpack_from("<BQ", content, offset) if offset + _HEAD <= len(content) else (0, 0)
+        )
         data = content[offset + _HEAD : offset + _HEAD + length]
     if kind != _MESSAGE or len(data) != length:
-        raise FormatError(path, expected=f"a message at {offset} in the chunk at byte {chunk}", found="something else")
+        raise FormatError(
+            path,
+            expected=f"a message at {offset} in the chunk at byte {chunk}",
+            found="something else",
+        )
     return data[_MESSAGE_HEAD:]
 
 
@@ -105,7 +113,9 @@ class _McapRecords:
             number, _, time = unpack_from("<HIQ", content)
             self.loose.setdefault(number, []).append((time, at))
         elif kind == _INDEX:
-            self._entries.append((unpack_from("<H", content)[0], np.frombuffer(content, _ENTRY, offset=6)))
+            self._entries.append(
+                (unpack_from("<H", content)[0], np.frombuffer(content, _ENTRY, offset=6))
+            )
         else:
             self._learn(kind, content)
 
@@ -124,7 +134,8 @@ class _McapRecords:
         except FormatError:
             if not (whole and entries):
                 raise
-            self._add(chunk, entries)  # the channels may be known later; reading its frames reports the damage
+            # the channels may be known later; reading its frames reports the damage
+            self._add(chunk, entries)
             return
         for kind, begin, end in _records(data):
             if kind == _MESSAGE:
@@ -138,7 +149,9 @@ class _McapRecords:
 
     def _add(self, chunk: int, entries: list[tuple[int, NDArray[np.void]]]) -> None:
         for number, rows in entries:
-            self.index.add(number, chunk, rows["time"].astype(np.int64), rows["offset"].astype(np.int64))
+            self.index.add(
+                number, chunk, rows["time"].astype(np.int64), rows["offset"].astype(np.int64)
+            )
 
     def _learn(self, kind: int, content: bytes) -> None:
         if kind == _SCHEMA:
@@ -159,13 +172,17 @@ def _read_chunk(path: str, at: int, version: Version) -> bytes:
         codec, begin = _text(content, 28)
         (length,) = unpack_from("<Q", content, begin)
     except (struct.error, UnicodeDecodeError) as error:
-        raise FormatError(path, expected=f"a chunk at byte {at}", found=f"damage ({error})") from error
+        raise FormatError(
+            path, expected=f"a chunk at byte {at}", found=f"damage ({error})"
+        ) from error
     data, (checksum,) = (
         decompressed(content[begin + 8 : begin + 8 + length], codec, path),
         unpack_from("<I", content, 24),
     )
     if checksum and crc32(data) != checksum:
-        raise FormatError(path, expected=f"a chunk at byte {at} that fits its checksum", found="damage")
+        raise FormatError(
+            path, expected=f"a chunk at byte {at} that fits its checksum", found="damage"
+        )
     return data
 
 

@@ -34,7 +34,9 @@ _ALONE_US = 50_000.0  # greatest distance in time from a single frame to the dat
 
 
 class Ncore(Converter):
-    """Reads recordings of NCore: files .zarr.itar or folders .zarr, one or several for each sequence."""
+    """Reads recordings of NCore: files .zarr.itar or folders .zarr, one or several for each
+    sequence.
+    """
 
     title: ClassVar[str] = "NCore, NVIDIA's exchange format, version 4"
     classes = NCORE
@@ -47,12 +49,17 @@ class Ncore(Converter):
             MissingDataError: no sequence exists.
             FormatError: a store has another version.
         """
-        stores = defaultdict[tuple[Path, str], list[NcoreStore]](list)  # those of one sequence lie in one folder
+        # those of one sequence lie in one folder
+        stores = defaultdict[tuple[Path, str], list[NcoreStore]](list)
         for path in self._paths():
             store = open_store(str(path))
             about = store.attributes()
             if about.get("version") != _VERSION:
-                raise FormatError(path, expected=f"NCore {_VERSION}", found=str(about.get("version", "no version")))
+                raise FormatError(
+                    path,
+                    expected=f"NCore {_VERSION}",
+                    found=str(about.get("version", "no version")),
+                )
             stores[path.parent, str(about["sequence_id"])].append(store)
         found = [NcoreRecording(name, parts) for (_, name), parts in sorted(stores.items())]
         if not found:
@@ -67,11 +74,16 @@ class Ncore(Converter):
     def _paths(self) -> list[Path]:
         if self.source.name.endswith(SUFFIXES):
             return [self.source]
-        return sorted(path for path in self.source.rglob("*ncore4*") if path.name.endswith(SUFFIXES))
+        return sorted(
+            path for path in self.source.rglob("*ncore4*") if path.name.endswith(SUFFIXES)
+        )
 
 
 class NcoreRecording(Recording):
-    """A sequence. Its frames are those of its first LiDAR; a frame's time is its end, as in NCore."""
+    """A sequence.
+
+    Its frames are those of its first LiDAR; a frame's time is its end, as in NCore.
+    """
 
     split = "Train"
 
@@ -79,7 +91,10 @@ class NcoreRecording(Recording):
         self.name, self.location, self._stores = sequence_name(name), str(stores[0].path), stores
         if not self._lidars:
             raise MissingDataError(
-                self.location, expected="a LiDAR with frames", found="none", advice="give all stores of the sequence"
+                self.location,
+                expected="a LiDAR with frames",
+                found="none",
+                advice="give all stores of the sequence",
             )
 
     @cached_property
@@ -93,13 +108,17 @@ class NcoreRecording(Recording):
                     version = store.attributes(group).get("component_version")
                     if version != _COMPONENT:
                         raise FormatError(
-                            f"{store.path}: {group}", expected=f"version {_COMPONENT}", found=str(version)
+                            f"{store.path}: {group}",
+                            expected=f"version {_COMPONENT}",
+                            found=str(version),
                         )
                     components[name] = (store, group)
         return found
 
     def _component(self, kind: str) -> tuple[NcoreStore, str] | None:
-        """Return the component of a kind with the name default, as in NCore, otherwise the first; None without one."""
+        """Return the component of a kind with the name default, as in NCore, otherwise the first;
+        None without one.
+        """
         found = self._components[kind]
         return found.get("default") or next(iter(found.values()), None)
 
@@ -109,7 +128,9 @@ class NcoreRecording(Recording):
         spans = {}
         for name, (store, group) in self._components["lidars"].items():
             with opening(f"{store.path}: {group}/frames", "the times of frames"):
-                own = np.array(store.attributes(f"{group}/frames")["frames_timestamps_us"], np.int64).reshape(-1, 2)
+                own = np.array(
+                    store.attributes(f"{group}/frames")["frames_timestamps_us"], np.int64
+                ).reshape(-1, 2)
             if len(own):
                 spans[name] = own
         return spans
@@ -132,7 +153,9 @@ class NcoreRecording(Recording):
 
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
-        """The frames of the first LiDAR, each with the frames of the other ones that are nearest to it in time."""
+        """The frames of the first LiDAR, each with the frames of the other ones that are nearest to
+        it in time.
+        """
         ends = self._first[:, 1]
         parts: list[list[tuple[int, str, str]]] = [[] for _ in ends]
         for index, (name, (store, group)) in enumerate(self._lidars.items()):
@@ -142,23 +165,33 @@ class NcoreRecording(Recording):
                 row = int(np.argmin(apart[:, number]))
                 if apart[row, number] <= self._slack_us and int(np.argmin(apart[row])) == number:
                     parts[number].append((index, str(store.path), f"{group}/frames/{own[row]}"))
-        return [NcoreFrame(number, end, tuple(parts[number])) for number, end in enumerate(ends.tolist())]
+        return [
+            NcoreFrame(number, end, tuple(parts[number]))
+            for number, end in enumerate(ends.tolist())
+        ]
 
     @cached_property
     def _tree(self) -> FrameTree:
         """The frames of coordinates, as a tree below the world."""
-        edges: dict[str, list[tuple[str, NDArray[np.int64], NDArray[np.float64]]]] = defaultdict(list)
+        edges: dict[str, list[tuple[str, NDArray[np.int64], NDArray[np.float64]]]] = defaultdict(
+            list
+        )
         if (component := self._component("poses")) is not None:
             store, group = component
             with opening(f"{store.path}: {group}", "poses between frames"):
-                given = {**store.attributes(f"{group}/static_poses"), **store.attributes(f"{group}/dynamic_poses")}
+                given = {
+                    **store.attributes(f"{group}/static_poses"),
+                    **store.attributes(f"{group}/dynamic_poses"),
+                }
                 for key, entry in given.items():
                     source, target = ast.literal_eval(key)
                     poses = np.array(entry.get("poses", [entry.get("pose")]), np.float64)
                     stamps = np.array(entry.get("timestamps_us", [0]), np.int64)
                     check_rigid(poses, f"{store.path}: {group}: {key}")
                     edges[target].append((source, stamps, poses))
-                    edges[source].append((target, stamps, np.array([invert(pose) for pose in poses])))
+                    edges[source].append(
+                        (target, stamps, np.array([invert(pose) for pose in poses]))
+                    )
         tree, reached = FrameTree(self.location), list[str]()
         waiting = [_WORLD if _WORLD in edges else _RIG]
         while waiting:
@@ -168,7 +201,9 @@ class NcoreRecording(Recording):
                 if child in reached or child in waiting:
                     continue
                 waiting.append(child)
-                rows = np.concatenate([poses[:, :3, 3], quaternions_of(poses[:, :3, :3])], axis=1).tolist()
+                rows = np.concatenate(
+                    [poses[:, :3, 3], quaternions_of(poses[:, :3, :3])], axis=1
+                ).tolist()
                 for stamp, row in zip(stamps.tolist(), rows, strict=True):
                     tree.add(PlacedFrame(stamp * _NS, parent, child, tuple(row)))
         return tree
@@ -189,9 +224,13 @@ class NcoreRecording(Recording):
         for name in self._lidars:
             if not self._tree.connected(name, self._vehicle):
                 raise MissingDataError(
-                    self.location, expected=f"poses from {name} to {self._vehicle}", found=str(self._tree)
+                    self.location,
+                    expected=f"poses from {name} to {self._vehicle}",
+                    found=str(self._tree),
                 )
-            sensors.append(Sensor(name, self._tree.lookup(self._vehicle, name, at)[0], deskewed=False))
+            sensors.append(
+                Sensor(name, self._tree.lookup(self._vehicle, name, at)[0], deskewed=False)
+            )
         return sensors
 
     def times(self) -> NDArray[np.float64]:
@@ -205,11 +244,17 @@ class NcoreRecording(Recording):
         """Return the poses of the rig in the world; None if there are none."""
         if not self._tree.connected(self._vehicle, _WORLD) or self._vehicle == _WORLD:
             return None
-        tracks = [track.values[0] for track in self._tree.edges(self._vehicle, _WORLD) if len(track) > 1]
+        tracks = [
+            track.values[0] for track in self._tree.edges(self._vehicle, _WORLD) if len(track) > 1
+        ]
         if not tracks:
             return None
         stamps = max(tracks, key=len)
-        return Trajectory(self._tree.lookup(_WORLD, self._vehicle, stamps), self._seconds(stamps // _NS), self.location)
+        return Trajectory(
+            self._tree.lookup(_WORLD, self._vehicle, stamps),
+            self._seconds(stamps // _NS),
+            self.location,
+        )
 
     @cached_property
     def _observations(self) -> list[tuple[int, dict[str, Any]]]:
@@ -222,7 +267,9 @@ class NcoreRecording(Recording):
             return [(self._frame_at(int(entry["timestamp_us"])), entry) for entry in given]
 
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the cuboids of each frame with observations, in the frame of the rig at its time; None without any."""
+        """Return the cuboids of each frame with observations, in the frame of the rig at its time;
+        None without any.
+        """
         if not self._observations:
             return None
         annotated = sorted({frame for frame, _ in self._observations} - {-1})
@@ -235,7 +282,12 @@ class NcoreRecording(Recording):
                 if frame < 0 or (frame, track) in seen:  # or it was seen by several sensors
                     continue
                 seen.add((frame, track))
-                stamps = np.array([self._first[frame, 1], entry["reference_frame_timestamp_us"]], np.int64) * _NS
+                stamps = (
+                    np.array(
+                        [self._first[frame, 1], entry["reference_frame_timestamp_us"]], np.int64
+                    )
+                    * _NS
+                )
                 vehicle_T_reference = self._between(entry["reference_frame_id"], stamps)
                 box, label = entry["bbox3"], class_of_name(entry["class_id"])
                 pose = multiply(vehicle_T_reference, _pose_of(box["centroid"], box["rot"]))
@@ -258,7 +310,10 @@ class NcoreRecording(Recording):
     @cached_property
     def _images(self) -> dict[str, list[int | None]]:
         """The row of the image of each frame, by camera."""
-        return {camera.name: camera.nearest(self._first[:, 1], self._slack_us) for camera in self._cameras}
+        return {
+            camera.name: camera.nearest(self._first[:, 1], self._slack_us)
+            for camera in self._cameras
+        }
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras with a model of the layout and with poses that lead to the vehicle."""
@@ -266,7 +321,10 @@ class NcoreRecording(Recording):
         for camera in self._cameras:
             if camera.unknown is None and self._tree.connected(camera.name, self._vehicle):
                 middles = self._seconds(camera.spans.mean(axis=1))
-                taken = [np.nan if row is None else float(middles[row]) for row in self._images[camera.name]]
+                taken = [
+                    np.nan if row is None else float(middles[row])
+                    for row in self._images[camera.name]
+                ]
                 place = self._tree.lookup(self._vehicle, camera.name, at)[0]
                 found.append(camera.model(place, np.array(taken) if len(middles) else None))
         return found
@@ -274,12 +332,17 @@ class NcoreRecording(Recording):
     def image(self, camera: CameraModel, frame: int) -> tuple[str, bytes] | None:
         """Return the image of a camera that is nearest to a frame."""
         row = self._images[camera.name][frame]
-        return None if row is None else next(own for own in self._cameras if own.name == camera.name).read(row)
+        return (
+            None
+            if row is None
+            else next(own for own in self._cameras if own.name == camera.name).read(row)
+        )
 
     def notes(self) -> list[str]:
         """Return notes on what was left out of the recording, and on unknown classes of objects."""
         notes = [
-            f"the camera {camera.name} was left out: {camera.unknown or f'no poses lead to {self._vehicle}'}"
+            f"the camera {camera.name} was left out: "
+            f"{camera.unknown or f'no poses lead to {self._vehicle}'}"
             for camera in self._cameras
             if camera.unknown or not self._tree.connected(camera.name, self._vehicle)
         ]
@@ -292,15 +355,21 @@ class NcoreRecording(Recording):
         if far := sum(frame < 0 for frame, _ in self._observations):
             notes.append(f"{count(far, 'observation')} of boxes left out, not near any frame")
         unknown = {
-            str(entry["class_id"]) for _, entry in self._observations if class_of_name(entry["class_id"]) is None
+            str(entry["class_id"])
+            for _, entry in self._observations
+            if class_of_name(entry["class_id"]) is None
         }
         if unknown:
-            notes.append(f"objects of unknown classes became Other object: {', '.join(sorted(unknown))}")
+            notes.append(
+                f"objects of unknown classes became Other object: {', '.join(sorted(unknown))}"
+            )
         return notes
 
     def _frame_at(self, stamp_us: int) -> int:
         """Return the frame that contains a time, or the nearest one; -1 if none is near."""
-        away = np.maximum(self._first[:, 0] - stamp_us, 0) + np.maximum(stamp_us - self._first[:, 1], 0)
+        away = np.maximum(self._first[:, 0] - stamp_us, 0) + np.maximum(
+            stamp_us - self._first[:, 1], 0
+        )
         frame = int(np.argmin(away))
         return frame if away[frame] <= self._slack_us else -1
 
@@ -308,7 +377,9 @@ class NcoreRecording(Recording):
         """Return (4, 4) from a frame at the second time to the rig at the first time."""
         if not self._tree.connected(reference, self._vehicle):
             raise MissingDataError(
-                self.location, expected=f"poses from {reference} to {self._vehicle}", found=str(self._tree)
+                self.location,
+                expected=f"poses from {reference} to {self._vehicle}",
+                found=str(self._tree),
             )
         root = self._tree.ancestors(self._vehicle)[-1]
         now, then = (
@@ -343,12 +414,20 @@ class NcoreFrame(FrameHandle):
 
     def _read(self, index: int, path: str, group: str) -> Cloud:
         store = open_store(path)
-        rays = {name: store.array(f"{group}/ray_bundle/{name}") for name in ("direction", "timestamp_us")}
-        returns = {name: store.array(f"{group}/ray_bundle_returns/{name}") for name in ("distance_m", "intensity")}
+        rays = {
+            name: store.array(f"{group}/ray_bundle/{name}")
+            for name in ("direction", "timestamp_us")
+        }
+        returns = {
+            name: store.array(f"{group}/ray_bundle_returns/{name}")
+            for name in ("distance_m", "intensity")
+        }
         distance = returns["distance_m"]
         if distance.shape[1:] != rays["direction"].shape[:1]:
             raise FormatError(
-                f"{path}: {group}", expected=f"returns of {len(rays['direction'])} rays", found=str(distance.shape)
+                f"{path}: {group}",
+                expected=f"returns of {len(rays['direction'])} rays",
+                found=str(distance.shape),
             )
         which, ray = np.nonzero(np.isfinite(distance))
         points = np.empty((len(ray), 4), np.float32)

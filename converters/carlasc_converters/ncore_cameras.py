@@ -19,7 +19,9 @@ from carlasc_converters.image_files import nearest_rows
 from carlasc_converters.ncore_store import NcoreStore
 
 _ENDINGS = {"jpeg": "jpg", "jpg": "jpg", "png": "png"}
-_EDGE = 0.5  # pixels from the corner of the first pixel, where NCore's coordinates begin, to its centre, where those of the layout do
+# pixels from the corner of the first pixel, where NCore's coordinates begin, to its centre, where
+# those of the layout do
+_EDGE = 0.5
 
 
 @dataclass(frozen=True)
@@ -27,10 +29,12 @@ class NcoreCamera:
     """A camera.
 
     Attributes:
-        name: its name, which is that of its frame of coordinates too: x to the right, y down, z ahead.
+        name: its name, which is that of its frame of coordinates too: x to the right, y down, z
+            ahead.
         store: the store of its images.
         group: the group of its images there.
-        lens: `camera_model_type`, `camera_model_parameters` and the other values of the component "intrinsics".
+        lens: `camera_model_type`, `camera_model_parameters` and the other values of the component
+            "intrinsics".
     """
 
     name: str
@@ -41,7 +45,10 @@ class NcoreCamera:
     @property
     def unknown(self) -> str | None:
         """Why its images cannot be projected; None if they can."""
-        kind, given = self.lens.get("camera_model_type"), self.lens.get("camera_model_parameters", {})
+        kind, given = (
+            self.lens.get("camera_model_type"),
+            self.lens.get("camera_model_parameters", {}),
+        )
         if kind not in ("opencv-pinhole", "opencv-fisheye"):
             return f"the model {kind}"
         if self.lens.get("external_distortion_type") or given.get("external_distortion_parameters"):
@@ -56,7 +63,9 @@ class NcoreCamera:
             return np.array(given, np.int64).reshape(-1, 2)
 
     def nearest(self, ends: NDArray[np.int64], within: float) -> list[int | None]:
-        """Return the row of the image whose middle is nearest to each of (F,) times, microseconds; None if none is near enough."""
+        """Return the row of the image whose middle is nearest to each of (F,) times, microseconds;
+        None if none is near enough.
+        """
         if not len(self.spans):
             return [None] * len(ends)
         middles = self.spans.mean(axis=1).astype(np.int64)
@@ -77,8 +86,12 @@ class NcoreCamera:
             (fx, fy), (cx, cy) = given["focal_length"], given["principal_point"]
             radial = tuple(given["radial_coeffs"])
             fisheye = self.lens["camera_model_type"] == "opencv-fisheye"
-            distortion = radial if fisheye else (*radial[:2], *given["tangential_coeffs"], *radial[2:])
-        model: Lens = "fisheye" if fisheye else "radial-tangential" if any(distortion) else "pinhole"
+            distortion = (
+                radial if fisheye else (*radial[:2], *given["tangential_coeffs"], *radial[2:])
+            )
+        model: Lens = (
+            "fisheye" if fisheye else "radial-tangential" if any(distortion) else "pinhole"
+        )
         return CameraModel(
             name=self.name,
             width=width,

@@ -1,7 +1,9 @@
-"""Stores of NCore, version 4: zarr hierarchies of version 2, in a folder or in a tar archive with an index (.zarr.itar).
+"""Stores of NCore, version 4: zarr hierarchies of version 2, in a folder or in a tar archive with
+an index (.zarr.itar).
 
-The format: https://nvidia.github.io/ncore/data/formats.html. An archive ends with a block with the position of its index: names, positions and
-sizes of its members, as CBOR compressed by LZMA. The metadata of a store are collected in one member, in the same form.
+The format: https://nvidia.github.io/ncore/data/formats.html. An archive ends with a block with the
+position of its index: names, positions and sizes of its members, as CBOR compressed by LZMA. The
+metadata of a store are collected in one member, in the same form.
 """
 
 from __future__ import annotations
@@ -51,11 +53,20 @@ class NcoreStore:
                 )
             if kind != _CBOR_LZMA:
                 raise FormatError(
-                    self.path, expected="an index of kind 1", found=f"kind {kind}", advice="upgrade carlasc"
+                    self.path,
+                    expected="an index of kind 1",
+                    found=f"kind {kind}",
+                    advice="upgrade carlasc",
                 )
             file.seek(place)
             table = _unpacked(file.read(length))
-            return dict(zip(table["items"], zip(table["offset_datas"], table["sizes"], strict=True), strict=True))
+            return dict(
+                zip(
+                    table["items"],
+                    zip(table["offset_datas"], table["sizes"], strict=True),
+                    strict=True,
+                )
+            )
 
     def _read(self, name: str) -> bytes | None:
         """Return the bytes of a member; None if it does not exist."""
@@ -69,7 +80,9 @@ class NcoreStore:
             file.seek(place)
             data = file.read(size)
         if len(data) < size:
-            raise FormatError(self.path, expected=f"{size} bytes of {name}", found=str(len(data)), advice=COPY)
+            raise FormatError(
+                self.path, expected=f"{size} bytes of {name}", found=str(len(data)), advice=COPY
+            )
         return data
 
     @cached_property
@@ -108,7 +121,9 @@ class NcoreStore:
         """
         about = self._metadata.get(f"{name}/.zarray")
         if about is None:
-            raise MissingDataError(f"{self.path}: {name}", expected="an array", found="none", advice=COPY)
+            raise MissingDataError(
+                f"{self.path}: {name}", expected="an array", found="none", advice=COPY
+            )
         where = f"{self.path}: {name}"
         with opening(where, "an array of zarr version 2"):
             shape, chunks = tuple(about["shape"]), tuple(about["chunks"])
@@ -116,7 +131,9 @@ class NcoreStore:
             values = np.full(shape, about["fill_value"] or 0, np.dtype(about["dtype"]))
             if about["order"] != "C" or about["filters"]:
                 raise FormatError(
-                    where, expected="rows in order C without filters", found=f"{about['order']}, {about['filters']}"
+                    where,
+                    expected="rows in order C without filters",
+                    found=f"{about['order']}, {about['filters']}",
                 )
             codec = (
                 None
@@ -140,7 +157,9 @@ class NcoreStore:
 
 
 def open_store(path: str) -> NcoreStore:
-    """Return a store; a process reads its index and metadata once, and again after the store changed."""
+    """Return a store; a process reads its index and metadata once, and again after the store
+    changed.
+    """
     file = Path(path)
     changed = file / _METADATA if file.is_dir() and (file / _METADATA).exists() else file
     return _open(path, version_of(changed, "a store of NCore"))

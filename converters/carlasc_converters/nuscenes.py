@@ -26,11 +26,15 @@ _NEAR_US = 50_000  # greatest time between an image and its scan
 
 
 class NuScenes(Converter):
-    """Reads nuScenes with its point labels and instances (lidarseg and panoptic), if they are installed."""
+    """Reads nuScenes with its point labels and instances (lidarseg and panoptic), if they are
+    installed.
+    """
 
     title: ClassVar[str] = "nuScenes, with lidarseg and panoptic labels where they are installed"
     license = "CC BY-NC-SA 4.0"
-    citation = "H. Caesar et al., nuScenes, CVPR 2020; W. K. Fong et al., Panoptic nuScenes, RA-L 2022"
+    citation = (
+        "H. Caesar et al., nuScenes, CVPR 2020; W. K. Fong et al., Panoptic nuScenes, RA-L 2022"
+    )
     classes = NUSCENES
     to_carla = TO_CARLA
     sensor = "Velodyne HDL-32E"
@@ -41,8 +45,12 @@ class NuScenes(Converter):
         self,
         source: Path,
         *,
-        version: Annotated[str | None, "Folder of the tables, if there are several, such as v1.0-mini."] = None,
-        sweeps: Annotated[bool, "Read all scans, 20 per second; without it, only key frames, 2 per second."] = True,
+        version: Annotated[
+            str | None, "Folder of the tables, if there are several, such as v1.0-mini."
+        ] = None,
+        sweeps: Annotated[
+            bool, "Read all scans, 20 per second; without it, only key frames, 2 per second."
+        ] = True,
     ) -> None:
         super().__init__(source)
         self.version, self.sweeps = version, sweeps
@@ -60,13 +68,18 @@ class NuScenes(Converter):
         root, names = tables.folder.parent, _Names()
         found: list[Recording] = []
         for scene in tables.scenes:
-            present = {scan.file for scan in scene.scans if (root / scan.file).name in names.of(root / scan.file)}
+            present = {
+                scan.file
+                for scan in scene.scans
+                if (root / scan.file).name in names.of(root / scan.file)
+            }
             if present:
                 found.append(NuScenesScene(tables, scene, present, all_scans=self.sweeps))
         if not found:
             raise MissingDataError(
                 root,
-                expected=f"the LiDAR scans that {tables.folder.name} lists, such as samples/{CHANNEL}/*.pcd.bin",
+                expected=f"the LiDAR scans that {tables.folder.name} lists, such as "
+                f"samples/{CHANNEL}/*.pcd.bin",
                 found="none of them",
                 advice="unpack the archives of the sensor data beside the folder of the tables",
             )
@@ -88,12 +101,17 @@ class NuScenes(Converter):
             )
         chosen = [folder for folder in folders if asked in (None, folder.name)]
         if len(chosen) != 1:
-            raise ArgumentError("version", expected=f"one of {listed}", found=repr(asked) if asked else "no choice")
+            raise ArgumentError(
+                "version", expected=f"one of {listed}", found=repr(asked) if asked else "no choice"
+            )
         return chosen[0]
 
 
 class _Names:
-    """The names of the files in folders. Each folder is listed once, because it may hold hundreds of thousands."""
+    """The names of the files in folders.
+
+    Each folder is listed once, because it may hold hundreds of thousands.
+    """
 
     def __init__(self) -> None:
         self._folders: dict[Path, frozenset[str]] = {}
@@ -114,7 +132,9 @@ class NuScenesScene(Recording):
         scene: the scene.
     """
 
-    def __init__(self, tables: Tables, scene: SceneRow, present: set[str], *, all_scans: bool) -> None:
+    def __init__(
+        self, tables: Tables, scene: SceneRow, present: set[str], *, all_scans: bool
+    ) -> None:
         """Choose the scans.
 
         Args:
@@ -144,7 +164,9 @@ class NuScenesScene(Recording):
                 number,
                 None if scan.labels is None else str(root / scan.labels),
                 None if scan.instances is None else str(root / scan.instances),
-                boxes[number].transform(sensor_T_vehicle) if scan.instances and number in boxes else None,
+                boxes[number].transform(sensor_T_vehicle)
+                if scan.instances and number in boxes
+                else None,
             )
             for number, scan in enumerate(self._scans)
             if scan.file in self._present
@@ -153,12 +175,24 @@ class NuScenesScene(Recording):
     @cached_property
     def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
         """The LiDAR on the roof. The origin of the vehicle is on the ground."""
-        mounts = [self.tables.mounts[token] for token in sorted({scan.mount for scan in self.scene.scans})]
+        mounts = [
+            self.tables.mounts[token] for token in sorted({scan.mount for scan in self.scene.scans})
+        ]
         if any(not np.allclose(mount, mounts[0]) for mount in mounts):
             raise FormatError(
-                self.location, expected=f"one calibration of {CHANNEL} in a scene", found=str(len(mounts))
+                self.location,
+                expected=f"one calibration of {CHANNEL} in a scene",
+                found=str(len(mounts)),
             )
-        return (Sensor(CHANNEL, mounts[0], points_in="sensor", deskewed=True, height_m=float(mounts[0][2, 3])),)
+        return (
+            Sensor(
+                CHANNEL,
+                mounts[0],
+                points_in="sensor",
+                deskewed=True,
+                height_m=float(mounts[0][2, 3]),
+            ),
+        )
 
     def poses(self, *, force: bool = False) -> Trajectory:
         """Return the poses of the vehicle at all LiDAR scans of the scene, at their own times."""
@@ -172,7 +206,9 @@ class NuScenesScene(Recording):
     def _global_T_vehicle(self, rows: Sequence[int]) -> NDArray[np.float64]:
         """Return (N, 4, 4) poses of rows of the poses in the tables."""
         numbers = self.tables.poses[1][rows]
-        return poses_of(numbers[:, 3:], numbers[:, :3], f"{self.tables.path('ego_pose')}: {self.scene.name}")
+        return poses_of(
+            numbers[:, 3:], numbers[:, :3], f"{self.tables.path('ego_pose')}: {self.scene.name}"
+        )
 
     def times(self) -> NDArray[np.float64]:
         """Return seconds after the first frame."""
@@ -186,9 +222,13 @@ class NuScenesScene(Recording):
         root, found = self.tables.folder.parent, []
         frames = np.array([scan.timestamp for scan in self._scans], np.int64)
         for token in sorted(
-            {image.mount for image in self.scene.images}, key=lambda one: self.tables.cameras[one].channel
+            {image.mount for image in self.scene.images},
+            key=lambda one: self.tables.cameras[one].channel,
         ):
-            row, own = self.tables.cameras[token], [image for image in self.scene.images if image.mount == token]
+            row, own = (
+                self.tables.cameras[token],
+                [image for image in self.scene.images if image.mount == token],
+            )
             nearest, near, images = nearest_images(
                 {image.timestamp: root / image.file for image in own}, frames, _NEAR_US
             )
@@ -206,7 +246,10 @@ class NuScenesScene(Recording):
         return found
 
     def boxes(self) -> Mapping[int, Boxes] | None:
-        """Return the boxes of the key frames. Tracks are numbered as the data set's panoptic labels are: by first appearance."""
+        """Return the boxes of the key frames.
+
+        Tracks are numbered as the data set's panoptic labels are: by first appearance.
+        """
         return None if self.tables.annotations is None else self._boxes
 
     @cached_property
@@ -217,25 +260,36 @@ class NuScenesScene(Recording):
             return {}
         keys = {number: scan for number, scan in enumerate(self._scans) if scan.sample >= 0}
         rows = {number: annotations.of(scan.sample) for number, scan in keys.items()}
-        tracks = _tracks([rows[number] for number in sorted(rows, key=lambda number: keys[number].sample)])
+        tracks = _tracks(
+            [rows[number] for number in sorted(rows, key=lambda number: keys[number].sample)]
+        )
         poses = self._global_T_vehicle([scan.pose for scan in keys.values()])
         found = {}
         for (number, scan), global_T_vehicle in zip(keys.items(), poses, strict=True):
             try:
                 found[number] = _boxes_of(rows[number], tracks, global_T_vehicle)
             except FormatError as error:
-                raise error.within(f"{self.tables.path('sample_annotation')}: {scan.file}") from error
+                raise error.within(
+                    f"{self.tables.path('sample_annotation')}: {scan.file}"
+                ) from error
         return found
 
     def problems(self) -> list[tuple[int, str]]:
         """Return the scans that the tables list and that have no file."""
         root, advice = self.tables.folder.parent, "unpack the archives of the sensor data again"
-        missing = [(number, scan.file) for number, scan in enumerate(self._scans) if scan.file not in self._present]
+        missing = [
+            (number, scan.file)
+            for number, scan in enumerate(self._scans)
+            if scan.file not in self._present
+        ]
         errors = (
             (
                 number,
                 MissingDataError(
-                    root / file, expected="a LiDAR scan that the tables list", found="no such file", advice=advice
+                    root / file,
+                    expected="a LiDAR scan that the tables list",
+                    found="no such file",
+                    advice=advice,
                 ),
             )
             for number, file in missing
@@ -244,9 +298,14 @@ class NuScenesScene(Recording):
 
     def notes(self) -> list[str]:
         """Return notes on what is missing in the scene."""
-        if self._asked_for_all and not self._between and any(scan.sample < 0 for scan in self.scene.scans):
+        if (
+            self._asked_for_all
+            and not self._between
+            and any(scan.sample < 0 for scan in self.scene.scans)
+        ):
             return [
-                f"{self.location}: no scan between key frames exists in sweeps/: the frames are the key frames, 2 a second"
+                f"{self.location}: no scan between key frames exists in sweeps/: the frames are "
+                f"the key frames, 2 a second"
             ]
         return []
 
@@ -260,7 +319,9 @@ def _boxes_of(rows: Annotations, tracks: Mapping[int, int], global_T_vehicle: Tr
 
 
 def _tracks(samples: Sequence[Annotations]) -> dict[int, int]:
-    """Return the number of each object of a scene from 1: the order in which its samples first name it."""
+    """Return the number of each object of a scene from 1: the order in which its samples first name
+    it.
+    """
     tracks: dict[int, int] = {}
     for sample in samples:
         for instance in sample.instances.tolist():

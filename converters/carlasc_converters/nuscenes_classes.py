@@ -1,11 +1,14 @@
-"""The classes of nuScenes: the 32 general classes of nuScenes-lidarseg, of which 1 to 23 are also those of its boxes."""
+"""The classes of nuScenes: the 32 general classes of nuScenes-lidarseg, of which 1 to 23 are also
+those of its boxes.
+"""
 
 from __future__ import annotations
 
 from carlasc.core.classes import ClassTable, Color, Remap
 from carlasc.core.tables import CARLA
 
-_CLASSES: tuple[tuple[str, Color, str], ...] = (  # name in category.json, colour, class of CARLA; ids in order
+# name in category.json, colour, class of CARLA; ids in order
+_CLASSES: tuple[tuple[str, Color, str], ...] = (
     ("noise", (0, 0, 0), "Free"),  # returns from dust, rain and reflections: unlabelled
     ("animal", (70, 130, 180), "Dynamic"),
     ("human.pedestrian.adult", (0, 0, 230), "Pedestrian"),
@@ -46,7 +49,9 @@ NUSCENES = ClassTable(
     "nuscenes",
     {index: name for name, index in CLASS_IDS.items()},
     {index: color for index, (_, color, _) in enumerate(_CLASSES)},
-    movable=frozenset({*range(1, 9), CLASS_IDS["movable_object.pushable_pullable"], *range(14, 24)}),
+    movable=frozenset(
+        {*range(1, 9), CLASS_IDS["movable_object.pushable_pullable"], *range(14, 24)}
+    ),
     deformable=frozenset({1, 2, 3, 4, 6}),
     ground=frozenset(range(24, 28)),
     geometry_only=CLASS_IDS["static.other"],
@@ -62,11 +67,14 @@ TO_CARLA = Remap(
 VALIDATION = frozenset(
     f"scene-{number:04d}"
     for part in (
-        "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 632-638 770-771 775 777-778"
+        "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 "
+        "632-638 770-771 775 777-778"
         " 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 1059-1073"
     ).split()
     for number in range(int(part.partition("-")[0]), int(part.rpartition("-")[2]) + 1)
 )
-"""Names of the 150 scenes of v1.0-trainval that are for validation, as the data set's devkit lists them."""
+"""Names of the 150 scenes of v1.0-trainval that are for validation, as the data set's devkit lists
+them.
+"""
 MINI_VALIDATION = frozenset({"scene-0103", "scene-0916"})
 """Those of v1.0-mini, which has splits of its own."""

@@ -18,7 +18,8 @@ from carlasc_converters.nuscenes_classes import NUSCENES
 
 _COLUMNS = 5  # x, y, z, intensity, ring
 _PER_CLASS = 1000  # panoptic labels are 1000 * class + number of the object
-_UNMATCHED = 1 << 16  # added to the panoptic label of objects without a box: above the number of any track
+# added to the panoptic label of objects without a box: above the number of any track
+_UNMATCHED = 1 << 16
 _SURFACE_M = 0.01  # points on the surface of a box count as inside, in spite of rounding
 
 
@@ -29,7 +30,8 @@ class NuScenesFrame(FrameHandle):
     Attributes:
         labels: the file of its point labels, or None.
         instances: the file of its panoptic labels, or None.
-        boxes: its boxes in the frame of the sensor, which give panoptic instances the numbers of their tracks.
+        boxes: its boxes in the frame of the sensor, which give panoptic instances the numbers of
+            their tracks.
     """
 
     location: str
@@ -70,10 +72,11 @@ class NuScenesFrame(FrameHandle):
 def number_instances(
     panoptic: NDArray[np.uint16], points: NDArray[np.float32], boxes: Boxes | None
 ) -> NDArray[np.uint32]:
-    """Return the number of the object of each point: that of the box with the class of the object that holds most of its points.
+    """Return the number of the object of each point: that of the box with the class of the object
+    that holds most of its points.
 
-    The data set made its panoptic labels from the boxes, so that each object has a box. An object without a box gets a unique number above
-    those of the tracks, the same in all frames.
+    The data set made its panoptic labels from the boxes, so that each object has a box. An object
+    without a box gets a unique number above those of the tracks, the same in all frames.
 
     Args:
         panoptic: (N,) panoptic labels.
@@ -101,7 +104,9 @@ def _read(path: str) -> bytes:
 
 def _read_panoptic(path: str) -> NDArray[np.uint16]:
     """Return the panoptic labels of a file."""
-    return read_arrays(path, {"data": ArrayFormat(("u1", "<u2", "<u4"), (None,))}, "unpack it again")[0]
+    return read_arrays(
+        path, {"data": ArrayFormat(("u1", "<u2", "<u4"), (None,))}, "unpack it again"
+    )[0]
 
 
 def _check_labels(labels: NDArray[Any], points: int, path: str) -> None:

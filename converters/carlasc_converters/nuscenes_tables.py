@@ -1,4 +1,7 @@
-"""The tables of nuScenes: the LiDAR scans, poses and boxes of its scenes. Each table is read once, row by row."""
+"""The tables of nuScenes: the LiDAR scans, poses and boxes of its scenes.
+
+Each table is read once, row by row.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,8 @@ class LidarScan:
     Attributes:
         file: the points, relative to the root of the data set.
         timestamp: microseconds.
-        sample: row of the sample that it belongs to, if it is the key frame of that sample; otherwise -1.
+        sample: row of the sample that it belongs to, if it is the key frame of that sample;
+            otherwise -1.
         mount: token of the calibrated sensor.
         pose: row of `Tables.poses`.
         labels: file of the point labels, or None.
@@ -113,7 +117,8 @@ class Annotations:
         samples: (A,) row of the sample of each box, increasing.
         instances: (A,) row of the object in the table of instances.
         labels: (A,) class ids.
-        numbers: (A, 10) x, y, z of the centre in the global frame, width, length, height, and the quaternion w, x, y, z.
+        numbers: (A, 10) x, y, z of the centre in the global frame, width, length, height, and the
+            quaternion w, x, y, z.
     """
 
     samples: NDArray[np.int32]
@@ -124,7 +129,9 @@ class Annotations:
     def of(self, sample: int) -> Annotations:
         """Return the boxes of one sample."""
         rows = slice(*np.searchsorted(self.samples, (sample, sample + 1)))
-        return Annotations(self.samples[rows], self.instances[rows], self.labels[rows], self.numbers[rows])
+        return Annotations(
+            self.samples[rows], self.instances[rows], self.labels[rows], self.numbers[rows]
+        )
 
 
 class Tables:
@@ -136,14 +143,16 @@ class Tables:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._pose_rows: dict[str, int] = {}  # row in `poses` by token; `scenes` collects the needed poses
+        # row in `poses` by token; `scenes` collects the needed poses
+        self._pose_rows: dict[str, int] = {}
 
     def path(self, table: str) -> Path:
         """Return the file of a table."""
         return self.folder / f"{table}.json"
 
     def check_categories(self) -> None:
-        """Check that classes have the same names as in our table, and those of point labels the same numbers.
+        """Check that classes have the same names as in our table, and those of point labels the
+        same numbers.
 
         Raises:
             FormatError: they differ, so that the tables belong to another version.
@@ -152,7 +161,8 @@ class Tables:
         for (name,) in read_rows(path, ("name",)):
             if name not in CLASS_IDS:
                 self._refuse_categories(repr(name))
-        if self.path("lidarseg").is_file() or self.path("panoptic").is_file():  # these add numbers to the categories
+        # these add numbers to the categories
+        if self.path("lidarseg").is_file() or self.path("panoptic").is_file():
             for name, index in read_rows(path, ("name", "index")):
                 if index != CLASS_IDS[name]:
                     self._refuse_categories(f"{index} for {name}, which is {CLASS_IDS[name]}")
@@ -160,7 +170,10 @@ class Tables:
     def _refuse_categories(self, found: str) -> None:
         expected = f"the {len(CLASS_IDS)} categories of nuScenes v1.0, with the numbers of nuScenes-lidarseg"
         raise FormatError(
-            self.path("category"), expected=expected, found=found, advice="use the tables of nuScenes v1.0"
+            self.path("category"),
+            expected=expected,
+            found=found,
+            advice="use the tables of nuScenes v1.0",
         )
 
     @cached_property
@@ -173,10 +186,14 @@ class Tables:
     def mounts(self) -> dict[str, Transform]:
         """(4, 4) pose of each calibrated LiDAR in the frame of its vehicle, by token."""
         sensors = {
-            token for token, channel in read_rows(self.path("sensor"), ("token", "channel")) if channel == CHANNEL
+            token
+            for token, channel in read_rows(self.path("sensor"), ("token", "channel"))
+            if channel == CHANNEL
         }
         path = self.path("calibrated_sensor")
-        rows = [row for row in read_rows(path, ("token", "sensor_token", *_POSE)) if row[1] in sensors]
+        rows = [
+            row for row in read_rows(path, ("token", "sensor_token", *_POSE)) if row[1] in sensors
+        ]
         poses = poses_of(_columns(rows, 3, 4), _columns(rows, 2, 3), str(path))
         return {row[0]: pose for row, pose in zip(rows, poses, strict=True)}
 
@@ -193,7 +210,9 @@ class Tables:
             try:
                 matrix = np.array(intrinsic, np.float64).reshape(3, 3)
             except ValueError as error:
-                raise FormatError(path, expected="3 x 3 numbers in camera_intrinsic", found=str(intrinsic)) from error
+                raise FormatError(
+                    path, expected="3 x 3 numbers in camera_intrinsic", found=str(intrinsic)
+                ) from error
             found[token] = CameraRow(str(channels.get(sensor)), pose, matrix)
         return found
 
@@ -215,22 +234,30 @@ class Tables:
             "width",
             "height",
         )
-        for token, sample, pose, mount, file, timestamp, key, *size in read_rows(self.path("sample_data"), keys):
+        for token, sample, pose, mount, file, timestamp, key, *size in read_rows(
+            self.path("sample_data"), keys
+        ):
             if mount in cameras and sample in samples and all(size):
                 self._check_inside("sample_data", file)
                 width, height = size
-                images.setdefault(samples[sample][1], []).append(ImageRow(file, timestamp, mount, (width, height)))
+                images.setdefault(samples[sample][1], []).append(
+                    ImageRow(file, timestamp, mount, (width, height))
+                )
             if mount not in mounts:
                 continue  # of a camera or a radar
             if sample not in samples:
                 raise FormatError(
-                    self.path("sample_data"), expected="a sample_token of sample.json", found=f"{sample} for {file}"
+                    self.path("sample_data"),
+                    expected="a sample_token of sample.json",
+                    found=f"{sample} for {file}",
                 )
             row, scene = samples[sample]
             place = self._pose_rows.setdefault(pose, len(self._pose_rows))
             self._check_inside("sample_data", file)
             files = labels.get(token), instances.get(token)
-            scans.setdefault(scene, []).append(LidarScan(file, timestamp, row if key else -1, mount, place, *files))
+            scans.setdefault(scene, []).append(
+                LidarScan(file, timestamp, row if key else -1, mount, place, *files)
+            )
         rows = list(read_rows(self.path("scene"), ("token", "name")))
         for _, name in rows:
             self._check_inside("scene", name)
@@ -245,7 +272,9 @@ class Tables:
         return sorted(found, key=attrgetter("name"))
 
     def _label_files(self, table: str) -> dict[str, str]:
-        """Return the files of a table of labels by token of the scan; none if there is no such table."""
+        """Return the files of a table of labels by token of the scan; none if there is no such
+        table.
+        """
         path = self.path(table)
         files = dict(read_rows(path, ("sample_data_token", "filename"))) if path.is_file() else {}
         for file in files.values():
@@ -263,16 +292,22 @@ class Tables:
 
     @cached_property
     def poses(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """(P,) timestamps in microseconds, and (P, 7) x, y, z, qw, qx, qy, qz of the vehicle in the global frame, at LiDAR scans."""
+        """(P,) timestamps in microseconds, and (P, 7) x, y, z, qw, qx, qy, qz of the vehicle in the
+        global frame, at LiDAR scans.
+        """
         wanted = self._pose_rows if self.scenes else {}
         timestamps, numbers = np.zeros(len(wanted), np.int64), np.full((len(wanted), 7), np.nan)
-        for token, timestamp, position, rotation in read_rows(self.path("ego_pose"), ("token", "timestamp", *_POSE)):
+        for token, timestamp, position, rotation in read_rows(
+            self.path("ego_pose"), ("token", "timestamp", *_POSE)
+        ):
             if (row := wanted.get(token)) is not None:
                 timestamps[row], numbers[row] = timestamp, (*position, *rotation)
         if np.isnan(numbers).any():
             lacking = list(wanted)[int(np.argmax(np.isnan(numbers).any(axis=1)))]
             raise FormatError(
-                self.path("ego_pose"), expected=f"the pose {lacking} of a LiDAR scan", found="no such row"
+                self.path("ego_pose"),
+                expected=f"the pose {lacking} of a LiDAR scan",
+                found="no such row",
             )
         return timestamps, numbers
 
@@ -281,12 +316,17 @@ class Tables:
         """All boxes; None if there are none, as in the test set."""
         if not self.path("sample_annotation").is_file():
             return None
-        class_ids = {token: CLASS_IDS[name] for token, name in read_rows(self.path("category"), ("token", "name"))}
+        class_ids = {
+            token: CLASS_IDS[name]
+            for token, name in read_rows(self.path("category"), ("token", "name"))
+        }
         objects: dict[str, tuple[int, int]] = {}
         for token, category in read_rows(self.path("instance"), ("token", "category_token")):
             if category not in class_ids:
                 found = f"{category} for {token}"
-                raise FormatError(self.path("instance"), expected="a category_token of category.json", found=found)
+                raise FormatError(
+                    self.path("instance"), expected="a category_token of category.json", found=found
+                )
             objects[token] = len(objects), class_ids[category]
         samples, instances, labels, numbers = array("i"), array("i"), array("I"), array("d")
         path = self.path("sample_annotation")

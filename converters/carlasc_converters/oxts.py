@@ -1,4 +1,6 @@
-"""OXTS: the packets of the inertial and satellite navigation system of KITTI's car, and the poses from them."""
+"""OXTS: the packets of the inertial and satellite navigation system of KITTI's car, and the poses
+from them.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ def read_packets(path: Path) -> NDArray[np.float64]:
     """Read the packets of a file, one per line.
 
     Returns:
-        (K, 30) latitude and longitude in degrees, altitude in metres, roll, pitch and yaw in radians, and 24 columns that are not used.
+        (K, 30) latitude and longitude in degrees, altitude in metres, roll, pitch and yaw in
+        radians, and 24 columns that are not used.
 
     Raises:
         MissingDataError: the file does not exist.
@@ -40,17 +43,21 @@ def read_packets(path: Path) -> NDArray[np.float64]:
 
 
 def world_T_imu(packets: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (K, 4, 4) poses of the IMU (x forward, y left, z up) in a world with x to the east, y to the north and z up, metres.
+    """Return (K, 4, 4) poses of the IMU (x forward, y left, z up) in a world with x to the east, y
+    to the north and z up, metres.
 
-    As in KITTI's development kit: the Mercator projection, scaled by the cosine of the first latitude, and the rotation
-    Rz(yaw) Ry(pitch) Rx(roll). The origin of the world is the position of the first packet.
+    As in KITTI's development kit: the Mercator projection, scaled by the cosine of the first
+    latitude, and the rotation Rz(yaw) Ry(pitch) Rx(roll). The origin of the world is the position
+    of the first packet.
     """
     latitude, longitude, altitude = packets[:, 0], packets[:, 1], packets[:, 2]
     scale = np.cos(np.radians(latitude[0])) * _EARTH_M
     east = scale * np.radians(longitude)
     north = scale * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
     poses = np.tile(np.eye(4), (len(packets), 1, 1))
-    poses[:, :3, :3] = _about(2, packets[:, 5]) @ _about(1, packets[:, 4]) @ _about(0, packets[:, 3])
+    poses[:, :3, :3] = (
+        _about(2, packets[:, 5]) @ _about(1, packets[:, 4]) @ _about(0, packets[:, 3])
+    )
     poses[:, :3, 3] = np.stack([east - east[0], north - north[0], altitude - altitude[0]], axis=1)
     return poses
 
@@ -67,5 +74,8 @@ def _about(axis: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _wrong(path: Path, line: int, found: str) -> FormatError:
     return FormatError(
-        path, expected=f"{COLUMNS} numbers per line", found=f"{found} in line {line + 1}", advice="copy it again"
+        path,
+        expected=f"{COLUMNS} numbers per line",
+        found=f"{found} in line {line + 1}",
+        advice="copy it again",
     )

@@ -1,7 +1,8 @@
-"""Paris-CARLA-3D: towns of CARLA 0.9.10, scanned by a tilted LiDAR, one PLY file of about 100 million points per town.
+"""Paris-CARLA-3D: towns of CARLA 0.9.10, scanned by a tilted LiDAR, one PLY file of about 100
+million points per town.
 
-The points of a file are in right-handed world coordinates. Each point has the position of the LiDAR, its time, and the number of its scan.
-Only the rows of one scan are in memory at a time.
+The points of a file are in right-handed world coordinates. Each point has the position of the
+LiDAR, its time, and the number of its scan. Only the rows of one scan are in memory at a time.
 """
 
 from __future__ import annotations
@@ -24,7 +25,12 @@ from carlasc_converters.ply import PlyVertices
 
 _POINT, _LIDAR = ("x", "y", "z"), ("x_lidar_position", "y_lidar_position", "z_lidar_position")
 _PROPERTIES = (*_POINT, *_LIDAR, "timestamp", "index_frame", "instance", "semantic")
-_SPLITS: dict[str, Split] = {"Town01": "Test", "Town06": "Val", "Town07": "Test"}  # as in the paper; all others: Train
+# as in the paper; all others: Train
+_SPLITS: dict[str, Split] = {
+    "Town01": "Test",
+    "Town06": "Val",
+    "Town07": "Test",
+}
 _HEADING_M = 1.0  # the heading is computed from positions that are at least this far apart
 _HEADING_FRAMES = 20  # and at most this number of frames before and after
 _MOST_RUNS = 1_000_000  # of consecutive rows of one scan: the index of a file stays small
@@ -47,10 +53,15 @@ class ParisCarla3D(Converter):
 
         Raises:
             MissingDataError: no file exists.
-            FormatError: a file is not a binary PLY file with the properties of this data set, or it is incomplete.
+            FormatError: a file is not a binary PLY file with the properties of this data set, or it
+                is incomplete.
         """
         source = self.source
-        files = [source] if source.is_file() else sorted(p for p in source.rglob("*.ply") if p.stem.startswith("Town"))
+        files = (
+            [source]
+            if source.is_file()
+            else sorted(p for p in source.rglob("*.ply") if p.stem.startswith("Town"))
+        )
         if not files:
             raise MissingDataError(
                 source,
@@ -73,38 +84,58 @@ class ParisCarlaTown(Recording):
 
     def __init__(self, path: Path) -> None:
         self.path, self.location = path, str(path)
-        self.name, self.split = f"PARISCARLA_{path.stem.replace('_', '-')}", _SPLITS.get(path.stem, "Train")
+        self.name, self.split = (
+            f"PARISCARLA_{path.stem.replace('_', '-')}",
+            _SPLITS.get(path.stem, "Train"),
+        )
         self._ply = PlyVertices.open(path, _PROPERTIES)
         if self._ply.lines is not None:
             raise FormatError(path, expected="a binary PLY file", found="a text file")
 
     @cached_property
     def _scans(self) -> list[tuple[int, tuple[tuple[int, int], ...]]]:
-        """The value of index_frame of each scan, and the ranges of its rows. One pass over the file finds them."""
+        """The value of index_frame of each scan, and the ranges of its rows.
+
+        One pass over the file finds them.
+        """
         values, bounds = _find_runs(self._ply)
         ranges: dict[int, list[tuple[int, int]]] = {}
-        for value, start, stop in zip(values.tolist(), bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
+        for value, start, stop in zip(
+            values.tolist(), bounds[:-1].tolist(), bounds[1:].tolist(), strict=True
+        ):
             ranges.setdefault(value, []).append((start, stop))
         return [(value, tuple(ranges[value])) for value in sorted(ranges)]
 
     @cached_property
     def _middles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(F, 3) position and (F,) time of the LiDAR at the middle point of each scan."""
-        rows = [self._ply.rows(row, row + 1)[0] for row in (_middle_row(ranges) for _, ranges in self._scans)]
-        positions = np.array([[row[name] for name in _LIDAR] for row in rows], np.float64).reshape(-1, 3)
+        rows = [
+            self._ply.rows(row, row + 1)[0]
+            for row in (_middle_row(ranges) for _, ranges in self._scans)
+        ]
+        positions = np.array([[row[name] for name in _LIDAR] for row in rows], np.float64).reshape(
+            -1, 3
+        )
         return positions, np.array([row["timestamp"] for row in rows], np.float64)
 
     @cached_property
     def _poses(self) -> NDArray[np.float64]:
-        """(F, 4, 4) world_T_scan: the position of the LiDAR, upright, with the direction of motion as heading."""
+        """(F, 4, 4) world_T_scan: the position of the LiDAR, upright, with the direction of motion
+        as heading.
+        """
         positions, times = self._middles
         if (wrong := np.flatnonzero(~(np.diff(times) > 0))).size:
             scan, later = self._scans[int(wrong[0])][0], self._scans[int(wrong[0]) + 1][0]
             raise FormatError(
-                self.path, expected="times that increase from scan to scan", found=f"none from scan {scan} to {later}"
+                self.path,
+                expected="times that increase from scan to scan",
+                found=f"none from scan {scan} to {later}",
             )
         return np.array(
-            [translation(at) @ rotation_z(yaw) for at, yaw in zip(positions, headings(positions), strict=True)]
+            [
+                translation(at) @ rotation_z(yaw)
+                for at, yaw in zip(positions, headings(positions), strict=True)
+            ]
         ).reshape(-1, 4, 4)
 
     @cached_property
@@ -112,7 +143,14 @@ class ParisCarlaTown(Recording):
         """The scans, numbered from 0."""
         times = self._middles[1].tolist()
         return [
-            ParisCarlaFrame(number, f"{self.path}: scan {value}", self._ply, ranges, self._poses[number], times[number])
+            ParisCarlaFrame(
+                number,
+                f"{self.path}: scan {value}",
+                self._ply,
+                ranges,
+                self._poses[number],
+                times[number],
+            )
             for number, (value, ranges) in enumerate(self._scans)
         ]
 
@@ -128,7 +166,8 @@ class ParisCarlaTown(Recording):
         """Return notes on the licence, and on the source of poses."""
         return [
             "Paris-CARLA-3D has the licence CC BY-NC-ND 3.0: converted data must not be shared",
-            "poses are the positions of the LiDAR at the middle of each scan, upright, with the direction of motion as heading,"
+            "poses are the positions of the LiDAR at the middle of each scan, upright, with the "
+            "direction of motion as heading,"
             " because the data have no rotations",
         ]
 
@@ -154,12 +193,16 @@ class ParisCarlaFrame(FrameHandle):
     seconds: float
 
     def read(self) -> Sequence[Cloud]:
-        """Read points, the origins of their rays, their times, tags, and the actors of classes that move."""
+        """Read points, the origins of their rays, their times, tags, and the actors of classes that
+        move.
+        """
         rows = np.concatenate([self.ply.rows(start, stop) for start, stop in self.ranges])
         scan_T_world = invert(self.world_T_scan)
 
         def in_scan(names: tuple[str, ...]) -> NDArray[np.float32]:
-            return transform_points(scan_T_world, np.stack([rows[name] for name in names], axis=1)).astype(np.float32)
+            return transform_points(
+                scan_T_world, np.stack([rows[name] for name in names], axis=1)
+            ).astype(np.float32)
 
         labels = rows["semantic"].astype(np.uint32)
         moves = np.isin(labels, sorted(CARLA.movable))
@@ -178,24 +221,29 @@ class ParisCarlaFrame(FrameHandle):
 def headings(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (F,) direction of motion, radians about z, at each of (F, 3) positions.
 
-    It is the direction from an earlier to a later position, the same number of frames before and after, at least a metre apart. A vehicle at
-    rest keeps its last heading.
+    It is the direction from an earlier to a later position, the same number of frames before and
+    after, at least a metre apart. A vehicle at rest keeps its last heading.
     """
     count = len(positions)
     found, frames = np.full(count, np.nan), np.arange(count)
     for away in range(1, _HEADING_FRAMES + 1):
-        way = positions[np.minimum(frames + away, count - 1), :2] - positions[np.maximum(frames - away, 0), :2]
+        way = (
+            positions[np.minimum(frames + away, count - 1), :2]
+            - positions[np.maximum(frames - away, 0), :2]
+        )
         chosen = np.isnan(found) & (np.hypot(*way.T) >= _HEADING_M)
         found[chosen] = np.arctan2(way[chosen, 1], way[chosen, 0])
     known = np.flatnonzero(~np.isnan(found))
     if not known.size:
         return np.zeros(count)
-    last = np.maximum(np.searchsorted(known, frames, side="right") - 1, 0)  # the first known one also holds before it
+    # the first known one also holds before it
+    last = np.maximum(np.searchsorted(known, frames, side="right") - 1, 0)
     return found[known[last]]
 
 
 def _find_runs(ply: PlyVertices) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the (R,) values of index_frame of the runs of consecutive rows of one scan, and the (R + 1,) rows where they begin and end.
+    """Return the (R,) values of index_frame of the runs of consecutive rows of one scan, and the (R
+    + 1,) rows where they begin and end.
 
     Raises:
         FormatError: the file has no rows, or the rows of a scan are scattered over it.

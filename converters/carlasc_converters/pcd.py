@@ -1,4 +1,7 @@
-"""Points of PCD files, version 0.7, by field: text, binary, and binary compressed. The format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html."""
+"""Points of PCD files, version 0.7, by field: text, binary, and binary compressed.
+
+The format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ class PcdHeader:
     """The header of a PCD file.
 
     Attributes:
-        row: structured type of a point; fields without a meaning (`_` in the file) have another name here.
+        row: structured type of a point; fields without a meaning (`_` in the file) have another
+            name here.
         points: number of points.
         encoding: "ascii", "binary" or "binary_compressed".
     """
@@ -36,7 +40,8 @@ class PcdHeader:
 
 
 def read_pcd(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Return the fields of the points of a PCD file, each (N,), or (N, count) for a field of several values.
+    """Return the fields of the points of a PCD file, each (N,), or (N, count) for a field of
+    several values.
 
     Raises:
         MissingDataError: the file does not exist.
@@ -48,7 +53,11 @@ def read_pcd(path: str | Path) -> dict[str, NDArray[Any]]:
     where, row, count = str(path), header.row, header.points
     if header.encoding == "ascii":
         try:
-            rows = np.loadtxt(io.BytesIO(body), row, comments=None, ndmin=1) if body.strip() else np.empty(0, row)
+            rows = (
+                np.loadtxt(io.BytesIO(body), row, comments=None, ndmin=1)
+                if body.strip()
+                else np.empty(0, row)
+            )
         except ValueError as error:
             raise FormatError(
                 where, expected=f"{count} rows of numbers", found=f"others ({error})", advice=COPY
@@ -57,7 +66,9 @@ def read_pcd(path: str | Path) -> dict[str, NDArray[Any]]:
         if header.encoding == "binary_compressed":
             body = _unpacked(body, row, count, where)
         if len(body) < count * row.itemsize:
-            raise FormatError(where, expected=f"{count} points", found=str(len(body) // row.itemsize), advice=COPY)
+            raise FormatError(
+                where, expected=f"{count} points", found=str(len(body) // row.itemsize), advice=COPY
+            )
         rows = np.frombuffer(body, row, count)
     if len(rows) != count:
         raise FormatError(where, expected=f"{count} points", found=str(len(rows)), advice=COPY)
@@ -70,7 +81,11 @@ def _read_header(file: BinaryIO, where: str) -> PcdHeader:
         line = file.readline(_MAX_LINE)
         words = line.decode("latin-1").split()
         if not line or (words and not words[0].startswith("#") and not words[0].isupper()):
-            raise FormatError(where, expected="the header of a PCD file, which ends with DATA", found=repr(line[:20]))
+            raise FormatError(
+                where,
+                expected="the header of a PCD file, which ends with DATA",
+                found=repr(line[:20]),
+            )
         if words and not words[0].startswith("#"):
             entries[words[0]] = words[1:]
     try:
@@ -82,8 +97,14 @@ def _read_header(file: BinaryIO, where: str) -> PcdHeader:
             else math.prod(int(entries[k][0]) for k in ("WIDTH", "HEIGHT"))
         )
         fields = [
-            (f"_{place}" if name == "_" else name, f"<{_KINDS[kind]}{size}", *(() if count == 1 else ((count,),)))
-            for place, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True))
+            (
+                f"_{place}" if name == "_" else name,
+                f"<{_KINDS[kind]}{size}",
+                *(() if count == 1 else ((count,),)),
+            )
+            for place, (name, size, kind, count) in enumerate(
+                zip(names, sizes, kinds, counts, strict=True)
+            )
         ]
         (encoding,) = entries["DATA"]
         if encoding not in ("ascii", "binary", "binary_compressed") or points < 0:
@@ -91,19 +112,27 @@ def _read_header(file: BinaryIO, where: str) -> PcdHeader:
         return PcdHeader(np.dtype(fields), points, encoding)
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise FormatError(
-            where, expected="FIELDS, SIZE, TYPE, COUNT, POINTS and DATA of a PCD file", found=f"others ({error})"
+            where,
+            expected="FIELDS, SIZE, TYPE, COUNT, POINTS and DATA of a PCD file",
+            found=f"others ({error})",
         ) from error
 
 
 def _unpacked(body: bytes, row: np.dtype[np.void], count: int, where: str) -> bytes:
-    """Return the rows of a compressed body: two sizes, then all values of the first field, of the second, and so on."""
+    """Return the rows of a compressed body: two sizes, then all values of the first field, of the
+    second, and so on.
+    """
     packed, size = (int(n) for n in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
     if size != count * row.itemsize or len(body) < 8 + packed:
         expected = f"{packed} bytes of {count} compressed points"
-        raise FormatError(where, expected=expected, found=f"{len(body) - 8} bytes of {size}", advice=COPY)
+        raise FormatError(
+            where, expected=expected, found=f"{len(body) - 8} bytes of {size}", advice=COPY
+        )
     columns = np.empty(size, np.uint8)
     if _lzf(np.frombuffer(body, np.uint8, packed, 8), columns) != size:
-        raise FormatError(where, expected=f"{size} bytes in LZF compression", found="damaged ones", advice=COPY)
+        raise FormatError(
+            where, expected=f"{size} bytes in LZF compression", found="damaged ones", advice=COPY
+        )
     rows, start = np.empty(count, row), 0
     for name in row.names or ():
         width = row[name].itemsize * count
@@ -141,7 +170,8 @@ def _lzf(packed: NDArray[np.uint8], out: NDArray[np.uint8]) -> int:
             at += 1
             if start < 0 or filled + length > len(out):
                 return -1
-            for k in range(length):  # the two may overlap: bytes that were just written are repeated
+            # the two may overlap: bytes that were just written are repeated
+            for k in range(length):
                 out[filled + k] = out[start + k]
         filled += length
     return filled

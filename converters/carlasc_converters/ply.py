@@ -1,6 +1,9 @@
-"""Vertices of PLY files, in rows: ASCII, and binary of either byte order. Only requested rows are read into memory.
+"""Vertices of PLY files, in rows: ASCII, and binary of either byte order.
 
-The format: https://paulbourke.net/dataformats/ply/. A text header lists elements and their properties; the rows of the elements follow.
+Only requested rows are read into memory.
+
+The format: https://paulbourke.net/dataformats/ply/. A text header lists elements and their
+properties; the rows of the elements follow.
 """
 
 from __future__ import annotations
@@ -35,10 +38,12 @@ class PlyVertices:
 
     Attributes:
         path: the file.
-        dtype: a structured type with a field per property, in the order and the byte order of the file.
+        dtype: a structured type with a field per property, in the order and the byte order of the
+            file.
         count: number of vertices.
         offset: where the body of the file begins, or, for a binary file, the first vertex.
-        lines: for a text file, the number of lines of its body before the first vertex; None for a binary file.
+        lines: for a text file, the number of lines of its body before the first vertex; None for a
+            binary file.
     """
 
     path: str
@@ -57,7 +62,8 @@ class PlyVertices:
 
         Raises:
             MissingDataError: the file does not exist.
-            FormatError: it is not a PLY file, its vertices have a list property or lack a required one, or it is shorter than its header says.
+            FormatError: it is not a PLY file, its vertices have a list property or lack a required
+                one, or it is shorter than its header says.
         """
         with opening(path, "a PLY file"), Path(path).open("rb") as file:
             kind, elements = _read_header(file, str(path))
@@ -72,25 +78,36 @@ class PlyVertices:
                 advice="check the data set: the file belongs to another one, or to another version",
             )
         if kind == "ascii":
-            return cls(str(path), dtype, elements["vertex"][0], offset, sum(elements[name][0] for name in before))
+            return cls(
+                str(path),
+                dtype,
+                elements["vertex"][0],
+                offset,
+                sum(elements[name][0] for name in before),
+            )
         start = offset + sum(
-            elements[name][0] * _row_type(elements[name][1], "<", str(path)).itemsize for name in before
+            elements[name][0] * _row_type(elements[name][1], "<", str(path)).itemsize
+            for name in before
         )
         vertices = cls(str(path), dtype, elements["vertex"][0], start)
         size = Path(path).stat().st_size
         if size < start + vertices.count * dtype.itemsize:
             found = max(0, size - start) // dtype.itemsize
-            raise FormatError(path, expected=f"{vertices.count} vertices", found=str(found), advice=_CUT)
+            raise FormatError(
+                path, expected=f"{vertices.count} vertices", found=str(found), advice=_CUT
+            )
         return vertices
 
     def __len__(self) -> int:
         return self.count
 
     def read(self) -> NDArray[np.void]:
-        """Return all vertices: an array of `dtype`, mapped from a binary file, read from a text file.
+        """Return all vertices: an array of `dtype`, mapped from a binary file, read from a text
+        file.
 
         Raises:
-            FormatError: a text file has fewer vertices than in its header, or values that are not numbers.
+            FormatError: a text file has fewer vertices than in its header, or values that are not
+                numbers.
         """
         if self.lines is None:
             return self.rows(0, self.count)
@@ -102,17 +119,27 @@ class PlyVertices:
         They need memory only when they are read, and only as long as the result exists.
 
         Raises:
-            FormatError: the file is a text file, whose rows cannot be found without reading all rows before them.
+            FormatError: the file is a text file, whose rows cannot be found without reading all
+                rows before them.
         """
         if self.lines is not None:
-            raise FormatError(self.path, expected="a binary PLY file", found="a text file", advice="save it as binary")
+            raise FormatError(
+                self.path,
+                expected="a binary PLY file",
+                found="a text file",
+                advice="save it as binary",
+            )
         start, stop, _ = slice(start, stop).indices(self.count)
         if stop <= start:
             return np.empty(0, self.dtype)
-        return np.memmap(self.path, self.dtype, "r", self.offset + start * self.dtype.itemsize, (stop - start,))
+        return np.memmap(
+            self.path, self.dtype, "r", self.offset + start * self.dtype.itemsize, (stop - start,)
+        )
 
     def chunks(self, size: int = _CHUNK) -> Iterator[NDArray[np.void]]:
-        """Yield all vertices in their order, at most `size` at a time. Only one chunk is in memory if the caller keeps none.
+        """Yield all vertices in their order, at most `size` at a time.
+
+        Only one chunk is in memory if the caller keeps none.
 
         Raises:
             FormatError: the file does not match its header.
@@ -132,29 +159,47 @@ class PlyVertices:
     def _parse(self, text: io.TextIOWrapper, start: int, count: int) -> NDArray[np.void]:
         """Return the vertices of the next `count` lines.
 
-        `numpy.loadtxt` with a structured type is the fastest parser without another package: 1.2 million rows of six values per
-        second, compared with 0.7 to 0.8 million for `split` and `fromstring`.
+        `numpy.loadtxt` with a structured type is the fastest parser without another package: 1.2
+        million rows of six values per second, compared with 0.7 to 0.8 million for `split` and
+        `fromstring`.
         """
         try:
             lines = list(islice(text, count))
-            rows = np.loadtxt(lines, self.dtype, comments=None, ndmin=1) if lines else np.empty(0, self.dtype)
+            rows = (
+                np.loadtxt(lines, self.dtype, comments=None, ndmin=1)
+                if lines
+                else np.empty(0, self.dtype)
+            )
         except ValueError as error:  # UnicodeDecodeError is one too
             expected = f"{len(self.dtype.names or ())} numbers in each of {self.count} rows"
             raise FormatError(
-                self.path, expected=expected, found=f"other values after row {start} ({error})", advice=_CUT
+                self.path,
+                expected=expected,
+                found=f"other values after row {start} ({error})",
+                advice=_CUT,
             ) from error
         if len(rows) < count:
-            raise FormatError(self.path, expected=f"{self.count} vertices", found=str(start + len(rows)), advice=_CUT)
+            raise FormatError(
+                self.path,
+                expected=f"{self.count} vertices",
+                found=str(start + len(rows)),
+                advice=_CUT,
+            )
         return rows
 
 
-_Properties = list[tuple[str, str]]  # (name, type), in the order of the file; a list's type is "list"
+# (name, type), in the order of the file; a list's type is "list"
+_Properties = list[tuple[str, str]]
 
 
 def _read_header(file: BinaryIO, path: str) -> tuple[str, dict[str, tuple[int, _Properties]]]:
-    """Return the kind of the file, and the count and the properties of its elements by name, in their order."""
+    """Return the kind of the file, and the count and the properties of its elements by name, in
+    their order.
+    """
     if file.readline(_MAX_LINE).rstrip() != b"ply":
-        raise FormatError(path, expected='a PLY file, which begins with the line "ply"', found="something else")
+        raise FormatError(
+            path, expected='a PLY file, which begins with the line "ply"', found="something else"
+        )
     kind, elements = "", dict[str, tuple[int, _Properties]]()
     for line in iter(lambda: file.readline(_MAX_LINE), b""):
         words = line.decode("latin-1").split()
@@ -178,9 +223,13 @@ def _read_header(file: BinaryIO, path: str) -> tuple[str, dict[str, tuple[int, _
             found = repr(" ".join(words)[:60])
             raise FormatError(path, expected="a line of a PLY header", found=found) from None
     else:
-        raise FormatError(path, expected="a PLY header that ends with end_header", found="none", advice=_CUT)
+        raise FormatError(
+            path, expected="a PLY header that ends with end_header", found="none", advice=_CUT
+        )
     if not kind:
-        raise FormatError(path, expected=f"a line with the format: {', '.join(_BYTE_ORDERS)}", found="none")
+        raise FormatError(
+            path, expected=f"a line with the format: {', '.join(_BYTE_ORDERS)}", found="none"
+        )
     if "vertex" not in elements:
         raise FormatError(path, expected="vertices", found=", ".join(elements) or "no elements")
     return kind, elements
@@ -192,7 +241,9 @@ def _before_vertices(elements: dict[str, tuple[int, _Properties]], path: str) ->
     before = names[: names.index("vertex")]
     for name in before:
         if any(kind == "list" for _, kind in elements[name][1]):
-            raise FormatError(path, expected="vertices before elements with lists", found=f"{name} before them")
+            raise FormatError(
+                path, expected="vertices before elements with lists", found=f"{name} before them"
+            )
     return before
 
 
@@ -202,8 +253,12 @@ def _row_type(properties: _Properties, byte_order: str, path: str) -> np.dtype[A
         if kind == "list":
             raise FormatError(path, expected="one number per property", found=f"the list {name}")
         if kind not in _TYPES:
-            raise FormatError(path, expected=f"types {', '.join(_TYPES)}", found=f"{kind} for the property {name}")
+            raise FormatError(
+                path, expected=f"types {', '.join(_TYPES)}", found=f"{kind} for the property {name}"
+            )
     names = [name for name, _ in properties]
     if not names or len(set(names)) < len(names):
-        raise FormatError(path, expected="properties with names of their own", found=", ".join(names) or "none")
+        raise FormatError(
+            path, expected="properties with names of their own", found=", ".join(names) or "none"
+        )
     return np.dtype([(name, byte_order + _TYPES[kind]) for name, kind in properties])

@@ -1,4 +1,6 @@
-"""Packed points, as in ROS' PointCloud2 and in Foxglove's PointCloud: any layout, to a column per field."""
+"""Packed points, as in ROS' PointCloud2 and in Foxglove's PointCloud: any layout, to a column per
+field.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +12,14 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
 
-# Types of sensor_msgs/PointField: https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointField.html
+# Types of sensor_msgs/PointField:
+# https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointField.html
 ROS_TYPES = dict(enumerate("i1 u1 i2 u2 i4 u4 f4 f8".split(), 1))
 
 
 def read_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
-    """Return the fields of a sensor_msgs/PointCloud2 by name; the points of all rows, one row after the other.
+    """Return the fields of a sensor_msgs/PointCloud2 by name; the points of all rows, one row after
+    the other.
 
     Raises:
         FormatError: the data do not have the layout in the message.
@@ -44,8 +48,8 @@ def unpack_fields(
 
     Args:
         data: the points, one after the other.
-        fields: name, first byte, type and number of values per point of each field. Fields of several values, without a name or of an
-            unknown type are left out.
+        fields: name, first byte, type and number of values per point of each field. Fields of
+            several values, without a name or of an unknown type are left out.
         step: bytes of a point.
         where: the message, for errors.
 
@@ -59,7 +63,10 @@ def unpack_fields(
     }
     for name, (offset, kind) in usable.items():
         if offset + kind.itemsize > step:
-            expected, found = f"points of {step} bytes", f"the field {name} up to byte {offset + kind.itemsize}"
+            expected, found = (
+                f"points of {step} bytes",
+                f"the field {name} up to byte {offset + kind.itemsize}",
+            )
             raise FormatError(where, expected=expected, found=found)
     if not step or len(data) % step:
         raise FormatError(where, expected=f"points of {step} bytes", found=f"{len(data)} bytes")

@@ -1,4 +1,6 @@
-"""The fields of points as files and messages of any origin name them, and the times of points in any unit."""
+"""The fields of points as files and messages of any origin name them, and the times of points in
+any unit.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,25 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "x": ("x", "x_m"),
     "y": ("y", "y_m"),
     "z": ("z", "z_m"),
-    "intensity": ("intensity", "intensities", "i", "reflectivity", "reflectance", "remission", "scalar_intensity"),
-    "time": ("t", "time", "timestamp", "time_stamp", "times", "offset_time", "gps_time", "scalar_time"),
+    "intensity": (
+        "intensity",
+        "intensities",
+        "i",
+        "reflectivity",
+        "reflectance",
+        "remission",
+        "scalar_intensity",
+    ),
+    "time": (
+        "t",
+        "time",
+        "timestamp",
+        "time_stamp",
+        "times",
+        "offset_time",
+        "gps_time",
+        "scalar_time",
+    ),
     "ring": ("ring", "channel", "line", "laser_id", "row"),
     "label": ("label", "labels", "class", "semantic", "classification", "scalar_label"),
     "instance": ("instance", "instances", "instance_id", "object_id", "track_id"),
@@ -36,17 +55,23 @@ def named_fields(columns: Mapping[str, NDArray[Any]], where: str) -> dict[str, N
         where: the file or the message, for errors.
 
     Returns:
-        `points` (N, 4) float32, x, y, z and the intensity (0 without one); if they exist, `time` and `ring` (N,), unchanged, and `label`
-        and `instance` (N,) uint32.
+        `points` (N, 4) float32, x, y, z and the intensity (0 without one); if they exist, `time`
+        and `ring` (N,), unchanged, and `label` and `instance` (N,) uint32.
 
     Raises:
-        FormatError: x, y or z does not exist, or a class or an instance is not a whole number from 0 to 2^32 - 1.
+        FormatError: x, y or z does not exist, or a class or an instance is not a whole number from
+            0 to 2^32 - 1.
     """
     lower = {name.lower(): values for name, values in columns.items()}
-    found = {field: next((lower[name] for name in names if name in lower), None) for field, names in _NAMES.items()}
+    found = {
+        field: next((lower[name] for name in names if name in lower), None)
+        for field, names in _NAMES.items()
+    }
     if missing := [field for field in ("x", "y", "z") if found[field] is None]:
         raise FormatError(
-            where, expected=f"points with {', '.join(missing)}", found=f"only {', '.join(columns) or 'no fields'}"
+            where,
+            expected=f"points with {', '.join(missing)}",
+            found=f"only {', '.join(columns) or 'no fields'}",
         )
     count = len(found["x"])  # type: ignore[arg-type]
     points = np.zeros((count, 4), np.float32)
@@ -77,7 +102,9 @@ def whole_numbers(values: NDArray[Any], where: str) -> NDArray[np.uint32]:
     return whole
 
 
-def point_seconds(times: NDArray[Any], unit: TimeUnit, where: str) -> tuple[NDArray[np.float64], int | None, str]:
+def point_seconds(
+    times: NDArray[Any], unit: TimeUnit, where: str
+) -> tuple[NDArray[np.float64], int | None, str]:
     """Return the times of the points of a scan in seconds.
 
     Args:
@@ -86,8 +113,8 @@ def point_seconds(times: NDArray[Any], unit: TimeUnit, where: str) -> tuple[NDAr
         where: the file or the message, for errors.
 
     Returns:
-        (N,) float64 seconds; the nanoseconds of the clock after which these are, None if they are after the time of the scan;
-        the unit.
+        (N,) float64 seconds; the nanoseconds of the clock after which these are, None if they are
+        after the time of the scan; the unit.
 
     Raises:
         FormatError: a time is not finite, or the scan has no usual duration in any unit.
@@ -95,18 +122,29 @@ def point_seconds(times: NDArray[Any], unit: TimeUnit, where: str) -> tuple[NDAr
     if not len(times):
         return np.empty(0), None, "s" if unit == "auto" else unit
     if times.dtype.kind == "f" and not np.isfinite(times).all():
-        raise FormatError(f"{where}: times of points", expected="finite numbers", found="NaN or infinity")
+        raise FormatError(
+            f"{where}: times of points", expected="finite numbers", found="NaN or infinity"
+        )
     first, last = times.min(), times.max()
     span = int(last) - int(first) if times.dtype.kind in "iu" else float(last) - float(first)
     if span == 0 and first == 0:
-        return np.zeros(len(times)), None, "s" if unit == "auto" else unit  # a column that was not filled in
+        # a column that was not filled in
+        return (
+            np.zeros(len(times)),
+            None,
+            "s" if unit == "auto" else unit,
+        )
     if unit == "auto":
         low, high = _SCAN_S
-        usual = next((name for name, scale in _NANOSECONDS.items() if low <= span * scale / 1e9 <= high), None)
+        usual = next(
+            (name for name, scale in _NANOSECONDS.items() if low <= span * scale / 1e9 <= high),
+            None,
+        )
         if usual is None:
             raise FormatError(
                 f"{where}: times of points",
-                expected="a scan of 4 ms to 0.6 s in seconds, milliseconds, microseconds or nanoseconds",
+                expected="a scan of 4 ms to 0.6 s in seconds, milliseconds, microseconds or "
+                "nanoseconds",
                 found=f"times from {first} to {last}",
                 advice="give their unit with `time_unit`",
             )

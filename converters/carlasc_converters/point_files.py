@@ -1,4 +1,6 @@
-"""Files of points, one scan each, as columns by name: .bin, .npy, .npz, .csv, .txt, .ply, .pcd, .las and .laz."""
+"""Files of points, one scan each, as columns by name: .bin, .npy, .npz, .csv, .txt, .ply, .pcd,
+.las and .laz.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,13 @@ _ARRAY = ArrayFormat(NUMBERS, None, records=True)
 
 
 def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:
-    """Return the values of the points of a file, (N,) each, by their names in the file or in `columns`.
+    """Return the values of the points of a file, (N,) each, by their names in the file or in
+    `columns`.
 
     Args:
         path: the file; its suffix says its format.
-        columns: names of the columns of a file that names none: of .bin and .npy. None: x, y, z and intensity, as far as a file
-            without names has so many.
+        columns: names of the columns of a file that names none: of .bin and .npy. None: x, y, z and
+            intensity, as far as a file without names has so many.
 
     Raises:
         MissingDataError: the file does not exist.
@@ -37,7 +40,9 @@ def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str
     """
     found = _READERS[path.suffix.lower()](path, columns)
     if not next(iter(found.values()), np.empty(0)).size:
-        raise FormatError(path, expected="points", found="none", advice="remove the file, or record it again")
+        raise FormatError(
+            path, expected="points", found="none", advice="remove the file, or record it again"
+        )
     return found
 
 
@@ -53,12 +58,14 @@ def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[
             "columns",
             expected="the names of the columns, such as x,y,z,intensity",
             found="none",
-            advice=f"the {len(data)} bytes of {path} are points of {' or '.join(map(str, fits)) or 'no number of'} float32 columns",
+            advice=f"the {len(data)} bytes of {path} are points of "
+            f"{' or '.join(map(str, fits)) or 'no number of'} float32 columns",
         )
     if count % len(columns):
         raise FormatError(
             path,
-            expected=f"a multiple of {_FLOAT * len(columns)} bytes ({len(columns)} float32 per point)",
+            expected=f"a multiple of {_FLOAT * len(columns)} bytes ({len(columns)} float32 per "
+            f"point)",
             found=str(len(data)),
             advice=f"check `columns` ({','.join(columns)})",
         )
@@ -71,23 +78,37 @@ def _read_npy(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[
 
 def _read_npz(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
     with open_npz(path) as archive:
-        arrays = {name: archive.read(name, _ARRAY) for name in archive.names if _ARRAY.holds(archive.dtype(name))}
+        arrays = {
+            name: archive.read(name, _ARRAY)
+            for name in archive.names
+            if _ARRAY.holds(archive.dtype(name))
+        }
     tables = {name: array for name, array in arrays.items() if array.ndim == 2 or array.dtype.names}
     if len(tables) != 1:
         if "x" in arrays:
             return arrays
-        raise FormatError(path, expected="one table of points, or x, y and z", found=", ".join(arrays) or "nothing")
+        raise FormatError(
+            path,
+            expected="one table of points, or x, y and z",
+            found=", ".join(arrays) or "nothing",
+        )
     ((name, table),) = tables.items()
     rest = {key: array for key, array in arrays.items() if key != name and len(array) == len(table)}
     return _named(table, path, columns) | rest
 
 
-def _named(array: NDArray[Any], path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:
+def _named(
+    array: NDArray[Any], path: Path, columns: tuple[str, ...] | None
+) -> dict[str, NDArray[Any]]:
     """Return the columns of a structured array, or of a table (N, C)."""
     if array.dtype.names:
         return {name: array[name].reshape(-1) for name in array.dtype.names}
     if array.ndim != 2 or array.dtype.kind not in "fiu":
-        raise FormatError(path, expected="a table (N, 3) of numbers, or wider", found=f"{array.shape} {array.dtype}")
+        raise FormatError(
+            path,
+            expected="a table (N, 3) of numbers, or wider",
+            found=f"{array.shape} {array.dtype}",
+        )
     names = columns or _FIRST[: array.shape[1]]
     if array.shape[1] != len(names):
         raise FormatError(
@@ -135,7 +156,11 @@ def _read_las(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[
     laspy = import_extra("laspy", "scans")
     with opening(path, "a LAS file"):
         cloud = laspy.read(path)
-        names = [name for name in cloud.point_format.dimension_names if name.lower() not in ("x", "y", "z")]
+        names = [
+            name
+            for name in cloud.point_format.dimension_names
+            if name.lower() not in ("x", "y", "z")
+        ]
         scaled = {axis: np.asarray(getattr(cloud, axis)) for axis in ("x", "y", "z")}
         return scaled | {name: np.asarray(cloud[name]) for name in names}
 

@@ -1,4 +1,6 @@
-"""Files of poses and of times: TUM, KITTI, EuRoC, CSV with a header, NumPy; times in any unit, as whole nanoseconds."""
+"""Files of poses and of times: TUM, KITTI, EuRoC, CSV with a header, NumPy; times in any unit, as
+whole nanoseconds.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,16 @@ _Row = TypeVar("_Row")
 _Value = TypeVar("_Value")
 
 _TUM, _KITTI = 8, 12  # numbers in a line
-_PLACES = (("x", "y", "z"), ("tx", "ty", "tz"), ("px", "py", "pz"), ("p_rs_r_x", "p_rs_r_y", "p_rs_r_z"))
+_PLACES = (
+    ("x", "y", "z"),
+    ("tx", "ty", "tz"),
+    ("px", "py", "pz"),
+    ("p_rs_r_x", "p_rs_r_y", "p_rs_r_z"),
+)
 _TURNS = (("qw", "qx", "qy", "qz"), ("q_rs_w", "q_rs_x", "q_rs_y", "q_rs_z"))
 _TIMES = ("timestamp", "time", "t", "stamp", "seconds", "sec", "nsec", "timestamp_ns", "time_ns")
-# A number above one of these is in milliseconds, microseconds or nanoseconds; in seconds, it would be a recording of years.
+# A number above one of these is in milliseconds, microseconds or nanoseconds; in seconds, it would
+# be a recording of years.
 _UNITS = ((Decimal(10) ** 17, 1), (Decimal(10) ** 14, 10**3), (Decimal(10) ** 11, 10**6))
 
 
@@ -45,11 +53,14 @@ class PoseRows:
 
 
 def read_poses(path: Path) -> PoseRows:
-    """Read a file of poses. The format is found by its suffix (.npy), its header, or the number of values in its lines.
+    """Read a file of poses.
+
+    The format is found by its suffix (.npy), its header, or the number of values in its lines.
 
     Raises:
         MissingDataError: the file does not exist.
-        FormatError: the format is unknown, a pose is not rigid, a quaternion does not have length 1, or times do not increase.
+        FormatError: the format is unknown, a pose is not rigid, a quaternion does not have length
+            1, or times do not increase.
     """
     if path.suffix.lower() == ".npy":
         poses = read_npy(path, ArrayFormat(NUMBERS, None)).astype(np.float64)
@@ -63,34 +74,45 @@ def read_poses(path: Path) -> PoseRows:
     if any(map(str.isidentifier, header)):
         return _read_named(header, rows[1:], path)
     if comments and "q_RS_w" in comments[0]:
-        header = [word.lstrip("#").partition("[")[0].strip().lower() for word in comments[0].split(",")]
+        header = [
+            word.lstrip("#").partition("[")[0].strip().lower() for word in comments[0].split(",")
+        ]
         return _read_named(header, rows, path, of="vehicle")
     if rows and len(rows[0]) == _TUM:
         table, stamps = _numbers(rows, _TUM, path), _stamps([row[0] for row in rows], path)
-        return PoseRows(poses_of(table[:, [7, 4, 5, 6]], table[:, 1:4], str(path)), stamps, "sensor")
+        return PoseRows(
+            poses_of(table[:, [7, 4, 5, 6]], table[:, 1:4], str(path)), stamps, "sensor"
+        )
     if rows and len(rows[0]) == _KITTI:
         table = _numbers(rows, _KITTI, path)
         return PoseRows(_whole(table.reshape(-1, 3, 4), path), None, "sensor")
     raise FormatError(
         path,
-        expected="poses: lines of 8 numbers (TUM: t x y z qx qy qz qw) or of 12 (KITTI), a header with x, y, z, qw, qx, qy, qz, or .npy",
+        expected="poses: lines of 8 numbers (TUM: t x y z qx qy qz qw) or of 12 (KITTI), a header "
+        "with x, y, z, qw, qx, qy, qz, or .npy",
         found=f"lines of {len(rows[0])} values" if rows else "no lines",
     )
 
 
 def read_stamps(path: Path) -> NDArray[np.int64]:
-    """Return the (F,) nanoseconds of a file of times: one number per line, or the first of several; seconds, or a unit by its magnitude.
+    """Return the (F,) nanoseconds of a file of times: one number per line, or the first of several;
+    seconds, or a unit by its magnitude.
 
     Raises:
         MissingDataError: the file does not exist.
         FormatError: a line is not a number.
     """
     lines = [line.strip() for line in read_text(path, "a time per line").splitlines()]
-    return _stamps([_split(line)[0] for line in lines if line and not line.startswith("#")], path, increasing=False)
+    return _stamps(
+        [_split(line)[0] for line in lines if line and not line.startswith("#")],
+        path,
+        increasing=False,
+    )
 
 
 def nanoseconds(word: str) -> int:
-    """Return the nanoseconds of a number: seconds, or, if it is too large for these, milliseconds, microseconds or nanoseconds.
+    """Return the nanoseconds of a number: seconds, or, if it is too large for these, milliseconds,
+    microseconds or nanoseconds.
 
     Raises:
         ValueError: it is not a finite number.
@@ -103,12 +125,16 @@ def nanoseconds(word: str) -> int:
         raise ValueError(word) from None
 
 
-def _read_named(header: Sequence[str], rows: Sequence[list[str]], path: Path, of: PoseOf = "sensor") -> PoseRows:
+def _read_named(
+    header: Sequence[str], rows: Sequence[list[str]], path: Path, of: PoseOf = "sensor"
+) -> PoseRows:
     def columns(choices: Sequence[tuple[str, ...]], what: str) -> list[int]:
         for names in choices:
             if all(name in header for name in names):
                 return [header.index(name) for name in names]
-        raise FormatError(path, expected=f"the columns {', '.join(choices[0])} of {what}", found=", ".join(header))
+        raise FormatError(
+            path, expected=f"the columns {', '.join(choices[0])} of {what}", found=", ".join(header)
+        )
 
     places, turns = columns(_PLACES, "the position"), columns(_TURNS, "the rotation")
     times = next((header.index(name) for name in _TIMES if name in header), None)
@@ -122,7 +148,9 @@ def _split(line: str) -> list[str]:
 
 
 def _numbers(rows: Sequence[list[str]], columns: int, path: Path) -> NDArray[np.float64]:
-    return np.array(_each(rows, lambda row: _floats(row, columns), f"{columns} numbers", path)).reshape(-1, columns)
+    return np.array(
+        _each(rows, lambda row: _floats(row, columns), f"{columns} numbers", path)
+    ).reshape(-1, columns)
 
 
 def _floats(row: list[str], columns: int) -> list[float]:
@@ -136,18 +164,24 @@ def _stamps(words: Sequence[str], path: Path, *, increasing: bool = True) -> NDA
     if increasing and (np.diff(stamps) <= 0).any():
         line = int(np.argmax(np.diff(stamps) <= 0)) + 2
         raise FormatError(
-            path, expected="times that increase", found=f"{words[line - 1]} in row {line}, after {words[line - 2]}"
+            path,
+            expected="times that increase",
+            found=f"{words[line - 1]} in row {line}, after {words[line - 2]}",
         )
     return stamps
 
 
-def _each(rows: Sequence[_Row], parse: Callable[[_Row], _Value], expected: str, path: Path) -> list[_Value]:
+def _each(
+    rows: Sequence[_Row], parse: Callable[[_Row], _Value], expected: str, path: Path
+) -> list[_Value]:
     values = []
     for number, row in enumerate(rows, 1):
         try:
             values.append(parse(row))
         except ValueError as error:
-            raise FormatError(f"{path}: row {number}", expected=expected, found=str(error)) from None
+            raise FormatError(
+                f"{path}: row {number}", expected=expected, found=str(error)
+            ) from None
     return values
 
 

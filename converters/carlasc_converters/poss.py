@@ -33,7 +33,9 @@ class SemanticPoss(Converter):
             MissingDataError: no sequence exists.
         """
         return [
-            PossRecording(folder, f"POSS_{folder.name}", "Val" if folder.name == _VALIDATION else "Train")
+            PossRecording(
+                folder, f"POSS_{folder.name}", "Val" if folder.name == _VALIDATION else "Train"
+            )
             for folder in find_sequences(self.source)
         ]
 
@@ -48,4 +50,8 @@ class PossRecording(KittiRecording):
         self.voxels = None
 
     def _calibration(self, poses: Path, *, force: bool) -> Transform:
-        return super()._calibration(poses, force=force) if (self.folder / "calib.txt").is_file() else np.eye(4)
+        return (
+            super()._calibration(poses, force=force)
+            if (self.folder / "calib.txt").is_file()
+            else np.eye(4)
+        )

@@ -11,7 +11,9 @@ from carlasc.errors import FormatError
 _UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1
 
 
-def poses_of(quaternions: NDArray[np.floating], translations: NDArray[np.floating], where: str) -> NDArray[np.float64]:
+def poses_of(
+    quaternions: NDArray[np.floating], translations: NDArray[np.floating], where: str
+) -> NDArray[np.float64]:
     """Return the (N, 4, 4) float64 transforms with given rotations and translations.
 
     Args:
@@ -27,5 +29,7 @@ def poses_of(quaternions: NDArray[np.floating], translations: NDArray[np.floatin
     if not valid.all():
         row = int(np.argmin(valid))
         found = f"{np.asarray(quaternions[row], np.float64).tolist()} in row {row}"
-        raise FormatError(where, expected="a rotation: a quaternion w, x, y, z of length 1", found=found)
+        raise FormatError(
+            where, expected="a rotation: a quaternion w, x, y, z of length 1", found=found
+        )
     return check_rigid(poses_from(quaternions, translations), where, 4 * _UNIT_TOLERANCE)

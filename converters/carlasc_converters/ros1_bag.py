@@ -1,4 +1,6 @@
-"""Files of ROS 1, `.bag` version 2.0: records of chunks, as https://wiki.ros.org/Bags/Format/2.0 describes them."""
+"""Files of ROS 1, `.bag` version 2.0: records of chunks, as https://wiki.ros.org/Bags/Format/2.0
+describes them.
+"""
 
 from __future__ import annotations
 
@@ -43,12 +45,16 @@ def index_file(path: Path) -> FileIndex:
                     chunk, entries = at, []
                 elif kind == _INDEX:
                     file.seek(begin)
-                    entries.append((_number(fields, b"conn"), np.frombuffer(file.read(end - begin), _ENTRY)))
+                    entries.append(
+                        (_number(fields, b"conn"), np.frombuffer(file.read(end - begin), _ENTRY))
+                    )
                 elif kind == _CONNECTION:
                     file.seek(begin)
                     _learn(index, fields, file.read(end - begin))
             except (EOFError, KeyError, ValueError, struct.error):
-                index.lost = f"it is cut short or damaged at byte {at} of {size}, and what follows is lost"
+                index.lost = (
+                    f"it is cut short or damaged at byte {at} of {size}, and what follows is lost"
+                )
                 entries = []  # the index of the last chunk may not be whole
                 break
             at = end
@@ -70,9 +76,13 @@ def read_message(path: str, chunk: int, offset: int) -> bytes:
     """
     data = _read_chunk(path, chunk, version_of(path))
     try:
-        kind, _, begin, end = next(record for record in _records(data, offset) if record[0] != _CONNECTION)
+        kind, _, begin, end = next(
+            record for record in _records(data, offset) if record[0] != _CONNECTION
+        )
     except (KeyError, StopIteration, struct.error) as error:
-        raise FormatError(path, expected=_EXPECTED.format(chunk), found=f"damage ({error!r})") from error
+        raise FormatError(
+            path, expected=_EXPECTED.format(chunk), found=f"damage ({error!r})"
+        ) from error
     if kind != _MESSAGE or end > len(data):
         raise FormatError(path, expected=_EXPECTED.format(chunk), found=f"a record of kind {kind}")
     return data[begin:end]

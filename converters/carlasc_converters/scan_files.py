@@ -1,4 +1,6 @@
-"""A scan of a folder: one file, or one for each LiDAR, and the classes of its points from a file of their own."""
+"""A scan of a folder: one file, or one for each LiDAR, and the classes of its points from a file of
+their own.
+"""
 
 from __future__ import annotations
 
@@ -64,14 +66,19 @@ class ScanFile(FrameHandle):
         return self.paths[0]
 
     def read(self) -> Sequence[Cloud]:
-        """Read the points. Points that are not finite are left out, because they are rays without a return."""
+        """Read the points.
+
+        Points that are not finite are left out, because they are rays without a return.
+        """
         return [self._read(index, path) for index, path in enumerate(self.paths)]
 
     def _read(self, index: int, path: str) -> Cloud:
         found = named_fields(read_columns(Path(path), self.options.columns), path)
         if set(found) != set(self.fields):
             raise FormatError(
-                path, expected=f"the fields of the first scan ({', '.join(self.fields)})", found=", ".join(found)
+                path,
+                expected=f"the fields of the first scan ({', '.join(self.fields)})",
+                found=", ".join(found),
             )
         points, seconds = found["points"], None
         if self.unit:
@@ -84,7 +91,9 @@ class ScanFile(FrameHandle):
         instances = found.get("instance") if self.options.has_classes else None
         finite = np.isfinite(points).all(axis=1)
         if not finite.any():
-            raise FormatError(path, expected="points", found="none that is finite", advice="remove the scan")
+            raise FormatError(
+                path, expected="points", found="none that is finite", advice="remove the scan"
+            )
         points = points[finite]
         if not np.array_equal(self.options.axes, np.eye(4)):
             points = points.copy()
@@ -99,7 +108,8 @@ class ScanFile(FrameHandle):
 
 
 def read_labels(path: Path, count: int) -> NDArray[np.uint32]:
-    """Return the (N,) class ids of a file: .label (uint32, of which the lower 16 bits count), .npy, or .txt with one per line.
+    """Return the (N,) class ids of a file: .label (uint32, of which the lower 16 bits count), .npy,
+    or .txt with one per line.
 
     Raises:
         FormatError: the file does not hold `count` whole numbers.
@@ -113,5 +123,7 @@ def read_labels(path: Path, count: int) -> NDArray[np.uint32]:
             values = np.loadtxt(path, ndmin=1)
     labels = whole_numbers(np.asarray(values).reshape(-1), str(path))
     if len(labels) != count:
-        raise FormatError(path, expected=f"a label for each of {count} points", found=str(len(labels)))
+        raise FormatError(
+            path, expected=f"a label for each of {count} points", found=str(len(labels))
+        )
     return labels

@@ -41,27 +41,44 @@ class Scans(Converter):
         self,
         source: Path,
         *,
-        columns: Annotated[str | None, "Names of the columns, if files do not contain them: x,y,z,intensity."] = None,
-        pose_file: Annotated[str | None, "File of poses: TUM, KITTI, EuRoC, CSV with a header, .npy (N, 4, 4)."] = None,
+        columns: Annotated[
+            str | None, "Names of the columns, if files do not contain them: x,y,z,intensity."
+        ] = None,
+        pose_file: Annotated[
+            str | None, "File of poses: TUM, KITTI, EuRoC, CSV with a header, .npy (N, 4, 4)."
+        ] = None,
         pose_of: Annotated[
-            Literal["auto", "sensor", "vehicle"], "Whose poses these are. auto: the sensor; with EuRoC, the vehicle."
+            Literal["auto", "sensor", "vehicle"],
+            "Whose poses these are. auto: the sensor; with EuRoC, the vehicle.",
         ] = "auto",
-        calibration: Annotated[str | None, "YAML or JSON file with the poses of the LiDARs on the vehicle."] = None,
+        calibration: Annotated[
+            str | None, "YAML or JSON file with the poses of the LiDARs on the vehicle."
+        ] = None,
         time_file: Annotated[str | None, "File with the time of each scan, one per line."] = None,
-        time_unit: Annotated[TimeUnit, "Unit of the times of points. auto: from the duration of a scan."] = "auto",
-        deskewed: Annotated[bool, "The points are already corrected for the motion of the vehicle."] = False,
-        label_dir: Annotated[str | None, "Folder with one .label, .npy or .txt file of classes per scan."] = None,
+        time_unit: Annotated[
+            TimeUnit, "Unit of the times of points. auto: from the duration of a scan."
+        ] = "auto",
+        deskewed: Annotated[
+            bool, "The points are already corrected for the motion of the vehicle."
+        ] = False,
+        label_dir: Annotated[
+            str | None, "Folder with one .label, .npy or .txt file of classes per scan."
+        ] = None,
         source_classes: Annotated[
             str | None, "Class table of the labels: a name such as semantickitti, or a JSON file."
         ] = None,
-        source_axes: Annotated[str, "Directions of x, y and z: flu, fru (left-handed), rfu, frd, rdf, ..."] = "flu",
+        source_axes: Annotated[
+            str, "Directions of x, y and z: flu, fru (left-handed), rfu, frd, rdf, ..."
+        ] = "flu",
     ) -> None:
         super().__init__(source)
         if source_classes:
             self.classes, self.to_carla = classes_given(source_classes)
         elif label_dir:
             raise ArgumentError(
-                "source_classes", expected="the class table of the labels: a name, or a JSON file", found="none"
+                "source_classes",
+                expected="the class table of the labels: a name, or a JSON file",
+                found="none",
             )
         self.options = ScanOptions(
             columns=tuple(name.strip() for name in columns.split(",")) if columns else None,
@@ -97,10 +114,15 @@ class Scans(Converter):
     def _folder(self) -> Path:
         """Return the folder of the scans: the source, or the only folder in it with scans."""
         if not self.source.is_dir():
-            raise MissingDataError(self.source, expected="a folder of scans", found="no such folder")
-        inner = [path for path in sorted(self.source.iterdir()) if path.is_dir() and self._scans_in(path)]
+            raise MissingDataError(
+                self.source, expected="a folder of scans", found="no such folder"
+            )
+        inner = [
+            path for path in sorted(self.source.iterdir()) if path.is_dir() and self._scans_in(path)
+        ]
         own = {path.suffix.lower() for path in self._scans_in(self.source)}
-        if own - set(_TABLES) or (own and not inner):  # tables beside folders of scans are their poses and times
+        # tables beside folders of scans are their poses and times
+        if own - set(_TABLES) or (own and not inner):
             return self.source
         if len(inner) > 1:
             raise MissingDataError(
@@ -113,9 +135,17 @@ class Scans(Converter):
 
     def _scans_in(self, folder: Path) -> list[Path]:
         """Return the files of a folder that may be scans, without those of poses and times."""
-        others = {path.resolve() for path in (self.options.pose_file, self.options.time_file) if path is not None}
+        others = {
+            path.resolve()
+            for path in (self.options.pose_file, self.options.time_file)
+            if path is not None
+        }
         found = folder.iterdir() if folder.is_dir() else iter(())
-        return [path for path in found if path.suffix.lower() in FORMATS and path.resolve() not in others]
+        return [
+            path
+            for path in found
+            if path.suffix.lower() in FORMATS and path.resolve() not in others
+        ]
 
     def _files(self, folder: Path) -> list[Path]:
         """Return the scans of a folder in their natural order."""
@@ -123,17 +153,24 @@ class Scans(Converter):
         kinds = Counter(path.suffix.lower() for path in found)
         scans = {kind: count for kind, count in kinds.items() if kind not in _TABLES} or dict(kinds)
         if not scans:
-            expected, advice = f"scans: files with the suffix {', '.join(FORMATS)}", "give the folder of the scans"
+            expected, advice = (
+                f"scans: files with the suffix {', '.join(FORMATS)}",
+                "give the folder of the scans",
+            )
             raise MissingDataError(folder, expected=expected, found="none", advice=advice)
         if len(scans) > 1:
             counts = ", ".join(f"{count} {kind}" for kind, count in sorted(scans.items()))
-            raise FormatError(folder, expected="scans of one format", found=counts, advice="move the others away")
+            raise FormatError(
+                folder, expected="scans of one format", found=counts, advice="move the others away"
+            )
         return sorted((path for path in found if path.suffix.lower() in scans), key=_natural)
 
     def _check_counts(self, files: dict[str, list[Path]]) -> None:
         if len({len(paths) for paths in files.values()}) > 1:
             counts = ", ".join(f"{len(paths)} of {name}" for name, paths in files.items())
-            raise FormatError(self.source, expected="the same number of scans of each LiDAR", found=counts)
+            raise FormatError(
+                self.source, expected="the same number of scans of each LiDAR", found=counts
+            )
 
 
 class ScanFolder(Recording):
@@ -142,11 +179,17 @@ class ScanFolder(Recording):
     split = "Train"
 
     def __init__(
-        self, source: Path, files: dict[str, list[Path]], rig: dict[str, Transform], options: ScanOptions
+        self,
+        source: Path,
+        files: dict[str, list[Path]],
+        rig: dict[str, Transform],
+        options: ScanOptions,
     ) -> None:
         self.location, self.name = str(source), sequence_name(source.resolve().name)
         self._files, self._rig, self._options = files, rig, options
-        self.has_labels = options.label_dir is not None or (options.has_classes and "label" in self._first)
+        self.has_labels = options.label_dir is not None or (
+            options.has_classes and "label" in self._first
+        )
         self.has_instances = self.has_labels and "instance" in self._first
 
     @cached_property
@@ -156,11 +199,15 @@ class ScanFolder(Recording):
     @cached_property
     def _first(self) -> dict[str, NDArray[Any]]:
         """The fields of the first scan."""
-        return named_fields(read_columns(self._paths[0], self._options.columns), str(self._paths[0]))
+        return named_fields(
+            read_columns(self._paths[0], self._options.columns), str(self._paths[0])
+        )
 
     @cached_property
     def _clock(self) -> tuple[str, int | None]:
-        """The unit of the times of points, and the start of the first scan, if these are times of a clock."""
+        """The unit of the times of points, and the start of the first scan, if these are times of a
+        clock.
+        """
         times = self._first.get("time")
         if times is None:
             return "", None
@@ -179,24 +226,37 @@ class ScanFolder(Recording):
             stamps = read_stamps(self._options.time_file)
             if len(stamps) != count:
                 raise FormatError(
-                    self._options.time_file, expected=f"a time for each of {count} scans", found=f"{len(stamps)} times"
+                    self._options.time_file,
+                    expected=f"a time for each of {count} scans",
+                    found=f"{len(stamps)} times",
                 )
             return stamps, str(self._options.time_file)
         if self._clock[1] is not None:
-            return np.array([self._start_of(path) for path in self._paths], np.int64), "the times of points"
+            return np.array(
+                [self._start_of(path) for path in self._paths], np.int64
+            ), "the times of points"
         if all(_STAMPED.fullmatch(path.stem) for path in self._paths):
             stamps = np.array([nanoseconds(path.stem) for path in self._paths], np.int64)
             if (np.diff(stamps) > 0).all():
                 return stamps, "the names of the files"
-        if self._poses is not None and self._poses.stamps is not None and len(self._poses.stamps) == count:
-            return self._poses.stamps, f"{self._options.pose_file}, whose lines go by the order of the scans"
+        if (
+            self._poses is not None
+            and self._poses.stamps is not None
+            and len(self._poses.stamps) == count
+        ):
+            return (
+                self._poses.stamps,
+                f"{self._options.pose_file}, whose lines go by the order of the scans",
+            )
         return None, ""
 
     def _start_of(self, path: Path) -> int:
         times = named_fields(read_columns(path, self._options.columns), str(path)).get("time")
         start = None if times is None else point_seconds(times, self._clock[0], str(path))[1]  # type: ignore[arg-type]
         if start is None:
-            raise FormatError(path, expected="times of points by a clock, as in the first scan", found="others")
+            raise FormatError(
+                path, expected="times of points by a clock, as in the first scan", found="others"
+            )
         return start
 
     @cached_property
@@ -224,19 +284,24 @@ class ScanFolder(Recording):
         if folder is None:
             return None
         found = (
-            {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in _LABELS} if folder.is_dir() else {}
+            {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in _LABELS}
+            if folder.is_dir()
+            else {}
         )
         if missing := [path.stem for path in self._paths if path.stem not in found]:
             raise MissingDataError(
                 folder,
                 expected=f"a file {', '.join(_LABELS)} for each scan",
-                found=f"none for {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
+                found=f"none for {missing[0]}"
+                + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
             )
         return [found[path.stem] for path in self._paths]
 
     @cached_property
     def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]
-        """The LiDARs, with their poses from the calibration; without one, the frame of the LiDAR is that of the vehicle."""
+        """The LiDARs, with their poses from the calibration; without one, the frame of the LiDAR is
+        that of the vehicle.
+        """
         deskewed = self._options.deskewed or "time" not in self._first
         return [
             Sensor(
@@ -254,11 +319,14 @@ class ScanFolder(Recording):
         return None if stamps is None else (stamps - stamps[0]) / 1e9
 
     def poses(self, *, force: bool = False) -> Trajectory | None:
-        """Return the poses of the file, by their times if scans have times, otherwise by their order; None without a file.
+        """Return the poses of the file, by their times if scans have times, otherwise by their
+        order; None without a file.
 
         Raises:
-            MissingDataError: they are poses of the vehicle, and no calibration has the pose of the sensor on it.
-            FormatError: the numbers of poses and scans differ, or they were recorded at different times.
+            MissingDataError: they are poses of the vehicle, and no calibration has the pose of the
+                sensor on it.
+            FormatError: the numbers of poses and scans differ, or they were recorded at different
+                times.
         """
         rows = self._poses
         if rows is None:
@@ -273,7 +341,9 @@ class ScanFolder(Recording):
             )
         world_T_body = in_axes(self._options.axes, rows.world_T_body)
         vehicle_T_sensor = self.sensors[0].vehicle_T_sensor
-        world_T_vehicle = world_T_body if of == "vehicle" else world_T_body @ invert(vehicle_T_sensor)
+        world_T_vehicle = (
+            world_T_body if of == "vehicle" else world_T_body @ invert(vehicle_T_sensor)
+        )
         stamps, where = self._stamps[0], str(self._options.pose_file)
         if rows.stamps is None or stamps is None:
             if len(world_T_vehicle) != len(self._paths):
@@ -281,7 +351,8 @@ class ScanFolder(Recording):
                     where,
                     expected=f"a pose for each of {len(self._paths)} scans",
                     found=f"{len(world_T_vehicle)} poses",
-                    advice="give `time_file`, and poses with times: without times, poses are matched by their order",
+                    advice="give `time_file`, and poses with times: without times, poses are "
+                    "matched by their order",
                 )
             return Trajectory(world_T_vehicle, where=where)
         if stamps[0] < rows.stamps[0] - _SLACK_NS or stamps[-1] > rows.stamps[-1] + _SLACK_NS:
@@ -299,13 +370,20 @@ class ScanFolder(Recording):
         if self._stamps[0] is not None and options.time_file is None:
             notes.append(f"the times of scans are from {self._stamps[1]}")
         if self._clock[0] and options.time_unit == "auto":
-            notes.append(f"the times of points are in {self._clock[0]}, because scans then have a usual duration")
+            notes.append(
+                f"the times of points are in {self._clock[0]}, because scans then have a usual "
+                f"duration"
+            )
         if "time" in self._first and not options.deskewed:
             notes.append(
-                "points have times, so that they were corrected for the motion of the vehicle; give `deskewed=True` to keep them"
+                "points have times, so that they were corrected for the motion of the vehicle; "
+                "give `deskewed=True` to keep them"
             )
         if "label" in self._first and not options.has_classes:
-            notes.append("points have a field of classes, which was not read: give `source_classes` to read it")
+            notes.append(
+                "points have a field of classes, which was not read: give `source_classes` to "
+                "read it"
+            )
         return notes
 
 

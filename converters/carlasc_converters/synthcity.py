@@ -1,7 +1,9 @@
-"""SynthCity: a simulated mobile-mapping cloud of a city, in Parquet tables, one per area of about 40 million points.
+"""SynthCity: a simulated mobile-mapping cloud of a city, in Parquet tables, one per area of about
+40 million points.
 
-The cloud has no trajectory, and therefore no scans. Each area is cut into tiles of the size of a voxel grid, and a frame is one tile. The
-positions of the sensor are not known, so that voxels with points are known, and all others are unknown.
+The cloud has no trajectory, and therefore no scans. Each area is cut into tiles of the size of a
+voxel grid, and a frame is one tile. The positions of the sensor are not known, so that voxels with
+points are known, and all others are unknown.
 """
 
 from __future__ import annotations
@@ -18,7 +20,15 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.converting import Cloud, Converter, FrameHandle, Recording, Sensor, Trajectory, VoxelContent
+from carlasc.converting import (
+    Cloud,
+    Converter,
+    FrameHandle,
+    Recording,
+    Sensor,
+    Trajectory,
+    VoxelContent,
+)
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
@@ -38,17 +48,36 @@ CLASSES = ClassTable(
     movable=frozenset({2}),
     ground=frozenset({3, 4, 6, 9}),
 )
-_SYNONYMS = {  # possible names of columns, in lower case, letters only, because the published names are not certain
+# possible names of columns, in lower case, letters only, because the published names are not
+# certain
+_SYNONYMS = {
     "x": {"x", "xcoord", "xcoordinate", "posx"},
     "y": {"y", "ycoord", "ycoordinate", "posy"},
     "z": {"z", "zcoord", "zcoordinate", "posz"},
-    "label": {"label", "labels", "labelid", "class", "classes", "classid", "classification", "category", "semantic"},
+    "label": {
+        "label",
+        "labels",
+        "labelid",
+        "class",
+        "classes",
+        "classid",
+        "classification",
+        "category",
+        "semantic",
+    },
 }
 _COLUMNS = "x=NAME,y=NAME,z=NAME,label=NAME"
-_HEIGHT_M = 1.8  # height of the origin of a frame above its ground: about that of the LiDAR in CarlaSC
-_GROUND_RADIUS_M, _GROUND_POINTS = 5.0, 20  # around the middle of a tile, and least number of ground points there
+_HEIGHT_M = (
+    1.8  # height of the origin of a frame above its ground: about that of the LiDAR in CarlaSC
+)
+# around the middle of a tile, and least number of ground points there
+_GROUND_RADIUS_M, _GROUND_POINTS = (
+    5.0,
+    20,
+)
 _BATCH = 1 << 18  # rows in memory
-_ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("label", "u1")])  # x and y from the middle of the tile
+# x and y from the middle of the tile
+_ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("label", "u1")])
 
 
 class SynthCity(Converter):
@@ -66,9 +95,13 @@ class SynthCity(Converter):
         source: Path,
         *,
         columns: Annotated[
-            str | None, "Names of columns, if they are not found automatically: x=X_noise,y=Y_noise,label=Class."
+            str | None,
+            "Names of columns, if they are not found automatically: "
+            "x=X_noise,y=Y_noise,label=Class.",
         ] = None,
-        grid: Annotated[Literal["coarse", "fine"], "Published grid with the size and voxels of tiles."] = "coarse",
+        grid: Annotated[
+            Literal["coarse", "fine"], "Published grid with the size and voxels of tiles."
+        ] = "coarse",
     ) -> None:
         super().__init__(source)
         self.columns, self.grid = columns, grid
@@ -86,14 +119,22 @@ class SynthCity(Converter):
         files = [self.source] if self.source.is_file() else sorted(self.source.rglob("*.parquet"))
         if not files:
             advice = "give their folder, or one of the tables"
-            raise MissingDataError(self.source, expected="Parquet tables, one per area", found="none", advice=advice)
-        return [SynthCityArea(path, _find_columns(path, named), GridSpec.published(self.grid)) for path in files]
+            raise MissingDataError(
+                self.source, expected="Parquet tables, one per area", found="none", advice=advice
+            )
+        return [
+            SynthCityArea(path, _find_columns(path, named), GridSpec.published(self.grid))
+            for path in files
+        ]
 
 
 class SynthCityArea(Recording):
-    """One area. Its tiles lie on a lattice that is the same for all areas, and are numbered along y first.
+    """One area.
 
-    The rows of each tile are kept in a file of a temporary folder, which is deleted with the recording and its frames.
+    Its tiles lie on a lattice that is the same for all areas, and are numbered along y first.
+
+    The rows of each tile are kept in a file of a temporary folder, which is deleted with the
+    recording and its frames.
 
     Attributes:
         path: its table.
@@ -130,7 +171,10 @@ class SynthCityArea(Recording):
 
     @cached_property
     def _cut(self) -> tuple[_TileFolder, list[tuple[int, int]]]:
-        """The folder with the rows of each tile, and the tiles. One pass over the table makes them."""
+        """The folder with the rows of each tile, and the tiles.
+
+        One pass over the table makes them.
+        """
         folder, tiles = _TileFolder(), set[tuple[int, int]]()
         for points, labels in _batches(self.path, self.columns):
             tiles |= _append(folder.name, points, labels, self._step)
@@ -148,22 +192,30 @@ class SynthCityArea(Recording):
         return (np.array(self._cut[1], np.float64) + 0.5) * self._step
 
     def poses(self, *, force: bool = False) -> Trajectory:
-        """Return the poses of the tiles in the city: 1.8 m above their ground, with the axes of the city."""
+        """Return the poses of the tiles in the city: 1.8 m above their ground, with the axes of the
+        city.
+        """
         heights = [frame.height_m for frame in self.frames if isinstance(frame, SynthCityFrame)]
-        poses = np.array([translation((x, y, z)) for (x, y), z in zip(self._centers, heights, strict=True)])
+        poses = np.array(
+            [translation((x, y, z)) for (x, y), z in zip(self._centers, heights, strict=True)]
+        )
         return Trajectory(poses, where=self.location)
 
     def notes(self) -> list[str]:
         """Return notes on what is missing in the data."""
         return [
-            f"SynthCity is a static cloud without trajectory: each frame is a tile of {self._step:.1f} m, in the frame of a place"
+            f"SynthCity is a static cloud without trajectory: each frame is a tile of "
+            f"{self._step:.1f} m, in the frame of a place"
             f" {_HEIGHT_M} m above its ground, where no sensor was",
             "only voxels with points are known, because there are no rays that show free space",
         ]
 
 
 class _TileFolder:
-    """A temporary folder. It is deleted with the last reference to this object, at the latest when the process ends."""
+    """A temporary folder.
+
+    It is deleted with the last reference to this object, at the latest when the process ends.
+    """
 
     def __init__(self) -> None:
         self.name = tempfile.mkdtemp(prefix="carlasc-synthcity-")
@@ -201,12 +253,16 @@ class SynthCityFrame(FrameHandle):
         return (Cloud(points, rows["label"]),)
 
     def read_voxels(self) -> VoxelContent:
-        """Return the class that most points of each voxel have; the one with the smallest number if there are several."""
+        """Return the class that most points of each voxel have; the one with the smallest number if
+        there are several.
+        """
         (cloud,) = self.read()
         assert cloud.labels is not None
         cells = self.spec.flat_index(cloud.points[:, :3])
         inside, kinds = cells >= 0, len(CLASSES.names)
-        votes = np.bincount(cells[inside] * kinds + cloud.labels[inside], minlength=self.spec.num_voxels * kinds)
+        votes = np.bincount(
+            cells[inside] * kinds + cloud.labels[inside], minlength=self.spec.num_voxels * kinds
+        )
         votes = votes.reshape(*self.spec.size, kinds)
         return VoxelContent(votes.argmax(axis=-1).astype(np.uint8), votes.sum(axis=-1) > 0)
 
@@ -227,7 +283,9 @@ def _find_columns(path: Path, named: Mapping[str, str]) -> dict[str, str]:
         existing = parquet.read_schema(path).names
     columns = {}
     for key, synonyms in _SYNONYMS.items():
-        found = [name for name in existing if "".join(filter(str.isalpha, name.lower())) in synonyms]
+        found = [
+            name for name in existing if "".join(filter(str.isalpha, name.lower())) in synonyms
+        ]
         found = [name for name in existing if name == named[key]] if key in named else found
         if len(found) != 1:
             raise FormatError(
@@ -240,15 +298,19 @@ def _find_columns(path: Path, named: Mapping[str, str]) -> dict[str, str]:
     return columns
 
 
-def _batches(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint8]]]:
+def _batches(
+    path: Path, columns: Mapping[str, str]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint8]]]:
     """Yield (N, 3) points and (N,) labels, counted from 1, of consecutive rows of a table.
 
     Raises:
-        FormatError: the table is damaged, a coordinate is not finite, or a label is not one of the nine.
+        FormatError: the table is damaged, a coordinate is not finite, or a label is not one of the
+            nine.
     """
     parquet = import_extra("pyarrow.parquet", "parquet")
     done = 0
-    # Without these two options, whole columns of a row group are in memory, and a table may be one row group.
+    # Without these two options, whole columns of a row group are in memory, and a table may be one
+    # row group.
     with (
         opening(path, "a Parquet table", "copy it again"),
         parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False) as table,
@@ -263,8 +325,10 @@ def _batches(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[NDArray[n
                 value, count = labels[np.argmax(wrong)], int(wrong.sum())
                 raise FormatError(
                     path,
-                    expected=f"labels 0 to {len(CLASSES.names) - 2} in the column {columns['label']}",
-                    found=f"{value:g} in row {done + int(np.argmax(wrong))}, and {count - 1} more such rows near it",
+                    expected=f"labels 0 to {len(CLASSES.names) - 2} in the column "
+                    f"{columns['label']}",
+                    found=f"{value:g} in row {done + int(np.argmax(wrong))}, and {count - 1} more "
+                    f"such rows near it",
                     advice="another column may hold the labels: name it with the option `columns`",
                 )
             yield points, labels.astype(np.uint8) + np.uint8(1)
@@ -275,11 +339,15 @@ def _numbers(path: Path, batch: Any, name: str) -> NDArray[np.float64]:
     """Return a column of a batch as numbers."""
     column = batch.column(name).to_numpy(zero_copy_only=False)
     if column.dtype.kind not in "iuf":
-        raise FormatError(path, expected=f"numbers in the column {name}", found=str(batch.schema.field(name).type))
+        raise FormatError(
+            path, expected=f"numbers in the column {name}", found=str(batch.schema.field(name).type)
+        )
     return column.astype(np.float64)
 
 
-def _append(folder: str, points: NDArray[np.float64], labels: NDArray[np.uint8], step: float) -> set[tuple[int, int]]:
+def _append(
+    folder: str, points: NDArray[np.float64], labels: NDArray[np.uint8], step: float
+) -> set[tuple[int, int]]:
     """Append points to the files of their tiles, and return these tiles."""
     if not len(points):
         return set()
@@ -289,9 +357,8 @@ def _append(folder: str, points: NDArray[np.float64], labels: NDArray[np.uint8],
     rows["z"], rows["label"] = points[:, 2], labels
     low = tiles.min(axis=0)
     codes = (tiles[:, 0] - low[0]) * (np.ptp(tiles[:, 1]) + 1) + (tiles[:, 1] - low[1])
-    codes = codes.astype(
-        np.min_scalar_type(codes.max())
-    )  # 16 bits, in nearly all cases, are sorted ten times as fast as 64
+    # 16 bits, in nearly all cases, are sorted ten times as fast as 64
+    codes = codes.astype(np.min_scalar_type(codes.max()))
     order = np.argsort(codes, kind="stable")
     rows, codes = rows[order], codes[order]
     starts = np.append(0, np.flatnonzero(np.diff(codes)) + 1)
@@ -313,9 +380,11 @@ def _tile_file(folder: str, tile: tuple[int, int]) -> str:
 
 
 def _grounds(files: list[str], centers: NDArray[np.float64]) -> list[float]:
-    """Return the height of the ground in each tile: the median of its ground points, those around the middle if there are enough.
+    """Return the height of the ground in each tile: the median of its ground points, those around
+    the middle if there are enough.
 
-    A tile without ground points has the height of the nearest tile that has some; if none has, that of its lowest point.
+    A tile without ground points has the height of the nearest tile that has some; if none has, that
+    of its lowest point.
     """
     heights = np.full(len(files), np.nan)
     lowest = np.empty(len(files))

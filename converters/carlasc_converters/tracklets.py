@@ -1,4 +1,6 @@
-"""tracklet_labels.xml of KITTI's raw data: the tracked boxes of a drive, as boost's serialisation writes them."""
+"""tracklet_labels.xml of KITTI's raw data: the tracked boxes of a drive, as boost's serialisation
+writes them.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +16,21 @@ from carlasc_converters.files import read_bytes
 from carlasc_converters.kitti_boxes import BoxRows, class_of
 
 MAX_BYTES = 256 << 20  # the files of KITTI have at most some ten megabytes
-_INTERPOLATED = 1  # the state of a box that was interpolated between two others; 2 means that it was drawn
+_INTERPOLATED = (
+    1  # the state of a box that was interpolated between two others; 2 means that it was drawn
+)
 
 
 def read_tracklets(path: Path, frames: list[int]) -> dict[int, Boxes]:
-    """Read the boxes of some frames, in the frame of the LiDAR: x forward, y left, z up. Tracks count from 1, in the order of the file.
+    """Read the boxes of some frames, in the frame of the LiDAR: x forward, y left, z up.
+
+    Tracks count from 1, in the order of the file.
 
     Boxes that the annotation tool interpolated between two others are marked as not annotated.
 
     Raises:
-        FormatError: the file is damaged or too large, or names a type of object that KITTI does not have.
+        FormatError: the file is damaged or too large, or names a type of object that KITTI does not
+            have.
     """
     items = _items(path)
     rows = BoxRows(str(path), frames)
@@ -38,8 +45,11 @@ def read_tracklets(path: Path, frames: list[int]) -> dict[int, Boxes]:
         if poses is None:
             raise FormatError(where, expected="poses", found="none", advice="copy the file again")
         for frame, pose in enumerate(poses.findall("item"), int(first)):
-            x, y, z = (_number(pose, name, where) for name in ("tx", "ty", "tz"))  # of the middle of the underside
-            lidar_T_box = translation((x, y, z + size[2] / 2)) @ rotation_z(_number(pose, "rz", where))
+            # of the middle of the underside
+            x, y, z = (_number(pose, name, where) for name in ("tx", "ty", "tz"))
+            lidar_T_box = translation((x, y, z + size[2] / 2)) @ rotation_z(
+                _number(pose, "rz", where)
+            )
             drawn = pose.findtext("state", "").strip() != str(_INTERPOLATED)
             rows.add(frame, track, label, lidar_T_box, size, annotated=drawn)
     return rows.boxes()
@@ -51,22 +61,36 @@ def _items(path: Path) -> list[ElementTree.Element]:
     if size > MAX_BYTES:
         raise FormatError(path, expected=f"at most {MAX_BYTES} bytes", found=str(size))
     data = read_bytes(path)
-    if (
-        b"<!ENTITY" in data or b"\0" in data
-    ):  # entities can make a small file very large, and other encodings can hide them
+    # entities can make a small file very large, and other encodings can hide them
+    if b"<!ENTITY" in data or b"\0" in data:
         found = "an entity" if b"<!ENTITY" in data else "another encoding"
-        raise FormatError(path, expected="XML in UTF-8 without entities", found=found, advice="copy the file again")
+        raise FormatError(
+            path,
+            expected="XML in UTF-8 without entities",
+            found=found,
+            advice="copy the file again",
+        )
     try:
         root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # LookupError: an unknown encoding
-        raise FormatError(path, expected="XML", found=f"damage: {error}", advice="copy the file again") from error
+    except (
+        ElementTree.ParseError,
+        LookupError,
+        ValueError,
+    ) as error:  # LookupError: an unknown encoding
+        raise FormatError(
+            path, expected="XML", found=f"damage: {error}", advice="copy the file again"
+        ) from error
     tracklets = root.find("tracklets")
     if tracklets is None:
-        raise FormatError(path, expected="tracklets in boost_serialization", found=f"<{root.tag}> without them")
+        raise FormatError(
+            path, expected="tracklets in boost_serialization", found=f"<{root.tag}> without them"
+        )
     items = tracklets.findall("item")
     if tracklets.findtext("count", "").strip() not in ("", str(len(items))):
         count = tracklets.findtext("count", "").strip()
-        raise FormatError(path, expected=f"{count} tracklets", found=str(len(items)), advice="copy the file again")
+        raise FormatError(
+            path, expected=f"{count} tracklets", found=str(len(items)), advice="copy the file again"
+        )
     return items
 
 

@@ -56,7 +56,10 @@ class FrameTrack:
         Raises:
             FormatError: a quaternion is not a rotation.
         """
-        stamps, numbers = np.array(self._stamps, np.int64), np.array(self._poses, np.float64).reshape(-1, 7)
+        stamps, numbers = (
+            np.array(self._stamps, np.int64),
+            np.array(self._poses, np.float64).reshape(-1, 7),
+        )
         poses = poses_of(numbers[:, 3:], numbers[:, :3], self._where)
         times, last = np.unique(stamps[::-1], return_index=True)
         return times, poses[::-1][last]
@@ -68,7 +71,9 @@ class FrameTrack:
         return bool(np.abs(poses - poses[0]).max() > _STILL)
 
     def at(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return (M, 4, 4) poses at some times: interpolated, and constant before the first and after the last."""
+        """Return (M, 4, 4) poses at some times: interpolated, and constant before the first and
+        after the last.
+        """
         times, poses = self.values
         after = (np.clip(stamps, times[0], times[-1]) - times[0]) * 1e-9
         return slerp(poses, (times - times[0]) * 1e-9, after)
@@ -98,7 +103,9 @@ class FrameTree:
         while parents := self._tracks.get(found[-1]):
             found.append(max(parents, key=lambda parent: len(parents[parent])))
             if found[-1] in found[:-1]:
-                raise FormatError(self._where, expected="a tree of frames", found=f"a circle: {', '.join(found)}")
+                raise FormatError(
+                    self._where, expected="a tree of frames", found=f"a circle: {', '.join(found)}"
+                )
         return found
 
     def edges(self, frame: str, ancestor: str) -> list[FrameTrack]:
@@ -121,7 +128,11 @@ class FrameTree:
         above = self.ancestors(target)
         common = next(frame for frame in self.ancestors(source) if frame in above)
         up, down = self._climb(source, common, stamps), self._climb(target, common, stamps)
-        return up if target == common else np.array([multiply(inverse_of(a), b) for a, b in zip(down, up, strict=True)])
+        return (
+            up
+            if target == common
+            else np.array([multiply(inverse_of(a), b) for a, b in zip(down, up, strict=True)])
+        )
 
     def _climb(self, frame: str, ancestor: str, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
         poses = np.tile(np.eye(4), (len(stamps), 1, 1))
@@ -131,5 +142,7 @@ class FrameTree:
 
     def __str__(self) -> str:
         """Name the frames, each with its parent."""
-        named = [f"{parent} > {child}" for child, parents in self._tracks.items() for parent in parents]
+        named = [
+            f"{parent} > {child}" for child, parents in self._tracks.items() for parent in parents
+        ]
         return ", ".join(sorted(named)) or "no frames"

@@ -1,14 +1,17 @@
 """Are actors that free space shows real? `python docs/studies/actors.py [WORK]` prints the tables.
 
-Simulated drives are given as points and poses only, and the actors that are found are compared with the instances of the recording, in three
-worlds: the town and the street of `movers.py`, and a street with rails, fences and hedges (`railed.py`). Poses are exact, or off by
-2 cm and 0.1 degrees in every frame. WORK keeps the drives; the default is a temporary folder.
+Simulated drives are given as points and poses only, and the actors that are found are compared with
+the instances of the recording, in three worlds: the town and the street of `movers.py`, and a
+street with rails, fences and hedges (`railed.py`). Poses are exact, or off by 2 cm and 0.1 degrees
+in every frame. WORK keeps the drives; the default is a temporary folder.
 
-An actor that is reported is right if more than half of its points, over all scans, belong to one mover: an instance that is faster than
-1 m/s at some time. A mover counts if it has 50 points or more in two scans or more. It is found if, in most of these scans, one
-reported actor holds more than half of its points. Precision is the share of reported actors that are right, recall that of movers
-that are found. Rows are added up over the drives. No criterion is a limit on height; the rows "no confidence" show what the
-criteria of the confidence change, because all actors are reported then.
+An actor that is reported is right if more than half of its points, over all scans, belong to one
+mover: an instance that is faster than 1 m/s at some time. A mover counts if it has 50 points or
+more in two scans or more. It is found if, in most of these scans, one reported actor holds more
+than half of its points. Precision is the share of reported actors that are right, recall that of
+movers that are found. Rows are added up over the drives. No criterion is a limit on height; the
+rows "no confidence" show what the criteria of the confidence change, because all actors are
+reported then.
 """
 
 from __future__ import annotations
@@ -38,7 +41,9 @@ MANY_POINTS, SCANS = 50, 2
 
 @dataclass(frozen=True)
 class Counts:
-    """How many actors were reported, how many of them are right and doubtful, and how many movers there are and were found."""
+    """How many actors were reported, how many of them are right and doubtful, and how many movers
+    there are and were found.
+    """
 
     reported: int = 0
     right: int = 0
@@ -48,12 +53,19 @@ class Counts:
     found: int = 0
 
     def __add__(self, other: Counts) -> Counts:
-        return Counts(*(one + more for one, more in zip(vars(self).values(), vars(other).values(), strict=True)))
+        return Counts(
+            *(
+                one + more
+                for one, more in zip(vars(self).values(), vars(other).values(), strict=True)
+            )
+        )
 
     def __str__(self) -> str:
         sure, sure_right = self.reported - self.doubtful, self.right - self.doubtful_right
         shares = ((self.right, self.reported), (sure_right, sure), (self.found, self.movers))
-        return " | ".join(f"{part / max(whole, 1):.2f} ({part} of {whole})" for part, whole in shares)
+        return " | ".join(
+            f"{part / max(whole, 1):.2f} ({part} of {whole})" for part, whole in shares
+        )
 
 
 @dataclass(frozen=True)
@@ -86,7 +98,9 @@ class Truth:
 
     def is_right(self, track: Track) -> bool:
         """Whether an actor is one mover."""
-        owners = np.concatenate([self.owners[frame][members] for frame, members in track.members.items()])
+        owners = np.concatenate(
+            [self.owners[frame][members] for frame, members in track.members.items()]
+        )
         numbers, counts = np.unique(owners, return_counts=True)
         return self.moves(int(numbers[counts.argmax()])) and counts.max() > len(owners) / 2
 
@@ -112,7 +126,9 @@ class Truth:
 
 
 def find(drive: Recorded, errors: tuple[float, float]) -> list[Track]:
-    """Return the moving actors that are found without labels, under poses with errors in metres and degrees."""
+    """Return the moving actors that are found without labels, under poses with errors in metres and
+    degrees.
+    """
     bare: Sequence = Only(drive.sequence, BARE)
     if any(errors):
         bare = bare.with_poses(NoisyPoses(*errors)(drive, 0).poses)
@@ -122,7 +138,9 @@ def find(drive: Recorded, errors: tuple[float, float]) -> list[Track]:
 def drives(given: Namespace) -> Iterator[tuple[str, int, Recorded]]:
     """Yield the world, the channels and the drive of each recording."""
     for world, seed in study.drives(given, SEEDS):
-        channels = study.few([32, 16, 64] if seed in getattr(given, world)[:MANY_CHANNELS] else [32])
+        channels = study.few(
+            [32, 16, 64] if seed in getattr(given, world)[:MANY_CHANNELS] else [32]
+        )
         for count, drive in zip(channels, record(world, seed, channels, given.work), strict=True):
             yield world, count, drive
 
@@ -141,7 +159,10 @@ def main() -> None:
                     key = (world, channels, f"{name}{rule}")
                     rows[key] = rows.get(key, Counts()) + counts
                     print(f"{drive.setting}, poses {name}{rule}: {counts}", flush=True)
-    print("\n| world | channels | poses | precision | precision of those that are not doubtful | recall |")
+    print(
+        "\n| world | channels | poses | precision | precision of those that are not doubtful | "
+        "recall |"
+    )
     print("|---|---|---|---|---|---|")
     for (world, channels, name), counts in sorted(rows.items()):
         print(f"| {world} | {channels} | {name} | {counts} |")

@@ -1,7 +1,9 @@
-"""What a Dask cluster costs beyond the work: `python docs/studies/engine.py` measures the figures of the page on scale again.
+"""What a Dask cluster costs beyond the work: `python docs/studies/engine.py` measures the figures
+of the page on scale again.
 
-It prints the time per frame of frames without work, in processes of our own and on a cluster of this machine; the time of all 43,200 frames
-of CarlaSC, with the memory of the process that holds the scheduler.
+It prints the time per frame of frames without work, in processes of our own and on a cluster of
+this machine; the time of all 43,200 frames of CarlaSC, with the memory of the process that holds
+the scheduler.
 """
 
 from __future__ import annotations
@@ -51,7 +53,9 @@ def _cpu_s() -> float:
 
 
 def measure_whole(workers: int, frames: int) -> None:
-    """Print the time of many frames, and the memory of this process, which holds the scheduler, on the way."""
+    """Print the time of many frames, and the memory of this process, which holds the scheduler, on
+    the way.
+    """
     process, start = psutil.Process(), time.perf_counter()
     with open_cluster(f"local:{workers}") as cluster:
         for done, _ in enumerate(run_all(do_nothing, range(frames), run=Run(executor=cluster))):
@@ -59,11 +63,14 @@ def measure_whole(workers: int, frames: int) -> None:
                 client: Any = cluster.client  # of distributed, which has more than our protocol
                 tasks = len(client.cluster.scheduler.tasks)
                 print(
-                    f"  {done:6d} frames, {time.perf_counter() - start:6.1f} s, {process.memory_info().rss >> 20} MiB, {tasks} tasks",
+                    f"  {done:6d} frames, {time.perf_counter() - start:6.1f} s, "
+                    f"{process.memory_info().rss >> 20} MiB, {tasks} tasks",
                     flush=True,
                 )
     print(
-        f"  {frames:6d} frames, {time.perf_counter() - start:6.1f} s, {process.memory_info().rss >> 20} MiB", flush=True
+        f"  {frames:6d} frames, {time.perf_counter() - start:6.1f} s, "
+        f"{process.memory_info().rss >> 20} MiB",
+        flush=True,
     )
 
 
@@ -73,7 +80,10 @@ def main() -> None:
         print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
         for workers in study.few((1, 2)):
             own, cluster = measure_overhead(workers, 100 if study.is_tiny() else 1000)
-            print(f"{workers} workers: {own} in processes of our own, {cluster} on a cluster", flush=True)
+            print(
+                f"{workers} workers: {own} in processes of our own, {cluster} on a cluster",
+                flush=True,
+            )
         frames = 80 if study.is_tiny() else FRAMES_OF_CARLASC
         print(f"{frames} frames on 2 workers:")
         measure_whole(2, frames)

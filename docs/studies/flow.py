@@ -1,7 +1,10 @@
-"""How true is the flow that `carlasc convert kitti` estimates? `python docs/studies/flow.py --town 4 5 6 7 8 9` prints the table.
+"""How true is the flow that `carlasc convert kitti` estimates?
 
-Simulated drives in heavy traffic are written as SemanticKITTI's files, which have no flow, and converted; the velocity that each sighting of a moving
-actor was given is compared with the simulator's.
+`python docs/studies/flow.py --town 4 5 6 7 8 9` prints the table.
+
+Simulated drives in heavy traffic are written as SemanticKITTI's files, which have no flow, and
+converted; the velocity that each sighting of a moving actor was given is compared with the
+simulator's.
 """
 
 from __future__ import annotations
@@ -34,11 +37,20 @@ ROWS = {  # name: class, speeds in m/s, numbers of points
 
 
 def compare(seed: int, root: Path) -> NDArray[np.float64]:
-    """Return (S, 4) of a drive's sightings of moving actors: class, true speed, number of points, end-point error."""
+    """Return (S, 4) of a drive's sightings of moving actors: class, true speed, number of points,
+    end-point error.
+    """
     lidar = Lidar(points=8_000) if study.is_tiny() else Lidar()
     drive, found = TownDrive(seed, "heavy", lidar), []
     truth = write_kitti(root / "in", drive, study.few(FRAMES, 8), voxels_every=0)
-    convert("kitti", root / "in", root / "out", layout=LayoutOptions("carla"), grids=None, run=Run(workers=1))
+    convert(
+        "kitti",
+        root / "in",
+        root / "out",
+        layout=LayoutOptions("carla"),
+        grids=None,
+        run=Run(workers=1),
+    )
     (sequence,) = carlasc.open(root / "out").sequences().values()
     for number in truth.frames:
         scan, flow = sequence.scan(number), truth.flow[number] * MIRROR
@@ -60,7 +72,13 @@ def main() -> None:
     label, speed, points, error = np.concatenate(drives).T
     print("| | median | 75th percentile | observations |", "|---|---:|---:|---:|", sep="\n")
     for name, (wanted, (slowest, fastest), (fewest, most)) in ROWS.items():
-        own = error[(label == wanted) & (speed >= slowest) & (speed < fastest) & (points >= fewest) & (points <= most)]
+        own = error[
+            (label == wanted)
+            & (speed >= slowest)
+            & (speed < fastest)
+            & (points >= fewest)
+            & (points <= most)
+        ]
         middle, high = np.quantile(own, (0.5, 0.75)) if len(own) else (np.nan, np.nan)
         print(f"| {name} | {middle:.3f} | {high:.3f} | {len(own)} |")
 

@@ -1,7 +1,10 @@
-"""Study: how well is the ground found without labels? `python docs/studies/ground.py` prints the table of docs/studies/ground.md.
+"""Study: how well is the ground found without labels?
 
-The scans are those of simulated towns with heavy traffic, whose labels are the truth: roads, pavements, markings and terrain are ground. If
-the package `pypatchworkpp` (BSD-2-Clause) is installed, the same scans are given to Patchwork++, with its defaults and the height of the sensor.
+`python docs/studies/ground.py` prints the table of docs/studies/ground.md.
+
+The scans are those of simulated towns with heavy traffic, whose labels are the truth: roads,
+pavements, markings and terrain are ground. If the package `pypatchworkpp` (BSD-2-Clause) is
+installed, the same scans are given to Patchwork++, with its defaults and the height of the sensor.
 """
 
 from __future__ import annotations
@@ -42,7 +45,9 @@ class Case:
 
     name: str
     channels: int = 32
-    mounts: tuple[tuple[float, float, float, float, float], ...] = ((-0.5, 0.0, HEIGHT_M, 0.0, 0.0),)
+    mounts: tuple[tuple[float, float, float, float, float], ...] = (
+        (-0.5, 0.0, HEIGHT_M, 0.0, 0.0),
+    )
     bend: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     below: float = 0.0
 
@@ -51,13 +56,19 @@ CASES = (
     Case("16 channels", 16),
     Case("32 channels"),
     Case("64 channels", 64),
-    *(Case(f"sensor at {height:g} m", mounts=((2.7, 0.0, height, 0.0, 0.0),)) for height in (1.0, 1.4, 2.5)),
+    *(
+        Case(f"sensor at {height:g} m", mounts=((2.7, 0.0, height, 0.0, 0.0),))
+        for height in (1.0, 1.4, 2.5)
+    ),
     Case("rolled by 3 degrees", mounts=((-0.5, 0.0, HEIGHT_M, 3.0, 0.0),)),
     Case("pitched by 3 degrees", mounts=((-0.5, 0.0, HEIGHT_M, 0.0, 3.0),)),
     Case("slope of 8 %", bend=lambda p: 0.08 * p[:, 0]),
     Case("top of a hill", bend=lambda p: -0.0015 * p[:, 0] ** 2),
     Case("bottom of a dip", bend=lambda p: 0.0015 * p[:, 0] ** 2),
-    Case("three sensors merged", mounts=((0, 0, HEIGHT_M, 0, 0), (2.2, 0.9, 0.8, 0, 2), (-2.2, -0.9, 1.2, 3, 0))),
+    Case(
+        "three sensors merged",
+        mounts=((0, 0, HEIGHT_M, 0, 0), (2.2, 0.9, 0.8, 0, 2), (-2.2, -0.9, 1.2, 3, 0)),
+    ),
     Case("0.5 % of points below the ground", below=0.005),
 )
 
@@ -86,7 +97,8 @@ def scans(case: Case, seed: int) -> Iterator[tuple[NDArray[np.float32], NDArray[
         poses = [drive.ego_pose(frame) @ _mount(*mount) for mount in case.mounts]
         recordings = [scan_snapshot(drive.snapshot(frame), pose, lidar, rng) for pose in poses]
         parts = [
-            transform_points(invert(poses[0]) @ pose, r.scan.points) for pose, r in zip(poses, recordings, strict=True)
+            transform_points(invert(poses[0]) @ pose, r.scan.points)
+            for pose, r in zip(poses, recordings, strict=True)
         ]
         points = np.concatenate(parts).astype(np.float64)
         truth = np.isin(np.concatenate([r.scan.labels for r in recordings]), _GROUND)
@@ -100,7 +112,9 @@ def scans(case: Case, seed: int) -> Iterator[tuple[NDArray[np.float32], NDArray[
 
 
 def ours(points: NDArray[np.float32], height_m: float) -> Found:
-    """Find the ground by `carlasc.motion.ground_points`, which does not know the height of the sensor."""
+    """Find the ground by `carlasc.motion.ground_points`, which does not know the height of the
+    sensor.
+    """
     start = time.perf_counter()
     ground = ground_points(points)
     elapsed = time.perf_counter() - start
@@ -122,12 +136,16 @@ def patchwork(points: NDArray[np.float32], height_m: float) -> Found:
 
 
 def rate(found: list[Found], truths: list[NDArray[np.bool_]], height_m: float) -> str:
-    """Return the columns of a row: precision, recall, the error of the height of the sensor and the time of a scan."""
+    """Return the columns of a row: precision, recall, the error of the height of the sensor and the
+    time of a scan.
+    """
     ground, truth = np.concatenate([f.ground for f in found]), np.concatenate(truths)
     both = np.count_nonzero(ground & truth)
     error = np.max(np.abs([f.height_m + height_m for f in found]))
     elapsed = 1e3 * float(np.median([f.elapsed_s for f in found]))
-    return f"{both / ground.sum():.1%} | {both / truth.sum():.1%} | {error:.2f} m | {elapsed:.0f} ms"
+    return (
+        f"{both / ground.sum():.1%} | {both / truth.sum():.1%} | {error:.2f} m | {elapsed:.0f} ms"
+    )
 
 
 def main() -> None:
@@ -146,7 +164,10 @@ def show(seeds: list[int]) -> None:
     for case in study.few(CASES, 2):
         taken = [scan for seed in seeds for scan in scans(case, seed)]
         height = case.mounts[0][2]
-        rows = (rate([m(p, height) for p, _ in taken], [truth for _, truth in taken], height) for m in methods.values())
+        rows = (
+            rate([m(p, height) for p, _ in taken], [truth for _, truth in taken], height)
+            for m in methods.values()
+        )
         print(f"| {case.name} | {' | '.join(rows)} |", flush=True)
         clock(case.name)
 

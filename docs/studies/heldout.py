@@ -1,7 +1,9 @@
-"""Held-out rays under several rules: `python docs/studies/heldout.py` prints the table of the page of `carlasc validate`.
+"""Held-out rays under several rules: `python docs/studies/heldout.py` prints the table of the page
+of `carlasc validate`.
 
-Five drives of each world of `movers.py` (town, street and railed; 32 channels), of which every 15th scan of the frames 30 to 74 is left out. `--drives FOLDER ...`
-takes other drives: folders of sequences with scans and poses. The scores of all drives are added. `--res 0.2` makes finer grids.
+Five drives of each world of `movers.py` (town, street and railed; 32 channels), of which every 15th
+scan of the frames 30 to 74 is left out. `--drives FOLDER ...` takes other drives: folders of
+sequences with scans and poses. The scores of all drives are added. `--res 0.2` makes finer grids.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ from movers_rows import EVIDENCE, ROWS
 from carlasc import GridSpec, Run
 from carlasc.inspection import HeldOutScores, holdout
 
-RULES = {row.name: row.observe for row in ROWS if row.name in ("tube", "current", "align, instances")}
+RULES = {
+    row.name: row.observe for row in ROWS if row.name in ("tube", "current", "align, instances")
+}
 RULES |= {"align, evidence": EVIDENCE}
 
 
@@ -24,17 +28,28 @@ def main() -> None:
     """Print the table."""
     parser = study.options(__doc__, SEEDS)
     parser.add_argument("--drives", nargs="+", type=Path)
-    parser.add_argument("--res", type=float, help="size of a voxel, metres; default: the published grid")
+    parser.add_argument(
+        "--res", type=float, help="size of a voxel, metres; default: the published grid"
+    )
     with study.begin(parser) as given:
-        spec = GridSpec.published() if given.res is None else GridSpec.published().with_resolution(given.res)
-        drives = given.drives or [record(*d, [32], given.work)[0].folder for d in study.drives(given, SEEDS)]
+        spec = (
+            GridSpec.published()
+            if given.res is None
+            else GridSpec.published().with_resolution(given.res)
+        )
+        drives = given.drives or [
+            record(*d, [32], given.work)[0].folder for d in study.drives(given, SEEDS)
+        ]
         print(
-            "| rule | free | of Vehicle | passed objects | of Vehicle | 90% of errors | swept |\n|---|---:|---:|---:|---:|---:|---:|"
+            "| rule | free | of Vehicle | passed objects | of Vehicle | 90% of errors | swept "
+            "|\n|---|---:|---:|---:|---:|---:|---:|"
         )
         every, frames = (3, None) if study.is_tiny() else (15, (30, 75))
         for rule, observe in RULES.items():
             results = [
-                holdout(drive, spec, observe=observe, every=every, frames=frames, run=Run(workers=1)).total
+                holdout(
+                    drive, spec, observe=observe, every=every, frames=frames, run=Run(workers=1)
+                ).total
                 for drive in drives
             ]
             scores = reduce(HeldOutScores.merge, [found for found in results if found])

@@ -1,8 +1,11 @@
-"""Ground truth of a converted SemanticKITTI drive, with and without ghost trails: `python docs/studies/kitti.py`.
+"""Ground truth of a converted SemanticKITTI drive, with and without ghost trails: `python
+docs/studies/kitti.py`.
 
-A simulated drive in heavy traffic is written as SemanticKITTI's files (right-handed, camera poses, moving classes, instances, no flow) and converted, and
-each rule's grids are scored against what 60 other sensors see at the same instant. `tube` is the rule by which SemanticKITTI's own voxels
-were made. Prints the table, and draws docs/images/kitti.png: one scene by both rules beside the reference.
+A simulated drive in heavy traffic is written as SemanticKITTI's files (right-handed, camera poses,
+moving classes, instances, no flow) and converted, and each rule's grids are scored against what 60
+other sensors see at the same instant. `tube` is the rule by which SemanticKITTI's own voxels were
+made. Prints the table, and draws docs/images/kitti.png: one scene by both rules beside the
+reference.
 """
 
 from __future__ import annotations
@@ -34,7 +37,8 @@ SEED, FRAMES, JUDGED = 1, range(101), (10, 30, 50, 70, 90)
 GRIDS = {"coarse": GridSpec.published(), "0.2 m": GridSpec.published().with_resolution(0.2)}
 CLASSES = ("Vehicle", "Pedestrian", "Road", "Building", "Sidewalk")
 VEHICLE = CARLA.id_of("Vehicle")
-RUNS: dict[str, tuple[Dynamic, FlowSource]] = {  # name: rule for what moves, and whether the converter estimates flow
+# name: rule for what moves, and whether the converter estimates flow
+RUNS: dict[str, tuple[Dynamic, FlowSource]] = {
     "tube": ("tube", "none"),
     "align, by instances": ("align", "none"),
     "align, by instances and their estimated flow": ("align", "auto"),
@@ -50,7 +54,10 @@ def reference(drive: TownDrive, frame: int) -> dict[str, Grid]:
     """Return what 60 sensors see at the instant of a frame, in each grid of the ego sensor."""
     grid_T_world = invert(drive.sensor_poses(frame, 1)[0])
     seen = drive.reference_observations(frame, 2 if study.is_tiny() else 60)
-    observations = [Observation(r.scan.points, study.labels_of(r.scan), grid_T_world @ r.world_T_sensor) for r in seen]
+    observations = [
+        Observation(r.scan.points, study.labels_of(r.scan), grid_T_world @ r.world_T_sensor)
+        for r in seen
+    ]
     return {name: count_votes(observations, spec).to_grid() for name, spec in GRIDS.items()}
 
 
@@ -78,7 +85,9 @@ def row(name: str, run: str, total: TruthScore) -> str:
     cells = [f"{matrix.iou[CARLA.id_of(label)]:.3f}" for label in CLASSES]
     return (
         f"| {name} | {run} | "
-        + " | ".join([*cells, f"{matrix.recall[VEHICLE]:.2f}", str(matrix.false_positives[VEHICLE])])
+        + " | ".join(
+            [*cells, f"{matrix.recall[VEHICLE]:.2f}", str(matrix.false_positives[VEHICLE])]
+        )
         + " |"
     )
 
@@ -96,7 +105,14 @@ def main() -> None:
         flows: tuple[FlowSource, ...] = ("none", "auto")
         for flow in flows:
             layout = LayoutOptions("carla", flow=flow)
-            convert("kitti", given.work / "in", given.work / flow, layout=layout, grids=None, run=Run(workers=1))
+            convert(
+                "kitti",
+                given.work / "in",
+                given.work / flow,
+                layout=layout,
+                grids=None,
+                run=Run(workers=1),
+            )
         clock("conversion")
         truths = {frame: reference(drive, frame) for frame in judged()}
         clock("reference")
@@ -106,7 +122,8 @@ def main() -> None:
             for run, (rule, flow) in RUNS.items():
                 made[run] = make(given.work / flow, rule, name)
                 scores = (
-                    score_truth(grid, truths[frame][name], CARLA.num_channels) for frame, grid in made[run].items()
+                    score_truth(grid, truths[frame][name], CARLA.num_channels)
+                    for frame, grid in made[run].items()
                 )
                 print(row(name, run, reduce(add, scores)), flush=True)
                 clock(f"{run}, {name}")
@@ -118,14 +135,19 @@ def draw(made: dict[str, dict[int, Grid]], truths: dict[int, Grid], path: Path) 
     """Draw the frame with the longest tubes: tube, align and reference side by side."""
     tubes = made["tube"]
     frame = max(
-        tubes, key=lambda f: int(score_truth(tubes[f], truths[f], CARLA.num_channels).matrix.false_positives[VEHICLE])
+        tubes,
+        key=lambda f: int(
+            score_truth(tubes[f], truths[f], CARLA.num_channels).matrix.false_positives[VEHICLE]
+        ),
     )
     grids = {
         "SemanticKITTI's rule (tube)": tubes[frame],
         "carlasc convert (align)": made["align, by instances"][frame],
         "reference: 60 sensors at that instant": truths[frame],
     }
-    panels = [Panel(grid_drawing(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()]
+    panels = [
+        Panel(grid_drawing(grid, ClassColors(CARLA)), title=title) for title, grid in grids.items()
+    ]
     picture = Image.fromarray(draw_panels(panels, size=(1800, 640)))
     picture.quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
 

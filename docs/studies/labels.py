@@ -1,9 +1,11 @@
-"""What wrong labels do to ground truth from scans: `python docs/studies/labels.py [WORK]` prints the tables of docs/studies/wrong-labels.md as rows finish.
+"""What wrong labels do to ground truth from scans: `python docs/studies/labels.py [WORK]` prints
+the tables of docs/studies/wrong-labels.md as rows finish.
 
-The labels of the drives of `movers.py` are made wrong in several ways, and their grids are compared with what 40 other sensors saw at the same instant.
-The last row has right labels, but voxels with returns of the frame's own scan may be free: it says what the rule of own returns costs.
-WORK keeps drives and references, as that of `movers.py` does.
-`--hint evidence` takes nothing but free space for what moves, instead of the exact flow.
+The labels of the drives of `movers.py` are made wrong in several ways, and their grids are compared
+with what 40 other sensors saw at the same instant. The last row has right labels, but voxels with
+returns of the frame's own scan may be free: it says what the rule of own returns costs. WORK keeps
+drives and references, as that of `movers.py` does. `--hint evidence` takes nothing but free space
+for what moves, instead of the exact flow.
 """
 
 from __future__ import annotations
@@ -81,7 +83,9 @@ class Score:
         self.shares: list[NDArray[np.float64]] = []
         self.grids: dict[int, Grid] = {}
 
-    def add(self, grid: Grid, seen: Reference, shares: NDArray[np.void], drive: Recorded, frame: int) -> None:
+    def add(
+        self, grid: Grid, seen: Reference, shares: NDArray[np.void], drive: Recorded, frame: int
+    ) -> None:
         """Count a frame."""
         self.grids[frame] = grid
         made, truth, both = grid.labels, seen.labels, seen.judged & grid.known
@@ -103,7 +107,9 @@ class Score:
             self.returns[index] += (made.reshape(-1)[voxels[own]] > 0).sum(), own.sum()
 
     def figures(self) -> dict[str, float]:
-        """Return IoUs, the share of occupied voxels of the right class, the calibration error of the class, and the share of own returns that are occupied."""
+        """Return IoUs, the share of occupied voxels of the right class, the calibration error of
+        the class, and the share of own returns that are occupied.
+        """
         hit, own, found = self.classes.T
         likely, right = np.concatenate(self.shares, axis=1)
         bins = np.array_split(np.argsort(likely, kind="stable"), 15)
@@ -127,13 +133,17 @@ def with_labels(drive: Recorded, case: str) -> Sequence:
         return drive.sequence
 
     def labels(frame: int) -> Labels:
-        points = transform_points(drive.sequence.read_pose(frame), drive.sequence.scan(frame, ()).points)
+        points = transform_points(
+            drive.sequence.read_pose(frame), drive.sequence.scan(frame, ()).points
+        )
         return change(drive.sequence.read("labels", frame), points, frame)
 
     return Changed(drive.sequence, labels=labels)
 
 
-def judge(drive: Recorded, references: dict[int, Reference], case: str, observe: FromScans) -> Score:
+def judge(
+    drive: Recorded, references: dict[int, Reference], case: str, observe: FromScans
+) -> Score:
     """Make and count the judged frames of a drive."""
     plan = GridPlan(GRIDS["coarse"], "grid", observe, Voting(keep_evidence=True), FrameRange())
     feed, score = ScanFeed(with_labels(drive, case), observe), Score()
@@ -141,13 +151,19 @@ def judge(drive: Recorded, references: dict[int, Reference], case: str, observe:
     for frame, seen in references.items():
         with patch.object(_FrameSteps, "keep_returns") if case == MAY_BE_FREE else nullcontext():
             merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
-        shares = merged.evidence.classes if merged.evidence else class_shares(merged.votes.occupied, CARLA)
+        shares = (
+            merged.evidence.classes
+            if merged.evidence
+            else class_shares(merged.votes.occupied, CARLA)
+        )
         score.add(merged.grid, seen, shares, drive, frame)
     return score
 
 
 def kept(scores: dict[str, Score], references: dict[int, Reference]) -> NDArray[np.int64]:
-    """Count the judged voxels that only the rule of own returns makes occupied, and those of them that other sensors call free."""
+    """Count the judged voxels that only the rule of own returns makes occupied, and those of them
+    that other sensors call free.
+    """
     counts = np.zeros(2, np.int64)
     for frame, seen in references.items():
         full, may_be_free = (scores[case].grids[frame].labels > 0 for case in (RIGHT, MAY_BE_FREE))
@@ -166,19 +182,33 @@ def main() -> None:
         observe = FLOW if given.hint == "flow" else EVIDENCE
         for kind, seed in study.drives(given, SEEDS):
             (drive,) = record(kind, seed, [32], given.work)
-            seen = {frame: one for (grid, frame), one in reference(kind, seed, given.work).items() if grid == "coarse"}
+            seen = {
+                frame: one
+                for (grid, frame), one in reference(kind, seed, given.work).items()
+                if grid == "coarse"
+            }
             scores = {case: judge(drive, seen, case, observe) for case in CASES}
             by_rule += kept(scores, seen)
             for case, score in scores.items():
                 found[case].append(score.figures())
-                print(kind, seed, case, " ".join(f"{k} {v:.3f}" for k, v in found[case][-1].items()), flush=True)
+                print(
+                    kind,
+                    seed,
+                    case,
+                    " ".join(f"{k} {v:.3f}" for k, v in found[case][-1].items()),
+                    flush=True,
+                )
     names = list(found[RIGHT][0])
     print(f"\n| labels | {' | '.join(names)} |\n|---|{'---:|' * len(names)}")
     for case, rows in found.items():
-        print(f"| {case} | {' | '.join(f'{np.mean([row[name] for row in rows]):.3f}' for name in names)} |")
+        print(
+            f"| {case} | "
+            f"{' | '.join(f'{np.mean([row[name] for row in rows]):.3f}' for name in names)} |"
+        )
     voxels, free = by_rule.tolist()
     print(
-        f"\nVoxels that only the rule of own returns makes occupied: {voxels}; other sensors call {free / max(voxels, 1):.0%} of them free."
+        f"\nVoxels that only the rule of own returns makes occupied: {voxels}; other sensors call "
+        f"{free / max(voxels, 1):.0%} of them free."
     )
 
 

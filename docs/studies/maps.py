@@ -1,13 +1,20 @@
-"""Are maps of drives clean? `python docs/studies/maps.py [WORK]` prints SA, DA and AA of maps by `carlasc map`, and of other programs.
+"""Are maps of drives clean?
 
-`--draw MAP.npz` draws such a map instead: docs/images/map.png and map_all.png are drives of the street with `--motion flow` and `none`.
+`python docs/studies/maps.py [WORK]` prints SA, DA and AA of maps by `carlasc map`, and of other
+programs.
 
-The measures are those of DynamicMap_Benchmark (Q. Zhang et al., ITSC 2023), by points: SA is the share of the static points within 5 cm of a point of
-the map, DA the share of the dynamic ones without such a point, AA the square root of their product. A point is dynamic if its actor
-moves faster than 1 m/s at any time of the drive. Drives are those of `movers.py`: WORK keeps them, and results; the default is a temporary folder.
+`--draw MAP.npz` draws such a map instead: docs/images/map.png and map_all.png are drives of the
+street with `--motion flow` and `none`.
 
-The rows of other programs need `pip install dufomap dynamic-object-removal` (DUFOMap: Python 3.12 or older); rows without them are left out.
-The row of dynamic-object-removal takes five minutes of CPU time per drive, the others less than one.
+The measures are those of DynamicMap_Benchmark (Q. Zhang et al., ITSC 2023), by points: SA is the
+share of the static points within 5 cm of a point of the map, DA the share of the dynamic ones
+without such a point, AA the square root of their product. A point is dynamic if its actor moves
+faster than 1 m/s at any time of the drive. Drives are those of `movers.py`: WORK keeps them, and
+results; the default is a temporary folder.
+
+The rows of other programs need `pip install dufomap dynamic-object-removal` (DUFOMap: Python 3.12
+or older); rows without them are left out. The row of dynamic-object-removal takes five minutes of
+CPU time per drive, the others less than one.
 """
 
 from __future__ import annotations
@@ -52,7 +59,9 @@ class MapRow:
     motion: MotionOptions
     change: Callable[[Recorded], Sequence] = lambda drive: drive.sequence
     needs: str = ""
-    clean: Callable[[NDArray[np.float32], Recorded], NDArray[np.float32]] = lambda points, drive: points
+    clean: Callable[[NDArray[np.float32], Recorded], NDArray[np.float32]] = lambda points, drive: (
+        points
+    )
 
 
 def without(drive: Recorded, kept: Keep) -> Sequence:
@@ -67,11 +76,15 @@ def dynamic_points(drive: Recorded) -> Keep:
     for frame in frames:
         fast = np.linalg.norm(sequence.read("flow", frame), axis=1) > MOVES_M_S
         moving |= set(np.unique(sequence.read("instances", frame)[fast]).tolist())
-    return {frame: np.isin(sequence.read("instances", frame), sorted(moving - {0})) for frame in frames}
+    return {
+        frame: np.isin(sequence.read("instances", frame), sorted(moving - {0})) for frame in frames
+    }
 
 
 def by_dynamic_object_removal(points: NDArray[np.float32], drive: Recorded) -> NDArray[np.float32]:
-    """Return the points of a map that the package's best method (`fusion`) keeps, with its own settings."""
+    """Return the points of a map that the package's best method (`fusion`) keeps, with its own
+    settings.
+    """
     from dynamic_object_removal import clean_map_by_fusion  # noqa: PLC0415 (pip install dynamic-object-removal)
 
     scans = []
@@ -86,13 +99,19 @@ def by_dynamic_object_removal(points: NDArray[np.float32], drive: Recorded) -> N
 ROWS = (
     MapRow("all points", MotionOptions("none"), lambda drive: Only(drive.sequence, BARE)),
     MapRow(
-        "exact labels", MotionOptions("none"), lambda d: without(d, {f: ~own for f, own in dynamic_points(d).items()})
+        "exact labels",
+        MotionOptions("none"),
+        lambda d: without(d, {f: ~own for f, own in dynamic_points(d).items()}),
     ),
     MapRow("carlasc, flow", MotionOptions("flow")),
     MapRow("carlasc, exact boxes", MotionOptions("boxes")),
     MapRow("carlasc, boxes", MotionOptions("boxes"), lambda drive: noisy_boxes(drive, 0)),
     MapRow("carlasc, nothing", MotionOptions("evidence")),
-    MapRow("carlasc, nothing, no labels", MotionOptions("evidence"), lambda drive: Only(drive.sequence, BARE)),
+    MapRow(
+        "carlasc, nothing, no labels",
+        MotionOptions("evidence"),
+        lambda drive: Only(drive.sequence, BARE),
+    ),
     MapRow("DUFOMap", MotionOptions("none"), lambda d: without(d, find_static(d)), "dufomap"),
     MapRow(
         "dynamic-object-removal",
@@ -110,7 +129,15 @@ def measure(row: MapRow, drive: Recorded, dynamic: Keep, folder: Path) -> dict[s
 
     start, out = time.perf_counter(), folder / "map.npz"
     source = ChosenSequences(row.name, {"": row.change(drive)})
-    carlasc.map(source, out, cell_m=CELL_M, motion=row.motion, poses=POSES, overwrite=True, run=Run(workers=1))
+    carlasc.map(
+        source,
+        out,
+        cell_m=CELL_M,
+        motion=row.motion,
+        poses=POSES,
+        overwrite=True,
+        run=Run(workers=1),
+    )
     tree = cKDTree(row.clean(np.load(out)["points"], drive))
     seconds = time.perf_counter() - start
     near: dict[bool, list[int]] = {False: [0, 0], True: [0, 0]}
@@ -122,20 +149,30 @@ def measure(row: MapRow, drive: Recorded, dynamic: Keep, folder: Path) -> dict[s
             near[kind][0] += int(found[moves == kind].sum())
             near[kind][1] += int((moves == kind).sum())
     static, moved = (found / count for found, count in near.values())
-    return {"SA": static, "DA": 1 - moved, "AA": float(np.sqrt(static * (1 - moved))), "seconds": seconds}
+    return {
+        "SA": static,
+        "DA": 1 - moved,
+        "AA": float(np.sqrt(static * (1 - moved))),
+        "seconds": seconds,
+    }
 
 
 def to_markdown(found: dict[str, list[dict[str, Any]]]) -> str:
     """Return the table: means over drives with their intervals, in percent."""
     lines = ["| map | SA | DA | AA |", "|---|---:|---:|---:|"]
     for name, drives in found.items():
-        cells = (study.interval((100 * drive[key] for drive in drives), ".2f") for key in ("SA", "DA", "AA"))
+        cells = (
+            study.interval((100 * drive[key] for drive in drives), ".2f")
+            for key in ("SA", "DA", "AA")
+        )
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def draw(path: Path, out: Path) -> None:
-    """Draw the points near the middle of a map, the nearer ones over the others, with a little shade by height."""
+    """Draw the points near the middle of a map, the nearer ones over the others, with a little
+    shade by height.
+    """
     with np.load(path) as made:
         points, labels = made["points"].astype(np.float64), made["label"]
     points = points - np.median(points, axis=0)
@@ -162,13 +199,19 @@ def draw(path: Path, out: Path) -> None:
 def main() -> None:
     """Measure all rows, and print the table."""
     parser = study.options(__doc__, SEEDS)
-    parser.add_argument("--rows", nargs="+", default=[row.name for row in ROWS], help="only these rows")
+    parser.add_argument(
+        "--rows", nargs="+", default=[row.name for row in ROWS], help="only these rows"
+    )
     parser.add_argument("--draw", type=Path, help="a map")
     with study.begin(parser) as given:
         if given.draw:
             draw(given.draw, given.draw.with_suffix(".png"))
             return
-        rows = [row for row in ROWS if (not row.needs or find_spec(row.needs)) and row.name in given.rows]
+        rows = [
+            row
+            for row in ROWS
+            if (not row.needs or find_spec(row.needs)) and row.name in given.rows
+        ]
         found: dict[str, list[dict[str, Any]]] = {row.name: [] for row in rows}
         for kind, seed in study.drives(given, SEEDS):
             (drive,) = record(kind, seed, [CHANNELS], given.work)

@@ -1,10 +1,14 @@
-"""Is ground truth from scans true where things move? `python docs/studies/movers.py [WORK]` prints rows as they finish, and writes the tables.
+"""Is ground truth from scans true where things move?
 
-Simulated drives in which everything moves, through a town and along a street, are recorded by one LiDAR each. Their ground truth is made in many ways and
-compared with what 40 other sensors saw at the same instant. WORK keeps drives, references and counts, and a run continues there; the counts of
+`python docs/studies/movers.py [WORK]` prints rows as they finish, and writes the tables.
+
+Simulated drives in which everything moves, through a town and along a street, are recorded by one
+LiDAR each. Their ground truth is made in many ways and compared with what 40 other sensors saw at
+the same instant. WORK keeps drives, references and counts, and a run continues there; the counts of
 code that has changed must be removed (WORK/whole/scores). The default is a temporary folder.
 
-The rows with DUFOMap need the extra `study` (Python 3.12 or older). SA, DA and AA of maps, those of other programs too: `maps.py`.
+The rows with DUFOMap need the extra `study` (Python 3.12 or older). SA, DA and AA of maps, those of
+other programs too: `maps.py`.
 """
 
 from __future__ import annotations
@@ -74,7 +78,9 @@ class Task:
 def tasks_of(given: argparse.Namespace) -> list[Task]:
     """Return what is to be done."""
     work: Path = given.work
-    every, basic, ablations, parked = (tuple(row.name for row in rows) for rows in (ROWS, BASIC, ABLATIONS, PARKED))
+    every, basic, ablations, parked = (
+        tuple(row.name for row in rows) for rows in (ROWS, BASIC, ABLATIONS, PARKED)
+    )
     if given.parked:
         return [Task(Setting("parked", seed, 64), tuple(GRIDS), parked, work) for seed in (1, 2, 3)]
     if study.is_tiny():
@@ -88,7 +94,11 @@ def tasks_of(given: argparse.Namespace) -> list[Task]:
 
     parts = {
         "rules": each(32, "coarse", every),
-        "lidars": [*each(16, "coarse", basic), *each(64, "coarse", basic), *each(32, "0.2 m", basic)],
+        "lidars": [
+            *each(16, "coarse", basic),
+            *each(64, "coarse", basic),
+            *each(32, "0.2 m", basic),
+        ],
         "errors": each(32, "coarse", (*UNCHANGED, *ablations)),
         "held out": [replace(task, held_out=True) for task in each(32, "coarse", HELD_OUT)],
     }
@@ -119,8 +129,15 @@ def plain(name: str) -> str:
 
 
 def run(task: Task) -> None:
-    """Do a task, and print a line for each row that was made; rows that were made before are left out."""
-    missing = [(BY_NAME[row], grid) for row in task.rows for grid in task.grids if not task.path(row, grid).exists()]
+    """Do a task, and print a line for each row that was made; rows that were made before are left
+    out.
+    """
+    missing = [
+        (BY_NAME[row], grid)
+        for row in task.rows
+        for grid in task.grids
+        if not task.path(row, grid).exists()
+    ]
     if not missing:
         return
     setting = task.setting
@@ -130,7 +147,12 @@ def run(task: Task) -> None:
         start = time.perf_counter()
         if task.held_out:
             scores = holdout(
-                drive.folder, GRIDS[grid], observe=row.observe, every=15, frames=(30, 61), run=Run(workers=1)
+                drive.folder,
+                GRIDS[grid],
+                observe=row.observe,
+                every=15,
+                frames=(30, 61),
+                run=Run(workers=1),
             )
             result = scores.to_dict()["total"]
             line = f"{setting} {grid} {row.name}: held-out rays"
@@ -148,23 +170,39 @@ def run(task: Task) -> None:
 def summary(counts: Counts) -> str:
     """Return some figures in a line."""
     found = figures(counts)
-    shown = ("Vehicle IoU", "Pedestrian IoU", "Vehicle found", "Vehicle free", "Road IoU", "Building IoU", "seconds")
+    shown = (
+        "Vehicle IoU",
+        "Pedestrian IoU",
+        "Vehicle found",
+        "Vehicle free",
+        "Road IoU",
+        "Building IoU",
+        "seconds",
+    )
     values = ", ".join(f"{name} {found[name]:.3f}" for name in shown)
     return f"{values}, wrongly Vehicle {found['wrongly Vehicle']:.0f}"
 
 
-def judge(drive: Recorded, row: Row, grid: str, references: dict[int, Reference], store: ActorStore) -> Counts:
+def judge(
+    drive: Recorded, row: Row, grid: str, references: dict[int, Reference], store: ActorStore
+) -> Counts:
     """Make the judged frames of a drive in one way, and count what is right."""
     total = []
     for frame, merged, seconds in make(drive, row, grid, references, store):
         posterior = None if merged.evidence is None else merged.evidence.occupied
-        grid_made = as_seen(merged.grid, references[frame]) if row.name == UNLABELLED else merged.grid
-        total.append(count(grid_made, references[frame], drive.sides(frame, WINDOW), posterior, seconds))
+        grid_made = (
+            as_seen(merged.grid, references[frame]) if row.name == UNLABELLED else merged.grid
+        )
+        total.append(
+            count(grid_made, references[frame], drive.sides(frame, WINDOW), posterior, seconds)
+        )
     return reduce(add, total)
 
 
 def as_seen(grid: Grid, seen: Reference) -> Grid:
-    """Return a grid without classes with those of the reference: only what is occupied is judged then."""
+    """Return a grid without classes with those of the reference: only what is occupied is judged
+    then.
+    """
     classes = np.where(seen.labels > 0, seen.labels, CARLA.geometry_id)
     return Grid(grid.spec, np.where(grid.labels > 0, classes, 0), grid.counts)
 
@@ -172,8 +210,16 @@ def as_seen(grid: Grid, seen: Reference) -> Grid:
 def make(
     drive: Recorded, row: Row, grid: str, frames: Iterable[int], store: ActorStore
 ) -> Iterator[tuple[int, MergedFrame, float]]:
-    """Yield the frames of a drive that are made in one way, each with the time that it took in seconds."""
-    plan = GridPlan(GRIDS[grid], "grid", row.observe, Voting(keep_evidence=row.observe.dynamic != "tube"), FrameRange())
+    """Yield the frames of a drive that are made in one way, each with the time that it took in
+    seconds.
+    """
+    plan = GridPlan(
+        GRIDS[grid],
+        "grid",
+        row.observe,
+        Voting(keep_evidence=row.observe.dynamic != "tube"),
+        FrameRange(),
+    )
     feed = None
     for frame in frames:
         if feed is None or row.by_frame:
@@ -213,15 +259,27 @@ def held_out(tasks: Iterable[Task]) -> dict[str, list[dict[str, Any]]]:
 def main() -> None:
     """Do all tasks, and write the tables."""
     parser = study.options(__doc__, SEEDS)
-    parser.add_argument("--parked", action="store_true", help="seeds 1 to 3 with parked cars, which are judged too")
-    parser.add_argument("--part", choices=PARTS, action="append", help="only this part of the page; may be repeated")
-    parser.add_argument("--tables", action="store_true", help="only write the tables of what WORK has")
+    parser.add_argument(
+        "--parked", action="store_true", help="seeds 1 to 3 with parked cars, which are judged too"
+    )
+    parser.add_argument(
+        "--part", choices=PARTS, action="append", help="only this part of the page; may be repeated"
+    )
+    parser.add_argument(
+        "--tables", action="store_true", help="only write the tables of what WORK has"
+    )
     parser.add_argument("--workers", type=int, default=2)
     with study.begin(parser) as given:
         tasks = tasks_of(given)
         if not given.tables:
             study.do_all(run, tasks, given.workers)
-        print(write_tables(tables(tasks), held_out(tasks), given.work / ("parked" if given.parked else "movers")))
+        print(
+            write_tables(
+                tables(tasks),
+                held_out(tasks),
+                given.work / ("parked" if given.parked else "movers"),
+            )
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""The drives of `movers.py`, recorded once, and what other sensors saw at the judged frames: both are kept in a folder."""
+"""The drives of `movers.py`, recorded once, and what other sensors saw at the judged frames: both
+are kept in a folder.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,25 @@ from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes
 from carlasc.storage import FolderSink, Sequence, layout
 
-SEEDS = {"town": range(61, 66), "street": range(261, 266), "railed": range(361, 366)}  # constants were chosen on others
+# constants were chosen on others
+SEEDS = {
+    "town": range(61, 66),
+    "street": range(261, 266),
+    "railed": range(361, 366),
+}
 POINTS = {16: 29_000, 32: 65_000, 64: 130_000}  # rays per scan by channels
 GRIDS = {"coarse": GridSpec.published(), "0.2 m": GridSpec.published().with_resolution(0.2)}
 VEHICLE = CARLA.id_of("Vehicle")
 MOVES_M_S = 1.0  # faster actors are movers; the voxels of the others are not judged
-SIGHTINGS = "sightings.npy"  # frame, actor, points, sensor and half the size (3 each, metres, frame of the box) per actor and scan
+# frame, actor, points, sensor and half the size (3 each, metres, frame of the box) per actor and
+# scan
+SIGHTINGS = "sightings.npy"
 _GROW_M = 0.4  # voxels this close to an actor's box may hold a part of it
-_FACE_SINE, _FACE_POINTS = 0.26, 12  # a side is seen from 15 degrees or more, by scans with so many points on the actor
+# a side is seen from 15 degrees or more, by scans with so many points on the actor
+_FACE_SINE, _FACE_POINTS = (
+    0.26,
+    12,
+)
 
 
 @dataclass(frozen=True)
@@ -70,7 +83,9 @@ KINDS = {
     "town": Kind(_town_without_parked_cars, 91, tuple(range(30, 61, 5)), 3, 40),
     "street": Kind(StreetDrive, 91, (30, 45, 60), 3, 40),
     "railed": Kind(RailedDrive, 91, (30, 45, 60), 3, 40),
-    "parked": Kind(_town, 101, tuple(int(f) for f in np.linspace(0, 100, 10)), 10, 60, movers_only=False),
+    "parked": Kind(
+        _town, 101, tuple(int(f) for f in np.linspace(0, 100, 10)), 10, 60, movers_only=False
+    ),
 }
 
 
@@ -108,7 +123,8 @@ class Reference:
 
     Attributes:
         labels: (X, Y, Z) class of each voxel.
-        judged: (X, Y, Z) bool, the voxels that are known and whose actor, if they belong to one, moves.
+        judged: (X, Y, Z) bool, the voxels that are known and whose actor, if they belong to one,
+            moves.
         owner: (X, Y, Z) uint16, number of the actor that a voxel may belong to; 0 is none.
         speeds: speed of each actor in m/s.
     """
@@ -149,12 +165,17 @@ class Recorded:
 
 
 def record(kind: str, seed: int, channels: Iterable[int], work: Path) -> list[Recorded]:
-    """Record a drive with everything that tells what moves, once for each LiDAR; those that were recorded before are opened."""
+    """Record a drive with everything that tells what moves, once for each LiDAR; those that were
+    recorded before are opened.
+    """
     settings = {count: Setting(kind, seed, count) for count in channels}
     folders = {count: work / "drives" / str(setting) for count, setting in settings.items()}
     missing = {count: folder for count, folder in folders.items() if not folder.exists()}
     if missing:
-        unfinished = {count: folder.with_name(f"{folder.name}.{os.getpid()}") for count, folder in missing.items()}
+        unfinished = {
+            count: folder.with_name(f"{folder.name}.{os.getpid()}")
+            for count, folder in missing.items()
+        }
         for folder in unfinished.values():
             shutil.rmtree(folder, ignore_errors=True)
         _write(kind, seed, unfinished)
@@ -174,12 +195,15 @@ def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
     lidars = {channels: lidar_of(channels) for channels in folders}
     drive = kind_of(kind).make(seed, Lidar())
     poses = np.stack([drive.sensor_poses(frame, 1)[0] for frame in range(frames)])
-    writers = {channels: FolderSink(folder).sequence("cartesian") for channels, folder in folders.items()}
+    writers = {
+        channels: FolderSink(folder).sequence("cartesian") for channels, folder in folders.items()
+    }
     sightings: dict[int, list[NDArray[np.float64]]] = {channels: [] for channels in folders}
     for writer in writers.values():
         writer.write_document(layout.POSES, layout.encode_poses(relative_to(poses[0], poses)))
         writer.write_document(
-            layout.TIMES, layout.encode_times(np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S)
+            layout.TIMES,
+            layout.encode_times(np.arange(frames, dtype=np.float64) * layout.FRAME_PERIOD_S),
         )
     for frame in range(frames):
         snapshot = drive.snapshot(frame)
@@ -188,7 +212,9 @@ def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
             recording = scan_snapshot(snapshot, poses[frame], lidars[channels], noise)
             scan = recording.scan
             assert scan.instances is not None
-            writer.write("points", frame, np.column_stack([scan.points, np.zeros(len(scan), np.float32)]))
+            writer.write(
+                "points", frame, np.column_stack([scan.points, np.zeros(len(scan), np.float32)])
+            )
             writer.write("labels", frame, labels_of(scan))
             writer.write("instances", frame, scan.instances)
             writer.write("flow", frame, recording.flow())
@@ -197,20 +223,26 @@ def _write(kind: str, seed: int, folders: dict[int, Path]) -> None:
             writer.write("boxes", frame, boxes.to_table())
             sensors = np.array([invert(pose)[:3, 3] for pose in boxes.sensor_T_box]).reshape(-1, 3)
             at = np.full(len(numbers), frame)
-            sightings[channels].append(np.column_stack([at, numbers, points, sensors, boxes.sizes / 2]))
+            sightings[channels].append(
+                np.column_stack([at, numbers, points, sensors, boxes.sizes / 2])
+            )
     for channels, folder in folders.items():
         np.save(folder / SIGHTINGS, np.concatenate(sightings[channels]))
 
 
 def boxes_of(actors: list[TownActor], world_T_sensor: Transform) -> Boxes:
-    """Return the tight boxes of actors in the frame of a sensor; their tracks are the actors' numbers."""
+    """Return the tight boxes of actors in the frame of a sensor; their tracks are the actors'
+    numbers.
+    """
     poses, sizes = np.zeros((len(actors), 4, 4)), np.zeros((len(actors), 3))
     for row, actor in enumerate(actors):
         lower, upper = actor.mesh.vertices.min(axis=0), actor.mesh.vertices.max(axis=0)
         poses[row] = invert(world_T_sensor) @ actor.world_T_actor @ translation((lower + upper) / 2)
         sizes[row] = upper - lower
     labels = np.array([label_of(actor) for actor in actors], np.uint32)
-    return Boxes.from_poses(np.array([actor.id for actor in actors], np.uint32), labels, poses, sizes)
+    return Boxes.from_poses(
+        np.array([actor.id for actor in actors], np.uint32), labels, poses, sizes
+    )
 
 
 def label_of(actor: TownActor) -> int:
@@ -231,9 +263,13 @@ def reference(kind: str, seed: int, work: Path) -> dict[tuple[str, int], Referen
     for frame in kept["frames"].tolist():
         speeds = {int(actor): float(speed) for actor, speed in kept[f"{frame} speeds"]}
         for grid in GRIDS:
-            labels, known, owner = (kept[f"{frame} {grid} {name}"] for name in ("labels", "known", "owner"))
+            labels, known, owner = (
+                kept[f"{frame} {grid} {name}"] for name in ("labels", "known", "owner")
+            )
             if KINDS[kind].movers_only:
-                known = known & ~np.isin(owner, [actor for actor, speed in speeds.items() if speed <= MOVES_M_S])
+                known = known & ~np.isin(
+                    owner, [actor for actor, speed in speeds.items() if speed <= MOVES_M_S]
+                )
             found[grid, frame] = Reference(labels, known, owner, speeds)
     return found
 
@@ -256,7 +292,10 @@ def _see(name: str, seed: int) -> dict[str, NDArray[Any]]:
         arrays[f"{frame} speeds"] = np.array(speeds, np.float64).reshape(-1, 2)
         for size, spec in GRIDS.items():
             grid = count_votes(seen, spec).to_grid()
-            arrays[f"{frame} {size} labels"], arrays[f"{frame} {size} known"] = grid.labels, grid.known
+            arrays[f"{frame} {size} labels"], arrays[f"{frame} {size} known"] = (
+                grid.labels,
+                grid.known,
+            )
             arrays[f"{frame} {size} owner"] = _owners(actors, invert(pose), spec)
     return arrays
 
@@ -266,8 +305,14 @@ def choose_frames(drive: TownDrive, kind: Kind) -> list[int]:
     counts = []
     for frame in kind.candidates:
         here = drive.sensor_poses(frame, 1)[0]
-        moving = [a for a in drive.actors(frame) if np.linalg.norm(a.velocity) > MOVES_M_S and label_of(a) == VEHICLE]
-        places = np.array([actor.world_T_actor[:3, 3] for actor in moving if actor.id != EGO_ID]).reshape(-1, 3)
+        moving = [
+            a
+            for a in drive.actors(frame)
+            if np.linalg.norm(a.velocity) > MOVES_M_S and label_of(a) == VEHICLE
+        ]
+        places = np.array(
+            [actor.world_T_actor[:3, 3] for actor in moving if actor.id != EGO_ID]
+        ).reshape(-1, 3)
         near = np.abs(transform_points(invert(here), places)[:, :2]) < REFERENCE_OFFSET_M
         counts.append(int(near.all(axis=1).sum()))
     best = np.argsort(-np.array(counts), kind="stable")[: kind.judged]
@@ -277,8 +322,15 @@ def choose_frames(drive: TownDrive, kind: Kind) -> list[int]:
 def _owners(actors: list[TownActor], grid_T_world: Transform, spec: GridSpec) -> NDArray[np.uint16]:
     """Return the actor that each voxel may belong to; the smaller one where boxes overlap."""
     owner = np.zeros(spec.num_voxels, np.uint16)
-    centers = np.indices(spec.size).reshape(3, -1).T * spec.voxel_size + spec.lower + np.array(spec.voxel_size) / 2
-    bounds = {a.id: (a.mesh.vertices.min(axis=0) - _GROW_M, a.mesh.vertices.max(axis=0) + _GROW_M) for a in actors}
+    centers = (
+        np.indices(spec.size).reshape(3, -1).T * spec.voxel_size
+        + spec.lower
+        + np.array(spec.voxel_size) / 2
+    )
+    bounds = {
+        a.id: (a.mesh.vertices.min(axis=0) - _GROW_M, a.mesh.vertices.max(axis=0) + _GROW_M)
+        for a in actors
+    }
     for actor in sorted(actors, key=lambda a: -float(np.prod(bounds[a.id][1] - bounds[a.id][0]))):
         lower, upper = bounds[actor.id]
         actor_T_grid = invert(actor.world_T_actor) @ invert(grid_T_world)

@@ -1,4 +1,6 @@
-"""The rows of `movers.py`: the ways in which ground truth is made, and how what they are given is changed."""
+"""The rows of `movers.py`: the ways in which ground truth is made, and how what they are given is
+changed.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ class Changed(Sequence):
         boxes: Mapping[int, Boxes] | None = None,
     ) -> None:
         self._sequence, self._keep, self._boxes = sequence, keep, boxes
-        self._made = {name: made for name, made in (("instances", instances), ("labels", labels)) if made}
+        self._made = {
+            name: made for name, made in (("instances", instances), ("labels", labels)) if made
+        }
         self.path, self.location, self.split = sequence.path, sequence.location, sequence.split
         self.name, self.coordinates = sequence.name, sequence.coordinates
 
@@ -61,8 +65,14 @@ class Changed(Sequence):
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one field of one frame."""
         if field == "boxes":
-            return self._sequence.read(field, frame) if self._boxes is None else self._boxes[frame].to_table()
-        values: NDArray[Any] = self._made[field](frame) if field in self._made else self._sequence.read(field, frame)
+            return (
+                self._sequence.read(field, frame)
+                if self._boxes is None
+                else self._boxes[frame].to_table()
+            )
+        values: NDArray[Any] = (
+            self._made[field](frame) if field in self._made else self._sequence.read(field, frame)
+        )
         return values if self._keep is None else values[self._keep(frame)]
 
     def documents(self) -> tuple[str, ...]:
@@ -136,7 +146,9 @@ def noisy_boxes(drive: Recorded, frame: int) -> Sequence:
             continue
         poses = exact.sensor_T_box.copy()
         poses[:, :3, 3] += rng.normal(0, 0.1, (len(poses), 3))
-        poses = poses @ np.array([rotation_z(a) for a in rng.normal(0, np.radians(1), len(poses))]).reshape(-1, 4, 4)
+        poses = poses @ np.array(
+            [rotation_z(a) for a in rng.normal(0, np.radians(1), len(poses))]
+        ).reshape(-1, 4, 4)
         boxes[number] = Boxes.from_poses(exact.tracks, exact.labels, poses, exact.sizes)
     return Changed(drive.sequence, boxes=boxes)
 
@@ -159,7 +171,9 @@ def wrong_ids(drive: Recorded, frame: int) -> Sequence:
 
 @dataclass(frozen=True)
 class NoisyPoses:
-    """Poses that are off by some metres (standard deviation, each axis) and degrees (about each axis) in every frame."""
+    """Poses that are off by some metres (standard deviation, each axis) and degrees (about each
+    axis) in every frame.
+    """
 
     metres: float
     degrees: float
@@ -180,7 +194,10 @@ def _turned(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     for axis, angle in enumerate(angles):
         other = [i for i in range(3) if i != axis]
         step = np.eye(3)
-        step[np.ix_(other, other)] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        step[np.ix_(other, other)] = [
+            [np.cos(angle), -np.sin(angle)],
+            [np.sin(angle), np.cos(angle)],
+        ]
         turn = turn @ step
     return turn
 
@@ -207,7 +224,9 @@ def without_what_dufomap_finds(drive: Recorded, frame: int) -> Sequence:
 
 
 def find_static(drive: Recorded) -> dict[int, NDArray[np.bool_]]:
-    """Return which points of each scan DUFOMap calls static, with the parameters of its paper; the result is kept beside the drive."""
+    """Return which points of each scan DUFOMap calls static, with the parameters of its paper; the
+    result is kept beside the drive.
+    """
     path = drive.folder / "dufomap.npz"
     frames = drive.sequence.frames("points").tolist()
     if not path.exists():
@@ -220,7 +239,10 @@ def find_static(drive: Recorded) -> dict[int, NDArray[np.bool_]]:
         for f in frames:
             finder.run(scans[f], poses[f], cloud_transform=True)
         finder.oncePropagateCluster(if_cluster=True, if_propagate=True)
-        static = {str(f): np.asarray(finder.segment(scans[f], poses[f], cloud_transform=True)) == 0 for f in frames}
+        static = {
+            str(f): np.asarray(finder.segment(scans[f], poses[f], cloud_transform=True)) == 0
+            for f in frames
+        }
         np.savez_compressed(path, **static)
     kept = np.load(path)
     return {f: kept[str(f)] for f in frames}
@@ -279,7 +301,10 @@ ABLATIONS = (
     ),
     Row("instances, 10 % wrong ids", _merging(motion=MotionOptions("instances")), wrong_ids),
 )
-"""What is changed one at a time, at 32 channels on the coarse grid. The window is 30 frames elsewhere."""
+"""What is changed one at a time, at 32 channels on the coarse grid.
+
+The window is 30 frames elsewhere.
+"""
 BASIC = tuple(
     row
     for row in ROWS
@@ -287,5 +312,7 @@ BASIC = tuple(
     or (row.observe.dynamic == "align" and "complete" not in row.name and "exact" not in row.name)
 )
 """The rows with other LiDARs, and on the finer grid."""
-PARKED = tuple(row for row in ROWS if row.name in ("tube", "current", "align, flow", "align, instances"))
+PARKED = tuple(
+    row for row in ROWS if row.name in ("tube", "current", "align, flow", "align, instances")
+)
 """The rows of the drives with parked cars."""

@@ -1,4 +1,6 @@
-"""What `movers.py` measures of a grid, as counts that can be added, and the figures that follow from them."""
+"""What `movers.py` measures of a grid, as counts that can be added, and the figures that follow
+from them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,17 @@ GROUPS = ("free", *CLASSES, "other classes")  # of what a voxel is called
 SPEEDS_M_S = (MOVES_M_S, 4.0, 8.0, np.inf)  # bands of the speed of vehicles
 _BINS = 200  # of the posterior, before they are joined to bins of equal mass
 _MASSES = 15
-RELIABILITY = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)  # bounds of the bins of the reliability diagram
+# bounds of the bins of the reliability diagram
+RELIABILITY = (
+    0.0,
+    0.05,
+    0.2,
+    0.4,
+    0.6,
+    0.8,
+    0.95,
+    1.0,
+)
 MARGIN = 0.05  # voxels with a posterior between it and 1 - MARGIN are the uncertain ones
 
 
@@ -28,19 +40,25 @@ class Counts:
     """What was counted in some grids, beside references.
 
     Attributes:
-        classes: by class: voxels known to both of the right class, of the class in the reference, of the class in the grid; then all of the
-            class in the reference, those of them that are called free, and those that are unknown.
+        classes: by class: voxels known to both of the right class, of the class in the reference,
+            of the class in the grid; then all of the class in the reference, those of them that are
+            called free, and those that are unknown.
         occupied: voxels known to both that are wrongly occupied, and those that are wrongly free.
-        movers: class, speed, sides seen, voxels of the reference, those found and those called free, of each mover in each frame.
-        posterior: (G, 3, bins): voxels, sum of their posterior and number of the occupied ones, by `GROUPS` and posterior; zeros without
-            evidence.
+        movers: class, speed, sides seen, voxels of the reference, those found and those called
+            free, of each mover in each frame.
+        posterior: (G, 3, bins): voxels, sum of their posterior and number of the occupied ones, by
+            `GROUPS` and posterior; zeros without evidence.
         seconds: time for each grid.
     """
 
-    classes: NDArray[np.int64] = field(default_factory=lambda: np.zeros((len(CLASSES), 6), np.int64))
+    classes: NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros((len(CLASSES), 6), np.int64)
+    )
     occupied: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, np.int64))
     movers: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
-    posterior: NDArray[np.float64] = field(default_factory=lambda: np.zeros((len(GROUPS), 3, _BINS)))
+    posterior: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros((len(GROUPS), 3, _BINS))
+    )
     seconds: list[float] = field(default_factory=list)
 
     def __add__(self, other: Counts) -> Counts:
@@ -54,7 +72,10 @@ class Counts:
 
     def to_json(self) -> dict[str, Any]:
         """Return the counts as plain values."""
-        return {name: value if isinstance(value, list) else value.tolist() for name, value in vars(self).items()}
+        return {
+            name: value if isinstance(value, list) else value.tolist()
+            for name, value in vars(self).items()
+        }
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Counts:
@@ -121,7 +142,9 @@ def _movers(grid: Grid, reference: Reference, sides: Mapping[int, int]) -> NDArr
             found, free = own & known & (labels == CLASSES[name]), own & known & (labels == 0)
             speed = reference.speeds[actor]
             if speed > MOVES_M_S:
-                rows.append([CLASSES[name], speed, sides.get(actor, 0), own.sum(), found.sum(), free.sum()])
+                rows.append(
+                    [CLASSES[name], speed, sides.get(actor, 0), own.sum(), found.sum(), free.sum()]
+                )
     return np.array(rows, np.float64).reshape(-1, 6)
 
 
@@ -136,12 +159,20 @@ def _calibration(
         return np.zeros((len(GROUPS), 3, _BINS))
     group = np.full(256, len(GROUPS) - 1)
     group[[0, *CLASSES.values()]] = np.arange(len(GROUPS) - 1)
-    groups, values, occupied = group[made[both]], posterior[both].astype(np.float64), truth[both] != 0
-    return np.stack([histogram(values[groups == g], occupied[groups == g]) for g in range(len(GROUPS))])
+    groups, values, occupied = (
+        group[made[both]],
+        posterior[both].astype(np.float64),
+        truth[both] != 0,
+    )
+    return np.stack(
+        [histogram(values[groups == g], occupied[groups == g]) for g in range(len(GROUPS))]
+    )
 
 
 def histogram(posterior: NDArray[np.floating], occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return (3, bins) rows of `Counts.posterior` of (V,) voxels: their probability of being occupied, and whether they are."""
+    """Return (3, bins) rows of `Counts.posterior` of (V,) voxels: their probability of being
+    occupied, and whether they are.
+    """
     bins = np.clip((posterior * _BINS).astype(np.int64), 0, _BINS - 1)
     weights = (np.ones(len(bins)), posterior.astype(np.float64), occupied.astype(np.float64))
     return np.stack([np.bincount(bins, weight, _BINS) for weight in weights])
@@ -160,15 +191,22 @@ def calibration_error(histogram: NDArray[np.float64], margin: float = 0.0) -> fl
     total = chosen[0].sum()
     if not total:
         return float("nan")
-    mass = np.minimum(((np.cumsum(chosen[0]) - chosen[0] / 2) / total * _MASSES).astype(np.int64), _MASSES - 1)
+    mass = np.minimum(
+        ((np.cumsum(chosen[0]) - chosen[0] / 2) / total * _MASSES).astype(np.int64), _MASSES - 1
+    )
     gaps = np.bincount(mass, chosen[1] - chosen[2], _MASSES)
     return float(np.abs(gaps).sum() / total)
 
 
 def figures(counts: Counts) -> dict[str, float]:
-    """Return the figures of some grids, NaN where nothing was counted. Shares are between 0 and 1, `wrongly` counts per grid."""
+    """Return the figures of some grids, NaN where nothing was counted.
+
+    Shares are between 0 and 1, `wrongly` counts per grid.
+    """
     found: dict[str, float] = {}
-    for name, (right, known, made, whole, free, _) in zip(CLASSES, counts.classes.tolist(), strict=True):
+    for name, (right, known, made, whole, free, _) in zip(
+        CLASSES, counts.classes.tolist(), strict=True
+    ):
         found[f"{name} IoU"] = _ratio(right, known + made - right)
         found[f"{name} IoU, all"] = _ratio(right, whole + made - right)
         found[f"{name} recall"] = _ratio(right, known)
@@ -182,19 +220,26 @@ def figures(counts: Counts) -> dict[str, float]:
 
 
 def reliability(counts: Counts) -> list[tuple[float, float, int, float, float]]:
-    """Return the bins of a reliability diagram: bounds of the posterior, voxels, their mean posterior and the share that is occupied."""
+    """Return the bins of a reliability diagram: bounds of the posterior, voxels, their mean
+    posterior and the share that is occupied.
+    """
     voxels, posterior, occupied = counts.posterior.sum(axis=0)
     bounds = (np.array(RELIABILITY) * _BINS).round().astype(int)
     rows = []
     for first, last in pairwise(bounds.tolist()):
         count = int(voxels[first:last].sum())
-        means = _ratio(posterior[first:last].sum(), count), _ratio(occupied[first:last].sum(), count)
+        means = (
+            _ratio(posterior[first:last].sum(), count),
+            _ratio(occupied[first:last].sum(), count),
+        )
         rows.append((first / _BINS, last / _BINS, count, *means))
     return rows
 
 
 def groups(counts: Counts) -> dict[str, tuple[float, float, int]]:
-    """Return the share found and the share called free of the voxels of movers, and their number, by group."""
+    """Return the share found and the share called free of the voxels of movers, and their number,
+    by group.
+    """
     label, speed, sides = counts.movers[:, 0], counts.movers[:, 1], counts.movers[:, 2]
     vehicle = label == CLASSES["Vehicle"]
     chosen = {"people": ~vehicle}
@@ -202,7 +247,9 @@ def groups(counts: Counts) -> dict[str, tuple[float, float, int]]:
         name = f"{low:g} to {high:g} m/s" if np.isfinite(high) else f"over {low:g} m/s"
         chosen[f"vehicles, {name}"] = vehicle & (speed > low) & (speed <= high)
     for number in range(5):
-        chosen[f"vehicles, {number} side{'s' if number != 1 else ''} seen"] = vehicle & (sides == number)
+        chosen[f"vehicles, {number} side{'s' if number != 1 else ''} seen"] = vehicle & (
+            sides == number
+        )
     result = {}
     for name, rows in chosen.items():
         voxels, found, free = counts.movers[rows, 3:].sum(axis=0).tolist()

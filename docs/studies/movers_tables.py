@@ -28,7 +28,14 @@ COLUMNS = (  # heading, figure, number of decimals
     ("ECE", "ECE", 3),
     ("ECE, uncertain", "ECE, uncertain", 3),
 )
-_WITHOUT_CLASSES = ("Vehicle found", "Vehicle free", "wrongly occupied", "ECE", "ECE, uncertain")  # found is occupied
+# found is occupied
+_WITHOUT_CLASSES = (
+    "Vehicle found",
+    "Vehicle free",
+    "wrongly occupied",
+    "ECE",
+    "ECE, uncertain",
+)
 FEWEST = 5  # drives of which a standard deviation is shown
 _RATIOS = ("wrongly Vehicle", "wrongly occupied")  # shown beside that of `tube`
 
@@ -51,7 +58,9 @@ class Table:
             row: {drive: counts for drive, counts in drives.items() if drive.startswith(kind)}
             for row, drives in self.rows.items()
         }
-        return Table(f"{self.title}, {kind}", {row: drives for row, drives in rows.items() if drives})
+        return Table(
+            f"{self.title}, {kind}", {row: drives for row, drives in rows.items() if drives}
+        )
 
     @property
     def drives(self) -> list[str]:
@@ -75,7 +84,9 @@ class Table:
                 spread = f" ± {deviation:.{decimals}f}" if len(self.drives) >= FEWEST else ""
                 cell = f"{mean:.{decimals}f}{spread}" if is_shown else ""
                 if is_shown and figure in _RATIOS and row != "tube" and tube:
-                    cell = f"{mean:.0f} (1/{tube[figure] / mean:.0f})" if mean >= 1 else f"{mean:.0f}"
+                    cell = (
+                        f"{mean:.0f} (1/{tube[figure] / mean:.0f})" if mean >= 1 else f"{mean:.0f}"
+                    )
                 cells.append(cell)
             missing = len(self.drives) - len(self.rows[row])
             note = f" ({len(self.rows[row])} drives)" if missing else ""
@@ -83,13 +94,18 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def movers_to_markdown(self, rows: Iterable[str]) -> str:
-        """Return the table of what was found of movers, by speed and by sides seen, over all drives."""
+        """Return the table of what was found of movers, by speed and by sides seen, over all
+        drives.
+        """
         chosen = {row: groups(reduce(add, self.rows[row].values())) for row in rows}
         if not chosen:
             return ""
         names = [name for name, (_, _, voxels) in next(iter(chosen.values())).items() if voxels]
         lines = [f"{self.title}: share found / called free:", ""]
-        lines += ["| movers | voxels | " + " | ".join(chosen) + " |", "|---|" + "---:|" * (1 + len(chosen))]
+        lines += [
+            "| movers | voxels | " + " | ".join(chosen) + " |",
+            "|---|" + "---:|" * (1 + len(chosen)),
+        ]
         for name in names:
             cells = [f"{found[name][0]:.2f} / {found[name][1]:.2f}" for found in chosen.values()]
             voxels = next(iter(chosen.values()))[name][2]
@@ -97,22 +113,32 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def calibration_to_markdown(self, row: str) -> str:
-        """Return the reliability diagram of a row as a table, and the calibration error by what a voxel is called."""
+        """Return the reliability diagram of a row as a table, and the calibration error by what a
+        voxel is called.
+        """
         counts = reduce(add, self.rows[row].values())
-        lines = [f"{self.title}, {row}: calibration:", "", "| posterior | voxels | mean posterior | share occupied |"]
+        lines = [
+            f"{self.title}, {row}: calibration:",
+            "",
+            "| posterior | voxels | mean posterior | share occupied |",
+        ]
         lines += ["|---|---:|---:|---:|"]
         for first, last, voxels, posterior, occupied in reliability(counts):
             lines.append(f"| {first:g} to {last:g} | {voxels} | {posterior:.3f} | {occupied:.3f} |")
         lines += ["", "| called | voxels | ECE |", "|---|---:|---:|"]
         for name, histogram in zip(GROUPS, counts.posterior, strict=True):
-            lines.append(f"| {name} | {int(histogram[0].sum())} | {calibration_error(histogram):.3f} |")
+            lines.append(
+                f"| {name} | {int(histogram[0].sum())} | {calibration_error(histogram):.3f} |"
+            )
         return "\n".join(lines) + "\n"
 
     def to_json(self) -> dict[str, object]:
         """Return the figures of every row and drive as plain values."""
         return {
             "title": self.title,
-            "rows": {row: {d: figures(c) for d, c in drives.items()} for row, drives in self.rows.items()},
+            "rows": {
+                row: {d: figures(c) for d, c in drives.items()} for row, drives in self.rows.items()
+            },
         }
 
     def mean(self, row: str, figure: str) -> tuple[float, float]:
@@ -121,24 +147,44 @@ class Table:
 
     def _values(self, row: str) -> dict[str, list[float]]:
         found = [figures(counts) for counts in self.rows[row].values()]
-        return {name: [values[name] for values in found if not np.isnan(values[name])] for name in found[0]}
+        return {
+            name: [values[name] for values in found if not np.isnan(values[name])]
+            for name in found[0]
+        }
 
     def _means(self, row: str) -> dict[str, float]:
-        return {name: float(np.mean(v)) if v else float("nan") for name, v in self._values(row).items()}
+        return {
+            name: float(np.mean(v)) if v else float("nan") for name, v in self._values(row).items()
+        }
 
     def _deviations(self, row: str) -> dict[str, float]:
-        return {name: float(np.std(v, ddof=1)) if len(v) > 1 else 0.0 for name, v in self._values(row).items()}
+        return {
+            name: float(np.std(v, ddof=1)) if len(v) > 1 else 0.0
+            for name, v in self._values(row).items()
+        }
 
 
 CALIBRATED = ("align, flow", "align, evidence")
-MOVERS_OF = ("tube", "perfect removal, then tube", "align, flow", "align, boxes", "align, evidence", UNLABELLED)
+MOVERS_OF = (
+    "tube",
+    "perfect removal, then tube",
+    "align, flow",
+    "align, boxes",
+    "align, evidence",
+    UNLABELLED,
+)
 
 
 def lidars_to_markdown(tables: list[Table], figure: str) -> str:
-    """Return one figure of every row that was made with several LiDARs: mean and standard deviation over drives."""
+    """Return one figure of every row that was made with several LiDARs: mean and standard deviation
+    over drives.
+    """
     rows = [row for row in tables[0].rows if sum(row in table.rows for table in tables) > 1]
     lines = [f"{figure}, with other LiDARs:", ""]
-    lines += ["| rule | " + " | ".join(table.title for table in tables) + " |", "|---|" + "---:|" * len(tables)]
+    lines += [
+        "| rule | " + " | ".join(table.title for table in tables) + " |",
+        "|---|" + "---:|" * len(tables),
+    ]
     for row in rows:
         cells = []
         for table in tables:
@@ -149,8 +195,13 @@ def lidars_to_markdown(tables: list[Table], figure: str) -> str:
 
 
 def held_out_to_markdown(scores: dict[str, list[dict[str, Any]]]) -> str:
-    """Return the table of held-out rays, the mean over drives in percent, from the scores of each row and drive."""
-    shares = {"returns in free voxels": "free", "rays through something other than ground": "passed_object"}
+    """Return the table of held-out rays, the mean over drives in percent, from the scores of each
+    row and drive.
+    """
+    shares = {
+        "returns in free voxels": "free",
+        "rays through something other than ground": "passed_object",
+    }
     headings = [*shares, "own path occupied"]
     lines = ["Held-out rays, 32 channels, coarse, in percent:", ""]
     lines += ["| rule | " + " | ".join(headings) + " |", "|---|" + "---:|" * len(headings)]
@@ -173,13 +224,18 @@ def write_tables(tables: list[Table], held_out: dict[str, list[dict[str, Any]]],
             parts.append(table.movers_to_markdown([row for row in MOVERS_OF if row in table.rows]))
             parts += [table.calibration_to_markdown(row) for row in CALIBRATED if row in table.rows]
     if len(tables) > 1:
-        parts += [lidars_to_markdown(tables, name) for name in ("Vehicle IoU", "Pedestrian IoU", "Vehicle free")]
+        parts += [
+            lidars_to_markdown(tables, name)
+            for name in ("Vehicle IoU", "Pedestrian IoU", "Vehicle free")
+        ]
     if held_out:
         parts.append(held_out_to_markdown(held_out))
     text = "\n".join(parts)
     out.parent.mkdir(parents=True, exist_ok=True)
     out.with_suffix(".md").write_text(text)
     out.with_suffix(".json").write_text(
-        json.dumps({"tables": [table.to_json() for table in tables], "held out": held_out}, indent=1)
+        json.dumps(
+            {"tables": [table.to_json() for table in tables], "held out": held_out}, indent=1
+        )
     )
     return text

@@ -1,8 +1,11 @@
-"""Which points move, without labels: `python docs/studies/per_point.py [WORK]` prints the figures of docs/ground-truth.md.
+"""Which points move, without labels: `python docs/studies/per_point.py [WORK]` prints the figures
+of docs/ground-truth.md.
 
-Simulated drives are given as points and poses only, and `carlasc label --from motion` says which points move: those with a velocity above
-0.5 m/s. The truth is the flow of the recording. The IoU is over all points of every fifth scan. The worlds are the town and the street of
-`movers.py`, and the street with rails, fences and hedges of `railed.py`. WORK keeps the drives; the default is a temporary folder.
+Simulated drives are given as points and poses only, and `carlasc label --from motion` says which
+points move: those with a velocity above 0.5 m/s. The truth is the flow of the recording. The IoU is
+over all points of every fifth scan. The worlds are the town and the street of `movers.py`, and the
+street with rails, fences and hedges of `railed.py`. WORK keeps the drives; the default is a
+temporary folder.
 """
 
 from __future__ import annotations
@@ -39,12 +42,22 @@ def main() -> None:
         for kind, seed in study.drives(given, SEEDS):
             (drive,) = record(kind, seed, [32], given.work)
             both, true, found = count(drive)
-            scores = (both / (true + found - both), both / np.maximum(found, 1), both / np.maximum(true, 1))
+            scores = (
+                both / (true + found - both),
+                both / np.maximum(found, 1),
+                both / np.maximum(true, 1),
+            )
             rows.setdefault(kind, []).append(scores)
             print(kind, seed, *(f"{value:.3f}" for value in scores), flush=True)
-    print("\n| world | drives | IoU of moving points | precision | recall |\n|---|---:|---:|---:|---:|")
+    print(
+        "\n| world | drives | IoU of moving points | precision | recall "
+        "|\n|---|---:|---:|---:|---:|"
+    )
     for kind, drives in rows.items():
-        print(f"| {kind} | {len(drives)} | {' | '.join(study.interval(values) for values in np.array(drives).T)} |")
+        print(
+            f"| {kind} | {len(drives)} | "
+            f"{' | '.join(study.interval(values) for values in np.array(drives).T)} |"
+        )
 
 
 if __name__ == "__main__":

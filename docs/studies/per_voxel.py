@@ -1,13 +1,17 @@
-"""Who is in each voxel, and how fast: `python docs/studies/per_voxel.py [WORK]` prints the table of docs/ground-truth.md.
+"""Who is in each voxel, and how fast: `python docs/studies/per_voxel.py [WORK]` prints the table of
+docs/ground-truth.md.
 
-The simulated drives of `movers.py` are merged with the fields that a row names, on the coarse grid, with 32 channels. What 40 sensors saw at
-the same instant is the truth: the class of each voxel, and the actor whose box it is in; how fast it moves there follows from the actor's
-exact poses. Voxels known to both count. WORK keeps the drives; the default is a temporary folder.
+The simulated drives of `movers.py` are merged with the fields that a row names, on the coarse grid,
+with 32 channels. What 40 sensors saw at the same instant is the truth: the class of each voxel, and
+the actor whose box it is in; how fast it moves there follows from the actor's exact poses. Voxels
+known to both count. WORK keeps the drives; the default is a temporary folder.
 
-- PQ: panoptic quality of vehicles and people that move faster than 1 m/s, the mean of both classes; "of the truth" counts what the grid does
-  not know as free.
-- one number: of the movers that half of all scans or more see with 50 points or more, the share that has one number in all of these scans.
-- velocity: mean length of the difference over the voxels that move in both, m/s; beside it the share of the moving voxels that have one.
+- PQ: panoptic quality of vehicles and people that move faster than 1 m/s, the mean of both classes;
+  "of the truth" counts what the grid does not know as free.
+- one number: of the movers that half of all scans or more see with 50 points or more, the share
+  that has one number in all of these scans.
+- velocity: mean length of the difference over the voxels that move in both, m/s; beside it the
+  share of the moving voxels that have one.
 
 The tables are means over the drives of each world, with 95 % intervals by the bootstrap over them.
 """
@@ -54,34 +58,48 @@ def merged_from(drive: Recorded, row: str) -> tuple[Sequence, FromScans]:
     observe = FromScans(own_path=False, motion=MotionOptions(source))  # type: ignore[arg-type]
     if row == "evidence, no labels":
         return Only(drive.sequence, BARE), observe
-    return Only(noisy_boxes(drive, 0) if row == "boxes" else drive.sequence, {source, "points", "labels"}), observe
+    return Only(
+        noisy_boxes(drive, 0) if row == "boxes" else drive.sequence, {source, "points", "labels"}
+    ), observe
 
 
 @dataclass
 class Scores:
     """What is added up over the frames of a drive."""
 
-    both: PanopticQuality = field(default_factory=lambda: PanopticQuality(CARLA.num_channels, THINGS))
-    truth: PanopticQuality = field(default_factory=lambda: PanopticQuality(CARLA.num_channels, THINGS))
+    both: PanopticQuality = field(
+        default_factory=lambda: PanopticQuality(CARLA.num_channels, THINGS)
+    )
+    truth: PanopticQuality = field(
+        default_factory=lambda: PanopticQuality(CARLA.num_channels, THINGS)
+    )
     one: list[bool] = field(default_factory=list)
     errors: list[NDArray[np.float64]] = field(default_factory=list)
     moving: int = 0
 
     def add(
-        self, found: tuple[NDArray[np.integer], NDArray[np.bool_], VoxelActors], seen: Reference, truth: Truth
+        self,
+        found: tuple[NDArray[np.integer], NDArray[np.bool_], VoxelActors],
+        seen: Reference,
+        truth: Truth,
     ) -> None:
         """Add a frame: the classes of the grid, what it knows, and its actors."""
         labels, known, actors = found
         is_mover = np.isin(seen.labels, sorted(THINGS)) & (seen.owner > 0)
         own = np.isin(labels, sorted(THINGS)) & (actors.instance > 0)
-        pair = (np.where(own, labels, 0), actors.instance), (np.where(is_mover, seen.labels, 0), seen.owner)
+        pair = (
+            (np.where(own, labels, 0), actors.instance),
+            (np.where(is_mover, seen.labels, 0), seen.owner),
+        )
         self.both.update(*pair, mask=seen.judged & known)
         self.truth.update(*pair, mask=seen.judged)
         wanted = is_mover & seen.judged & known & (labels > 0)
         velocity = np.full((labels.size, 3), np.nan)
         velocity[actors.velocity["voxel"]] = actors.velocity["velocity"]
         voxels = np.flatnonzero(wanted)
-        errors = np.linalg.norm(velocity[voxels] - truth.velocity(voxels, seen.owner.reshape(-1)[voxels]), axis=1)
+        errors = np.linalg.norm(
+            velocity[voxels] - truth.velocity(voxels, seen.owner.reshape(-1)[voxels]), axis=1
+        )
         self.moving += len(voxels)
         self.errors.append(errors[~np.isnan(errors)])
 
@@ -106,7 +124,8 @@ class Truth:
 
     Attributes:
         spec: the grid.
-        poses: (4, 4) grid_T_actor one frame before and one after, both in the grid of the frame itself, and at the frame, by actor.
+        poses: (4, 4) grid_T_actor one frame before and one after, both in the grid of the frame
+            itself, and at the frame, by actor.
     """
 
     spec: GridSpec
@@ -117,25 +136,39 @@ class Truth:
         """Make the drive again, and take the poses of its actors."""
         made = KINDS[drive.setting.kind].make(drive.setting.seed, Lidar())
         grid_T_world = invert(made.sensor_poses(frame, 1)[0])
-        at = [{a.id: grid_T_world @ a.world_T_actor for a in made.actors(f)} for f in (frame - 1, frame, frame + 1)]
-        return cls(GRIDS["coarse"], {a: (at[0][a], at[1][a], at[2][a]) for a in at[1] if a in at[0] and a in at[2]})
+        at = [
+            {a.id: grid_T_world @ a.world_T_actor for a in made.actors(f)}
+            for f in (frame - 1, frame, frame + 1)
+        ]
+        return cls(
+            GRIDS["coarse"],
+            {a: (at[0][a], at[1][a], at[2][a]) for a in at[1] if a in at[0] and a in at[2]},
+        )
 
-    def velocity(self, voxels: NDArray[np.int64], owners: NDArray[np.integer]) -> NDArray[np.float64]:
+    def velocity(
+        self, voxels: NDArray[np.int64], owners: NDArray[np.integer]
+    ) -> NDArray[np.float64]:
         """Return (N, 3) m/s of the centres of voxels in actors."""
         spec, found = self.spec, np.full((len(voxels), 3), np.nan)
-        centers = np.stack(np.unravel_index(voxels, spec.size), axis=-1) * spec.voxel_size + spec.lower
+        centers = (
+            np.stack(np.unravel_index(voxels, spec.size), axis=-1) * spec.voxel_size + spec.lower
+        )
         centers = centers + np.array(spec.voxel_size) / 2
         for actor in np.unique(owners).tolist():
             if actor in self.poses:
                 before, now, after = self.poses[actor]
                 own = owners == actor
                 local = transform_points(invert(now), centers[own])
-                found[own] = (transform_points(after, local) - transform_points(before, local)) / 0.2
+                found[own] = (
+                    transform_points(after, local) - transform_points(before, local)
+                ) / 0.2
         return found
 
 
 def numbers_seen(drive: Recorded, actors: MovingActors) -> list[bool]:
-    """Return of each mover that is seen throughout whether it has one number in all scans that see it."""
+    """Return of each mover that is seen throughout whether it has one number in all scans that see
+    it.
+    """
     frames = drive.sequence.frames("points").tolist()
     found: dict[int, list[int]] = {}
     speeds: dict[int, float] = {}
@@ -147,10 +180,13 @@ def numbers_seen(drive: Recorded, actors: MovingActors) -> list[bool]:
             own[track.members.get(frame, [])] = actors.numbers[number]
         for owner, count in zip(*np.unique(owners[owners > 0], return_counts=True), strict=True):
             mine = own[owners == owner]
-            speeds[int(owner)] = max(speeds.get(int(owner), 0.0), float(speed[owners == owner].max()))
+            speeds[int(owner)] = max(
+                speeds.get(int(owner), 0.0), float(speed[owners == owner].max())
+            )
             if count >= MANY_POINTS:
                 found.setdefault(int(owner), []).append(int(np.bincount(mine).argmax()))
-    # scans in which nothing shows a mover (it stands, or is hidden) have no number, and are another figure
+    # scans in which nothing shows a mover (it stands, or is hidden) have no number, and are another
+    # figure
     return [
         len(set(seen) - {0}) == 1
         for owner, seen in found.items()
@@ -171,7 +207,8 @@ def score_row(
         merged = merge_frame(plan, feed, actors, frame, feed.reaching(frame, plan.spec))
         assert merged.actors is not None  # the plan keeps them
         labels = merged.grid.labels
-        if row.endswith("no labels"):  # the class is not known: that of the truth, where both are occupied
+        # the class is not known: that of the truth, where both are occupied
+        if row.endswith("no labels"):
             own = np.isin(seen[frame].labels, sorted(THINGS)) | (labels == 0)
             labels = np.where(labels > 0, np.where(own, seen[frame].labels, min(THINGS)), 0)
         score.add((labels, merged.grid.known, merged.actors), seen[frame], truth)
@@ -186,7 +223,11 @@ def main() -> None:
         found: dict[str, dict[str, list[tuple[float, ...]]]] = {}
         for kind, seed in study.drives(given, SEEDS):
             (drive,) = record(kind, seed, [32], given.work)
-            seen = {frame: one for (grid, frame), one in reference(kind, seed, given.work).items() if grid == "coarse"}
+            seen = {
+                frame: one
+                for (grid, frame), one in reference(kind, seed, given.work).items()
+                if grid == "coarse"
+            }
             truths = {frame: Truth.of(drive, frame) for frame in seen}
             for row in given.rows:
                 figures = score_row(drive, row, seen, truths)
@@ -194,10 +235,14 @@ def main() -> None:
                 print(kind, seed, row, *(f"{value:.2f}" for value in figures), flush=True)
     for kind, rows in found.items():
         print(
-            f"\n{kind}:\n\n| from | PQ | people | vehicles | PQ of the truth | one number | velocity, m/s | with velocity |\n|---|---:|---:|---:|---:|---:|---:|---:|"
+            f"\n{kind}:\n\n| from | PQ | people | vehicles | PQ of the truth | one number | "
+            f"velocity, m/s | with velocity |\n|---|---:|---:|---:|---:|---:|---:|---:|"
         )
         for row, drives in rows.items():
-            print(f"| {row} | {' | '.join(study.interval(values) for values in zip(*drives, strict=True))} |")
+            print(
+                f"| {row} | "
+                f"{' | '.join(study.interval(values) for values in zip(*drives, strict=True))} |"
+            )
 
 
 if __name__ == "__main__":

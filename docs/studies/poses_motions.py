@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import invert, multiply
 
 
-def typical_errors(true: NDArray[np.float64], found: NDArray[np.float64], scans: int) -> tuple[float, float]:
+def typical_errors(
+    true: NDArray[np.float64], found: NDArray[np.float64], scans: int
+) -> tuple[float, float]:
     """Return the root mean square error of the motion over some scans.
 
     Args:

@@ -1,4 +1,6 @@
-"""What refining poses does on a real drive, for `poses.py`: KITTI tracking 0000 with poses by KISS-ICP, and with errors added to them."""
+"""What refining poses does on a real drive, for `poses.py`: KITTI tracking 0000 with poses by
+KISS-ICP, and with errors added to them.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,11 @@ GRIDS = {"0.4 m": GridSpec.published(), "0.2 m": GridSpec.published().with_resol
 OBSERVE = FromScans(window=(-30, 30))
 EVERY, FRAMES = 10, (50, 75)  # three scans, with whole windows
 SECOND = 10  # scans
-COLUMNS = ("rays through anything before their return", "through something other than ground", "returns in free voxels")
+COLUMNS = (
+    "rays through anything before their return",
+    "through something other than ground",
+    "returns in free voxels",
+)
 
 
 def print_tables(archive: Path, work: Path, added: Mapping[str, Mapping[str, float]]) -> None:
@@ -45,27 +51,39 @@ def print_tables(archive: Path, work: Path, added: Mapping[str, Mapping[str, flo
         (sequence,) = carlasc.open(folder).sequences().values()
         refined = refine_sequence(ScanFeed(sequence, OBSERVE), run=Run(workers=1))
         without_errors = without_errors or refined
-        before, after = (100 * float(np.nanmean(values)) for values in (refined.before_m, refined.after_m))
+        before, after = (
+            100 * float(np.nanmean(values)) for values in (refined.before_m, refined.after_m)
+        )
         others = show(typical_errors(without_errors.poses, refined.poses, SECOND), 2)
         notes.append(
-            f"{label}: scans disagree by {before:.1f} cm, now {after:.1f}; refined motions of 1 s are {others} from those of KISS-ICP"
+            f"{label}: scans disagree by {before:.1f} cm, now {after:.1f}; refined motions of 1 s "
+            f"are {others} from those of KISS-ICP"
         )
     print(f"\n| poses | {' | '.join(COLUMNS)} | median error |\n|---|---:|---:|---:|---:|")
     print("\n".join([*rows, "", *notes]))
 
 
 def _rows(folder: Path, name: str) -> list[str]:
-    """Return the row of the given poses and that of the refined ones; a cell has the figure of each grid."""
+    """Return the row of the given poses and that of the refined ones; a cell has the figure of each
+    grid.
+    """
     given, refined = [], []
     every, frames = (5, None) if is_tiny() else (EVERY, FRAMES)
     for spec in list(GRIDS.values())[: 1 if is_tiny() else None]:
-        found = holdout(folder, spec, observe=OBSERVE, every=every, frames=frames, run=Run(workers=1))
+        found = holdout(
+            folder, spec, observe=OBSERVE, every=every, frames=frames, run=Run(workers=1)
+        )
         (last,) = found.sequences.values()
         (first,) = found.given_poses.values() or [last]
         given.append(_figures(first))
         refined.append(_figures(last))
-    cells = [[" / ".join(column) for column in zip(*grids, strict=True)] for grids in (given, refined)]
-    return [f"| {row} | {' | '.join(own)} |" for row, own in zip((name, f"{name}, refined"), cells, strict=True)]
+    cells = [
+        [" / ".join(column) for column in zip(*grids, strict=True)] for grids in (given, refined)
+    ]
+    return [
+        f"| {row} | {' | '.join(own)} |"
+        for row, own in zip((name, f"{name}, refined"), cells, strict=True)
+    ]
 
 
 def _figures(scores: HeldOutScores) -> list[str]:

@@ -1,7 +1,9 @@
-"""A street whose edges repeat: rails, crash barriers, fences, hedges, kerbs and rows of posts, the negatives of movers without labels.
+"""A street whose edges repeat: rails, crash barriers, fences, hedges, kerbs and rows of posts, the
+negatives of movers without labels.
 
-What repeats looks the same after a shift along itself, and rays pass its gaps: nothing that stands is harder for a method that looks for
-motion. The road and the movers are those of `street.py`, but only every third mover, so that most of what is seen stands.
+What repeats looks the same after a shift along itself, and rays pass its gaps: nothing that stands
+is harder for a method that looks for motion. The road and the movers are those of `street.py`, but
+only every third mover, so that most of what is seen stands.
 """
 
 from __future__ import annotations
@@ -19,7 +21,11 @@ from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import CARLA
 
 _EVERY = 3  # mover of a street is kept
-_TRAM_Y_M, _TRACK_Y_M = -1.75, 17.0  # middles of the rails in the road, and of the railway beside it
+# middles of the rails in the road, and of the railway beside it
+_TRAM_Y_M, _TRACK_Y_M = (
+    -1.75,
+    17.0,
+)
 _STREAM = 2000  # of random numbers
 
 
@@ -41,10 +47,16 @@ class RailedDrive(StreetDrive):
 
 
 def _add_edges(builder: MeshBuilder, rng: np.random.Generator) -> None:
-    """Add what repeats along the street: pieces with random lengths and gaps in rows beside each other."""
+    """Add what repeats along the street: pieces with random lengths and gaps in rows beside each
+    other.
+    """
     rail, fence, post = (CARLA.id_of(name) for name in ("RailTrack", "Fence", "Pole"))
     length, middle = END_M - START_M, (START_M + END_M) / 2
-    for y in (_TRAM_Y_M - 0.72, _TRAM_Y_M + 0.72):  # they stand out by what wheels leave beside them
+    # they stand out by what wheels leave beside them
+    for y in (
+        _TRAM_Y_M - 0.72,
+        _TRAM_Y_M + 0.72,
+    ):
         builder.boxes(rail, (middle, y, -0.1), (length, 0.08, 0.18))
     sidewalk, land = HALF_ROAD_M + 0.15, HALF_ROAD_M + WALK_M
     builder.add_mesh(furniture.rail_track(length), translation((middle, _TRACK_Y_M, -0.15)))
@@ -62,7 +74,8 @@ def _add_edges(builder: MeshBuilder, rng: np.random.Generator) -> None:
             piece = float(rng.uniform(6.0, 30.0))
             if rng.random() < share:
                 builder.add_mesh(
-                    make(piece), translation((x + piece / 2, y, KERB_M)) @ rotation_z(0.0 if y > 0 else np.pi)
+                    make(piece),
+                    translation((x + piece / 2, y, KERB_M)) @ rotation_z(0.0 if y > 0 else np.pi),
                 )
             x += piece + float(rng.uniform(0.3, 4.0))
     for x in np.arange(START_M, END_M, float(rng.uniform(1.5, 2.5))):
@@ -70,7 +83,9 @@ def _add_edges(builder: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _railing(label: int, length_m: float) -> Mesh:
-    """Return a railing along x with its middle at the origin: thin bars, which most rays pass, between two beams."""
+    """Return a railing along x with its middle at the origin: thin bars, which most rays pass,
+    between two beams.
+    """
     builder = MeshBuilder()
     bars = np.arange(-length_m / 2, length_m / 2, 0.25)
     builder.boxes(label, np.column_stack([bars, 0 * bars, 0 * bars]), (0.03, 0.03, 1.0))

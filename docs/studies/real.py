@@ -1,11 +1,16 @@
-"""Do grids of a real drive hold ghost trails, and which of its actors are found? `python docs/studies/real.py --archive FOLDER` prints the tables.
+"""Do grids of a real drive hold ghost trails, and which of its actors are found?
 
-FOLDER is an unpacked part of KITTI's tracking benchmark: frames 20 to 104 of sequence 0000, with boxes in the camera's view and without poses. Frames
-with whole windows (every fifth of 50 to 74; `--every 1` takes all) are made from scans of a window of 30 frames, with labels by the boxes and without any label,
-and measured by `real_measures.py`. Nothing is left on the disk.
+`python docs/studies/real.py --archive FOLDER` prints the tables.
 
-Without labels, the actors that free space shows are compared with the boxes too: recall is the share of the points in boxes of moving actors that move by
-`carlasc label --from motion`, false motion the share of those in boxes of parked ones. People without boxes walk there, so precision cannot be measured.
+FOLDER is an unpacked part of KITTI's tracking benchmark: frames 20 to 104 of sequence 0000, with
+boxes in the camera's view and without poses. Frames with whole windows (every fifth of 50 to 74;
+`--every 1` takes all) are made from scans of a window of 30 frames, with labels by the boxes and
+without any label, and measured by `real_measures.py`. Nothing is left on the disk.
+
+Without labels, the actors that free space shows are compared with the boxes too: recall is the
+share of the points in boxes of moving actors that move by `carlasc label --from motion`, false
+motion the share of those in boxes of parked ones. People without boxes walk there, so precision
+cannot be measured.
 """
 
 from __future__ import annotations
@@ -41,20 +46,28 @@ RULES = {  # name -> whether labels and boxes are given, what observes
 
 
 def main() -> None:
-    """Write the drive twice, make the grids of each rule, and print what is wrong in them; then, what is found of actors."""
+    """Write the drive twice, make the grids of each rule, and print what is wrong in them; then,
+    what is found of actors.
+    """
     parser = study.options(__doc__)
     parser.add_argument("--archive", type=Path, required=True)
     parser.add_argument("--every", type=int, default=5)
     with study.begin(parser) as given:
         every = given.every
         frames = [30] if study.is_tiny() else list(FRAMES)[::every]
-        drives = {labelled: given.work / ("labels" if labelled else "geometry") for labelled in (True, False)}
+        drives = {
+            labelled: given.work / ("labels" if labelled else "geometry")
+            for labelled in (True, False)
+        }
         poses = find_poses(read_scans(given.archive))
         for labelled, folder in drives.items():
             write_drive(given.archive, folder, labelled=labelled, poses=poses)
         (drive,) = carlasc.open(drives[True]).sequences().values()
         judge, clock = Judge.of(drive, WINDOW), study.Clock()
-        print(f"{len(frames)} frames from {frames[0]}; {len(judge.movers)} labelled movers; in percent")
+        print(
+            f"{len(frames)} frames from {frames[0]}; {len(judge.movers)} labelled movers; in "
+            f"percent"
+        )
         print(f"| rule | {' | '.join(vars(Measures()))} | s per frame |")
         print("|---" * (len(vars(Measures())) + 2) + "|")
         for name, (labelled, observe) in list(RULES.items())[-1 if study.is_tiny() else 0 :]:
@@ -72,7 +85,9 @@ def main() -> None:
 
 
 def found_of(archive: Path, found: Sequence) -> dict[int, NDArray[np.int64]]:
-    """Return how many points are in the boxes of each track, those that move by their velocity first."""
+    """Return how many points are in the boxes of each track, those that move by their velocity
+    first.
+    """
     counts: dict[int, NDArray[np.int64]] = {}
     boxes = read_boxes(archive)
     for frame, scan in read_scans(archive).items():
@@ -84,12 +99,18 @@ def found_of(archive: Path, found: Sequence) -> dict[int, NDArray[np.int64]]:
     return counts
 
 
-def measure_rule(judge: Judge, folder: Path, name: str, frames: list[int], every: int, observe: FromScans) -> Measures:
+def measure_rule(
+    judge: Judge, folder: Path, name: str, frames: list[int], every: int, observe: FromScans
+) -> Measures:
     """Make the grids of a rule in a drive's folder, and return their measures, added up."""
     grid = "".join(letter if letter.isalnum() else "_" for letter in name)
-    ranges = [(frames[0], frames[-1] + 1)] if every == 1 else [(frame, frame + 1) for frame in frames]
+    ranges = (
+        [(frames[0], frames[-1] + 1)] if every == 1 else [(frame, frame + 1) for frame in frames]
+    )
     for chosen in ranges:
-        result = carlasc.regrid(folder, SPEC, name=grid, frames=chosen, observe=observe, run=Run(workers=1))
+        result = carlasc.regrid(
+            folder, SPEC, name=grid, frames=chosen, observe=observe, run=Run(workers=1)
+        )
         if result.failures:
             raise SystemExit("\n".join(map(str, result.failures)))
     (sequence,) = carlasc.open(folder).sequences().values()

@@ -1,7 +1,9 @@
-"""What is wrong in a grid of a real drive: what stays of things that moved on, and what is lost of things that did not.
+"""What is wrong in a grid of a real drive: what stays of things that moved on, and what is lost of
+things that did not.
 
-No dense truth exists for real drives, but the space that something drove through is free at all other times. Volumes are compared with
-grids by their voxels' centres. "World" is the sensor frame of the first scan, as in poses.txt.
+No dense truth exists for real drives, but the space that something drove through is free at all
+other times. Volumes are compared with grids by their voxels' centres. "World" is the sensor frame
+of the first scan, as in poses.txt.
 """
 
 from __future__ import annotations
@@ -18,10 +20,18 @@ from carlasc.motion import tracks_from_boxes
 from carlasc.motion.solving import smooth
 from carlasc.storage import Sequence as Drive
 
-SHRINK_M, FLOOR_M = 0.2, 0.4  # a body's volume: smaller than its box on all sides, and this high above its floor
+# a body's volume: smaller than its box on all sides, and this high above its floor
+SHRINK_M, FLOOR_M = (
+    0.2,
+    0.4,
+)
 GROW_M = 0.3  # what is this close to a body that is there now belongs to it
 HEIGHT_M = 0.3  # structure is higher above the ground
-OWN_LOWER, OWN_UPPER = (-2.2, -0.75, -1.2), (2.2, 0.75, 0.0)  # of the recording vehicle, sensor frame, above the road
+# of the recording vehicle, sensor frame, above the road
+OWN_LOWER, OWN_UPPER = (
+    (-2.2, -0.75, -1.2),
+    (2.2, 0.75, 0.0),
+)
 SENSOR_HEIGHT_M = 1.73
 _FOLLOWER_START, _FOLLOWER_RADIUS_M, _FOLLOWER_SMOOTH_S = (-8.5, 2.0), 2.2, 0.7
 _FOLLOWER_LENGTH_M, _FOLLOWER_HEIGHT_M = 4.0, 1.45
@@ -44,16 +54,28 @@ class Body:
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
 
-    def contains(self, frames: Iterable[int], points: NDArray[np.float64], grow_m: float = 0.0) -> NDArray[np.bool_]:
-        """Return whether (N, 3) points, world, are in the body at one of some frames, grown on all sides."""
+    def contains(
+        self, frames: Iterable[int], points: NDArray[np.float64], grow_m: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Return whether (N, 3) points, world, are in the body at one of some frames, grown on all
+        sides.
+        """
         return self._covers(frames, points, self.lower - grow_m, self.upper + grow_m)
 
     def swept(self, frames: Iterable[int], points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether (N, 3) points, world, are in the inner volume of the body at one of some frames."""
-        return self._covers(frames, points, self.lower + [SHRINK_M, SHRINK_M, FLOOR_M], self.upper - SHRINK_M)
+        """Return whether (N, 3) points, world, are in the inner volume of the body at one of some
+        frames.
+        """
+        return self._covers(
+            frames, points, self.lower + [SHRINK_M, SHRINK_M, FLOOR_M], self.upper - SHRINK_M
+        )
 
     def _covers(
-        self, frames: Iterable[int], points: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
+        self,
+        frames: Iterable[int],
+        points: NDArray[np.float64],
+        lower: NDArray[np.float64],
+        upper: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
         covered = np.zeros(len(points), np.bool_)
         poses = [self.poses[frame] for frame in frames if frame in self.poses]
@@ -65,7 +87,11 @@ class Body:
         nearby = points[candidates]
         for pose in poses:
             near = _between(nearby, pose[:3, 3] - reach, pose[:3, 3] + reach)
-            covered[candidates[near[_between(transform_points(invert(pose), nearby[near]), lower, upper)]]] = True
+            covered[
+                candidates[
+                    near[_between(transform_points(invert(pose), nearby[near]), lower, upper)]
+                ]
+            ] = True
         return covered
 
 
@@ -90,10 +116,13 @@ class Measures:
     """The measures of a frame, or of several that were added.
 
     Attributes:
-        trail: occupied share of the volume that labelled movers swept at other times, without what is there now.
-        own_path: occupied share of the volume that the recording vehicle drove through, without what is there now.
+        trail: occupied share of the volume that labelled movers swept at other times, without what
+            is there now.
+        own_path: occupied share of the volume that the recording vehicle drove through, without
+            what is there now.
         own_path_all: the same with what is there now.
-        lane: occupied share of the volume that the unlabelled follower swept, without what is there now.
+        lane: occupied share of the volume that the unlabelled follower swept, without what is there
+            now.
         kept: share of the frame's own points on structure that are in occupied voxels.
     """
 
@@ -134,7 +163,15 @@ class Judge:
         """Return the judge of a drive that was written by `write_drive` with labels."""
         movers, standing = labelled_bodies(drive)
         own = Body("own", _poses(drive), np.array(OWN_LOWER), np.array(OWN_UPPER))
-        return cls(drive, window, movers, standing, find_follower(drive), own, drive.metadata.min_range_m or 0.0)
+        return cls(
+            drive,
+            window,
+            movers,
+            standing,
+            find_follower(drive),
+            own,
+            drive.metadata.min_range_m or 0.0,
+        )
 
     def measure(self, grid: Grid, frame: int) -> Measures:
         """Return the measures of the grid of a frame."""
@@ -153,10 +190,16 @@ class Judge:
             return Share(int((occupied & volume).sum()), int(volume.sum()))
 
         kept = self._structure(frame, grid, pose)
-        return Measures(share(trail & empty), share(own & empty), share(own), share(lane & empty), kept)
+        return Measures(
+            share(trail & empty), share(own & empty), share(own), share(lane & empty), kept
+        )
 
-    def _occupied_now(self, frame: int, grid: Grid, centers: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return the voxels that a known body is in at the frame itself, or that the frame's own scan has points in."""
+    def _occupied_now(
+        self, frame: int, grid: Grid, centers: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Return the voxels that a known body is in at the frame itself, or that the frame's own
+        scan has points in.
+        """
         now = np.zeros(len(centers), np.bool_)
         for body in (*self.movers, *self.standing, self.follower):
             now |= body.contains([frame], centers, GROW_M)
@@ -182,7 +225,9 @@ class Judge:
 
 
 def labelled_bodies(drive: Drive) -> tuple[tuple[Body, ...], tuple[Body, ...]]:
-    """Return the labelled objects of a drive that move, and those that stand, with the boxes as they were annotated."""
+    """Return the labelled objects of a drive that move, and those that stand, with the boxes as
+    they were annotated.
+    """
     poses = _poses(drive)
     boxes = {frame: found for frame in poses if (found := drive.boxes(frame)) is not None}
     times = {frame: drive.read_time(frame) for frame in poses}
@@ -191,19 +236,30 @@ def labelled_bodies(drive: Drive) -> tuple[tuple[Body, ...], tuple[Body, ...]]:
     movers: list[Body] = []
     standing: list[Body] = []
     for number, is_mover in moves.items():
-        seen = {frame: found.select(found.tracks == number) for frame, found in world.items() if number in found.tracks}
+        seen = {
+            frame: found.select(found.tracks == number)
+            for frame, found in world.items()
+            if number in found.tracks
+        }
         half = np.median([box.sizes[0] for box in seen.values()], axis=0) / 2
-        body = Body(f"track {number}", {frame: box.sensor_T_box[0] for frame, box in seen.items()}, -half, half)
+        body = Body(
+            f"track {number}",
+            {frame: box.sensor_T_box[0] for frame, box in seen.items()},
+            -half,
+            half,
+        )
         (movers if is_mover else standing).append(body)
     return tuple(movers), tuple(standing)
 
 
 def find_follower(drive: Drive) -> Body:
-    """Return the car that follows the recording vehicle outside the camera's view, which has no box.
+    """Return the car that follows the recording vehicle outside the camera's view, which has no
+    box.
 
-    It keeps its distance, so its points are followed from scan to scan in the sensor's frame: in each scan, the mean of the points
-    above the road that are near the mean of the scan before. The means in the world, smoothed, are its path, whose direction is its
-    heading. All points together, moved to the body's frame, show its front and its sides; its rear is hidden.
+    It keeps its distance, so its points are followed from scan to scan in the sensor's frame: in
+    each scan, the mean of the points above the road that are near the mean of the scan before. The
+    means in the world, smoothed, are its path, whose direction is its heading. All points together,
+    moved to the body's frame, show its front and its sides; its rear is hidden.
     """
     poses = _poses(drive)
     frames = sorted(poses)
@@ -224,7 +280,10 @@ def find_follower(drive: Drive) -> Body:
         bodies[frame] = rotation_z(float(np.arctan2(y, x)))
         bodies[frame][:3, 3] = place
     cloud = np.concatenate(
-        [transform_points(invert(bodies[frame]), points) for frame, points in zip(frames, seen, strict=True)]
+        [
+            transform_points(invert(bodies[frame]), points)
+            for frame, points in zip(frames, seen, strict=True)
+        ]
     )
     front, (right, left) = np.quantile(cloud[:, 0], 0.95), np.quantile(cloud[:, 1], (0.02, 0.98))
     lower, upper = (front - _FOLLOWER_LENGTH_M, right, 0.0), (front, left, _FOLLOWER_HEIGHT_M)
@@ -232,7 +291,9 @@ def find_follower(drive: Drive) -> Body:
 
 
 def ground_below(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N,) the height of the ground below (N, 3) points, metres: the lowest points of each cell of 3 m, but outliers."""
+    """Return (N,) the height of the ground below (N, 3) points, metres: the lowest points of each
+    cell of 3 m, but outliers.
+    """
     cells = np.floor(points[:, :2] / _GROUND_CELL_M).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     order = np.lexsort((points[:, 2], cell))
@@ -245,6 +306,8 @@ def _poses(drive: Drive) -> dict[int, Transform]:
     return {frame: drive.read_pose(frame) for frame in drive.scan_frames().tolist()}
 
 
-def _between(points: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.int64]:
+def _between(
+    points: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> NDArray[np.int64]:
     """Return the indices of the (N, 3) points between two corners."""
     return np.flatnonzero(((points > lower) & (points < upper)).all(axis=1))

@@ -1,11 +1,14 @@
-"""A model of large runs: `python docs/studies/scale.py` prints the table of docs/studies/scale.md: time and cost of making grids on a cluster.
+"""A model of large runs: `python docs/studies/scale.py` prints the table of docs/studies/scale.md:
+time and cost of making grids on a cluster.
 
-The model takes figures that were measured on one machine (`Measured`) and prices (`Prices`), and assumes that
+The model takes figures that were measured on one machine (`Measured`) and prices (`Prices`), and
+assumes that
 
 - workers are as fast as the measured core, and do not slow each other down;
-- the object store answers any number of workers up to its limit of requests, and its transfer rate per worker is that of `Measured`;
-- the pass that finds the actors of a sequence runs before its grids, is shared by the workers of the sequence, and keeps
-  `PASS_WORKERS` of them busy at most;
+- the object store answers any number of workers up to its limit of requests, and its transfer rate
+  per worker is that of `Measured`;
+- the pass that finds the actors of a sequence runs before its grids, is shared by the workers of
+  the sequence, and keeps `PASS_WORKERS` of them busy at most;
 - a block of frames is read, made and written by one worker, one step after the other.
 
 It leaves out the time until machines start, and the time that people wait in a queue.
@@ -32,10 +35,12 @@ def _figure(name: str) -> float:
 
 @dataclass(frozen=True)
 class Measured:
-    """What one core does: from docs/figures.json, in proportion to the rays, and from the sections before the model.
+    """What one core does: from docs/figures.json, in proportion to the rays, and from the sections
+    before the model.
 
     Attributes:
-        frame_s: processor time of a frame: scans of 120,000 points, merged with 30 scans before and 30 after it into voxels of 0.2 m.
+        frame_s: processor time of a frame: scans of 120,000 points, merged with 30 scans before and
+            30 after it into voxels of 0.2 m.
         pass_s: processor time of a frame in the pass that finds the actors.
         engine_s: time of the scheduler for a task.
         start_s: loading the compiled code in a worker.
@@ -79,8 +84,10 @@ class Job:
         frames_per_sequence: length of a sequence.
         block: frames that one object of each column holds.
         window: scans around a frame that are merged with it.
-        columns_read: objects of a block that are read: xyz, labels, index and palette of flow, and the counts of each field.
-        columns_written: objects of a block that are written: labels and counts of the grid, each with its counts.
+        columns_read: objects of a block that are read: xyz, labels, index and palette of flow, and
+            the counts of each field.
+        columns_written: objects of a block that are written: labels and counts of the grid, each
+            with its counts.
         requests_s: requests that the object store answers per second.
     """
 
@@ -116,15 +123,19 @@ class Estimate:
     monthly: float
 
 
-def estimate(job: Job, workers: int, measured: Measured = Measured(), prices: Prices = Prices()) -> Estimate:
+def estimate(
+    job: Job, workers: int, measured: Measured = Measured(), prices: Prices = Prices()
+) -> Estimate:
     """Return what a run takes with a number of workers, each one core."""
     blocks = math.ceil(job.frames / job.block)
-    shards = 1 + math.ceil(job.window / job.block)  # of each column, that hold the scans of a block and of its window
-    gets = (
-        blocks * (shards + 1) * job.columns_read * 2
-    )  # the pass reads a block once; each object takes its index and its chunks
+    # of each column, that hold the scans of a block and of its window
+    shards = 1 + math.ceil(job.window / job.block)
+    # the pass reads a block once; each object takes its index and its chunks
+    gets = blocks * (shards + 1) * job.columns_read * 2
     puts = blocks * job.columns_written
-    moved = blocks * (shards + 1) * job.block * measured.read_bytes + job.frames * measured.write_bytes
+    moved = (
+        blocks * (shards + 1) * job.block * measured.read_bytes + job.frames * measured.write_bytes
+    )
     busy = job.frames * (measured.frame_s + measured.pass_s) + moved / measured.transfer_bytes_s
     sequence = job.frames_per_sequence * measured.pass_s / min(PASS_WORKERS, workers)
     limits = {
@@ -134,23 +145,33 @@ def estimate(job: Job, workers: int, measured: Measured = Measured(), prices: Pr
         "one sequence": sequence + job.block * measured.frame_s,
     }
     limit = max(limits, key=lambda name: limits[name])
-    seconds = limits[limit] + measured.start_s + (0 if limit == "one sequence" else sequence if workers > blocks else 0)
+    seconds = (
+        limits[limit]
+        + measured.start_s
+        + (0 if limit == "one sequence" else sequence if workers > blocks else 0)
+    )
     core_hours = seconds * workers / 3600
     dollars = core_hours * prices.core_hour + gets * prices.get + puts * prices.put
-    monthly = job.frames * (measured.read_bytes + measured.write_bytes) / 1e9 * prices.gigabyte_month
+    monthly = (
+        job.frames * (measured.read_bytes + measured.write_bytes) / 1e9 * prices.gigabyte_month
+    )
     return Estimate(seconds / 3600, limit, core_hours, gets, puts, dollars, monthly)
 
 
 def table() -> str:
     """Return the table of the documentation, as Markdown."""
-    rows = ["| frames | workers | time | limited by | core hours | cores and requests | storage a month |"]
+    rows = [
+        "| frames | workers | time | limited by | core hours | cores and requests | storage a "
+        "month |"
+    ]
     rows.append("|---:|---:|---:|---|---:|---:|---:|")
     for frames in (43_200, 432_000):
         for workers in WORKERS:
             found = estimate(replace(Job(), frames=frames), workers)
             hours = f"{found.hours:.1f} h" if found.hours >= 1 else f"{found.hours * 60:.0f} min"
             rows.append(
-                f"| {frames:,} | {workers:,} | {hours} | {found.limit} | {found.core_hours:.0f} | ${found.dollars:.2f} | ${found.monthly:.2f} |"
+                f"| {frames:,} | {workers:,} | {hours} | {found.limit} | {found.core_hours:.0f} | "
+                f"${found.dollars:.2f} | ${found.monthly:.2f} |"
             )
     return "\n".join(rows)
 

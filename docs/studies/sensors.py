@@ -1,8 +1,10 @@
-"""Study: does ground truth improve with more sensors? `python docs/studies/sensors.py` prints the table and draws docs/images/sensors.png.
+"""Study: does ground truth improve with more sensors?
 
-The reference is the grid of 60 additional sensors at the same instant. Accuracy is computed over the voxels that are known in both the
-reference and the grid of one sensor, so that all rows concern the same voxels. Coverage is the share of the reference's known voxels that
-are known in a grid.
+`python docs/studies/sensors.py` prints the table and draws docs/images/sensors.png.
+
+The reference is the grid of 60 additional sensors at the same instant. Accuracy is computed over
+the voxels that are known in both the reference and the grid of one sensor, so that all rows concern
+the same voxels. Coverage is the share of the reference's known voxels that are known in a grid.
 """
 
 from __future__ import annotations
@@ -23,7 +25,10 @@ from carlasc.metrics import TruthScore, score_truth
 
 SENSORS = (1, 5, 10, 20, 40)
 SEEDS, FRAME = {"town": range(101, 106)}, 60
-SPECS = {"0.4 m": GridSpec.published().with_resolution(0.4), "0.2 m": GridSpec.published().with_resolution(0.2)}
+SPECS = {
+    "0.4 m": GridSpec.published().with_resolution(0.4),
+    "0.2 m": GridSpec.published().with_resolution(0.2),
+}
 
 
 def sensors() -> tuple[int, ...]:
@@ -34,7 +39,8 @@ def sensors() -> tuple[int, ...]:
 def vote(recordings: Iterable[SensorRecording], grid_T_world: np.ndarray, spec: GridSpec) -> Grid:
     """Return the grid of several recordings."""
     observations = (
-        Observation(r.scan.points, study.labels_of(r.scan), grid_T_world @ r.world_T_sensor) for r in recordings
+        Observation(r.scan.points, study.labels_of(r.scan), grid_T_world @ r.world_T_sensor)
+        for r in recordings
     )
     return count_votes(observations, spec).to_grid()
 
@@ -53,7 +59,9 @@ def score_scene(seed: int, frame: int) -> dict[tuple[str, int], TruthScore]:
             grid = vote(recordings[:count], grid_T_world, spec)
             same = score_truth(grid, truth, CARLA.num_channels, mask=alone)
             whole = score_truth(grid, truth, CARLA.num_channels)
-            scores[name, count] = TruthScore(same.matrix, whole.known, whole.known_reference, whole.known_both)
+            scores[name, count] = TruthScore(
+                same.matrix, whole.known, whole.known_reference, whole.known_both
+            )
     return scores
 
 
@@ -64,7 +72,11 @@ def main() -> None:
         for seed in study.few(given.town):
             scenes.append(score_scene(seed, FRAME))
             clock(f"scene {seed}")
-        show(scenes, (given.work if study.is_tiny() else Path(__file__).parents[1] / "images") / "sensors.png")
+        show(
+            scenes,
+            (given.work if study.is_tiny() else Path(__file__).parents[1] / "images")
+            / "sensors.png",
+        )
 
 
 def show(scenes: list[dict[tuple[str, int], TruthScore]], picture: Path) -> None:

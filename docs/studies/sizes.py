@@ -1,6 +1,8 @@
-"""How much each set of extras installs: `python docs/studies/sizes.py` prints a row as soon as it is measured.
+"""How much each set of extras installs: `python docs/studies/sizes.py` prints a row as soon as it
+is measured.
 
-Each set is installed from this checkout into an environment of its own, with `-c constraints.txt`, and deleted. torch is the build that pip finds.
+Each set is installed from this checkout into an environment of its own, with `-c constraints.txt`,
+and deleted. torch is the build that pip finds.
 """
 
 from __future__ import annotations
@@ -13,7 +15,18 @@ from pathlib import Path
 import study
 
 ROOT = Path(__file__).parents[2]
-SETS = ("", "demo", "convert", "train", "demo,convert", "demo,train", "zarr,remote", "view", "rerun", "all")
+SETS = (
+    "",
+    "demo",
+    "convert",
+    "train",
+    "demo,convert",
+    "demo,train",
+    "zarr,remote",
+    "view",
+    "rerun",
+    "all",
+)
 
 
 def install(extras: str, folder: Path) -> tuple[float, int, float]:
@@ -23,10 +36,21 @@ def install(extras: str, folder: Path) -> tuple[float, int, float]:
     before = measure(packages)
     start = time.perf_counter()
     wanted = f"{ROOT}[{extras}]" if extras else str(ROOT)
-    command: list[str | Path] = [folder / "bin" / "python", "-m", "pip", "install", "--quiet", "--no-compile"]
+    command: list[str | Path] = [
+        folder / "bin" / "python",
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-compile",
+    ]
     command += ["--no-deps"] if study.is_tiny() else ["--constraint", ROOT / "constraints.txt"]
     subprocess.run([*command, wanted], check=True)
-    return measure(packages) - before, len([*packages.glob("*.dist-info")]) - 1, time.perf_counter() - start
+    return (
+        measure(packages) - before,
+        len([*packages.glob("*.dist-info")]) - 1,
+        time.perf_counter() - start,
+    )
 
 
 def measure(folder: Path) -> float:
@@ -42,7 +66,10 @@ def main() -> None:
     with study.begin(parser) as given:
         for extras in study.few(given.extras):
             size, packages, elapsed_s = install(extras, given.work / (extras or "none"))
-            print(f"| `{extras or '(none)'}` | {size:,.0f} | {packages} | {elapsed_s:.0f} |", flush=True)
+            print(
+                f"| `{extras or '(none)'}` | {size:,.0f} | {packages} | {elapsed_s:.0f} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""A straight street with dense traffic, made of the simulated town's meshes: another world than the town, for `movers.py`.
+"""A straight street with dense traffic, made of the simulated town's meshes: another world than the
+town, for `movers.py`.
 
-The vehicle that records drives in the inner lane, with vehicles ahead of it and behind it in the same lane, which show it one face only. Cars, lorries
-and a bus drive in the lane beside it, cyclists on the edge of the road, others come towards it, and people walk on both sidewalks. All of
+The vehicle that records drives in the inner lane, with vehicles ahead of it and behind it in the
+same lane, which show it one face only. Cars, lorries and a bus drive in the lane beside it,
+cyclists on the edge of the road, others come towards it, and people walk on both sidewalks. All of
 them keep their speed. Nothing is parked.
 """
 
@@ -33,17 +35,19 @@ from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
 
 START_M, END_M = -130.0, 260.0  # of the street along x; the vehicle that records starts at 0
+# middles of the lanes; y is to the right
 EGO_Y_M, BESIDE_Y_M, CYCLIST_Y_M, TOWARDS_Y_M = (
     1.75,
     5.25,
     7.15,
     (-1.75, -5.25),
-)  # middles of the lanes; y is to the right
+)
 HALF_ROAD_M, WALK_M, LAND_M = 7.75, 4.0, 26.0  # half the road, the sidewalk, and the land behind it
 _STREAM = 1000  # of random numbers, beside those of a drive
 _BUS = next(kind for kind in VEHICLE_KINDS if kind.name == "bus")
 _SHARES = np.array([kind.share for kind in VEHICLE_KINDS])
-_NO_STREETS = Streets(np.empty((0, 2)), np.empty((0, 2), np.int64), (), ())  # no network: nothing turns
+# no network: nothing turns
+_NO_STREETS = Streets(np.empty((0, 2)), np.empty((0, 2), np.int64), (), ())
 
 
 @dataclass(frozen=True)
@@ -69,11 +73,15 @@ class Mover:
         way = self.speed * frame * FRAME_PERIOD_S
         sign = -1.0 if self.backwards else 1.0
         height = KERB_M if abs(self.y) > HALF_ROAD_M else 0.0
-        pose = translation((self.x + sign * way, self.y, height)) @ rotation_z(np.pi if self.backwards else 0.0)
+        pose = translation((self.x + sign * way, self.y, height)) @ rotation_z(
+            np.pi if self.backwards else 0.0
+        )
         if isinstance(self.shape, Mesh):
             mesh = self.shape
         else:
-            mesh = pedestrian_mesh(round(self.shape, 1), int((self.x + way) / STRIDE_M * GAIT_PHASES) % GAIT_PHASES)
+            mesh = pedestrian_mesh(
+                round(self.shape, 1), int((self.x + way) / STRIDE_M * GAIT_PHASES) % GAIT_PHASES
+            )
         return TownActor(number, pose, np.array([sign * self.speed, 0.0, 0.0]), mesh)
 
 
@@ -88,18 +96,26 @@ class Traffic(Population):
         places = _queue(rng, behind, EGO_KIND.length_m / 2, (5.0, 10.0), EGO_Y_M, speed)
         self.movers += [Mover(-m.x, m.y, m.speed, m.shape) for m in places]
         beside = [*_kinds(rng, 2), _BUS, *_kinds(rng, 4)]
-        self.movers += _queue(rng, beside, -60.0, (6.0, 18.0), BESIDE_Y_M, speed + float(rng.uniform(-4.0, 4.0)))
+        self.movers += _queue(
+            rng, beside, -60.0, (6.0, 18.0), BESIDE_Y_M, speed + float(rng.uniform(-4.0, 4.0))
+        )
         for y in TOWARDS_Y_M:
-            towards = _queue(rng, _kinds(rng, 12), -45.0, (8.0, 25.0), y, float(rng.uniform(7.0, 12.0)))
+            towards = _queue(
+                rng, _kinds(rng, 12), -45.0, (8.0, 25.0), y, float(rng.uniform(7.0, 12.0))
+            )
             self.movers += [Mover(m.x, m.y, m.speed, m.shape, backwards=True) for m in towards]
         cycling = float(rng.uniform(3.0, 6.0))
         for x in np.arange(-70.0, 90.0, 28.0):
-            self.movers.append(Mover(float(x + rng.uniform(-8.0, 8.0)), CYCLIST_Y_M, cycling, bicycle_mesh()))
+            self.movers.append(
+                Mover(float(x + rng.uniform(-8.0, 8.0)), CYCLIST_Y_M, cycling, bicycle_mesh())
+            )
         for number in range(28):
             side = 1.0 if number % 2 else -1.0
             y = side * (HALF_ROAD_M + 0.6 + 0.22 * (number // 2))
             height, pace = float(rng.uniform(1.55, 1.9)), float(rng.uniform(1.1, 1.7))
-            self.movers.append(Mover(float(rng.uniform(-40.0, 130.0)), y, pace, height, bool(rng.random() < 0.5)))
+            self.movers.append(
+                Mover(float(rng.uniform(-40.0, 130.0)), y, pace, height, bool(rng.random() < 0.5))
+            )
 
     def ego_pose(self, frame: int) -> Transform:
         """Return (4, 4) world_T_ego of a frame."""
@@ -124,7 +140,10 @@ class StreetDrive(TownDrive):
 
 
 def _kinds(rng: np.random.Generator, count: int) -> list[VehicleKind]:
-    return [VEHICLE_KINDS[int(row)] for row in rng.choice(len(VEHICLE_KINDS), count, p=_SHARES / _SHARES.sum())]
+    return [
+        VEHICLE_KINDS[int(row)]
+        for row in rng.choice(len(VEHICLE_KINDS), count, p=_SHARES / _SHARES.sum())
+    ]
 
 
 def _queue(
@@ -135,7 +154,9 @@ def _queue(
     y: float,
     speed: float,
 ) -> list[Mover]:
-    """Return vehicles one after the other towards higher x, with a random gap of metres between them."""
+    """Return vehicles one after the other towards higher x, with a random gap of metres between
+    them.
+    """
     movers, x = [], start
     for kind in kinds:
         x += float(rng.uniform(*gap)) + kind.length_m / 2
@@ -159,19 +180,27 @@ def build_street(rng: np.random.Generator, houses: tuple[float, ...] = (-1.0, 1.
         kerb, inner = side * HALF_ROAD_M, side * (HALF_ROAD_M + WALK_M)
         _lay_strip(plan, SIDEWALK, (kerb, -0.05), (kerb, KERB_M))
         _lay_strip(plan, SIDEWALK, (kerb, KERB_M), (inner, KERB_M))
-        _lay_strip(plan, TERRAIN if rng.random() < 0.5 else GROUND, (inner, KERB_M), (side * LAND_M, KERB_M))
+        _lay_strip(
+            plan,
+            TERRAIN if rng.random() < 0.5 else GROUND,
+            (inner, KERB_M),
+            (side * LAND_M, KERB_M),
+        )
         if side in houses:
             _build_houses(plan, side)
         _add_furniture(plan, side)
     return Town(_NO_STREETS, plan.builder.build(), tuple(plan.buildings), ())
 
 
-def _lay_strip(plan: TownPlan, label: int, one: tuple[float, float], other: tuple[float, float]) -> None:
+def _lay_strip(
+    plan: TownPlan, label: int, one: tuple[float, float], other: tuple[float, float]
+) -> None:
     """Add a surface along the street between two lines, (y, z) each, in tiles of 6 m."""
     x = np.arange(START_M, END_M, 6.0)
     parts = max(1, round(abs(other[0] - one[0]) / 6.0))
     lines = [
-        np.column_stack([x, np.full(len(x), y), np.full(len(x), z)]) for y, z in np.linspace(one, other, parts + 1)
+        np.column_stack([x, np.full(len(x), y), np.full(len(x), z)])
+        for y, z in np.linspace(one, other, parts + 1)
     ]
     for left, right in pairwise(lines):
         plan.builder.ribbon(label, left, right)
@@ -186,7 +215,9 @@ def _build_houses(plan: TownPlan, side: float) -> None:
             y = side * (HALF_ROAD_M + WALK_M + back + depth / 2)
             yaw = 0.0 if side > 0 else np.pi
             footprint = Rectangle(np.array([x + width / 2, y]), (width, depth), yaw)
-            add_building(plan, footprint, float(rng.uniform(5, 14)), pitched=bool(rng.random() < 0.4))
+            add_building(
+                plan, footprint, float(rng.uniform(5, 14)), pitched=bool(rng.random() < 0.4)
+            )
         x += width + float(rng.uniform(1, 6))
 
 

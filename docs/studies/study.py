@@ -1,6 +1,8 @@
-"""What all studies share: `--size tiny`, the folder they work in, the choice of drives, and a clock.
+"""What all studies share: `--size tiny`, the folder they work in, the choice of drives, and a
+clock.
 
-A tiny run tries everything a study does in seconds, on a few frames of one drive. Its figures are not for the pages.
+A tiny run tries everything a study does in seconds, on a few frames of one drive. Its figures are
+not for the pages.
 """
 
 from __future__ import annotations
@@ -25,16 +27,27 @@ T = TypeVar("T")
 _TINY = ContextVar("tiny", default=False)
 
 
-def options(text: str | None, seeds: Mapping[str, Iterable[int]] | None = None) -> argparse.ArgumentParser:
+def options(
+    text: str | None, seeds: Mapping[str, Iterable[int]] | None = None
+) -> argparse.ArgumentParser:
     """Return a parser of what every study takes.
 
     Args:
         text: what the study is.
         seeds: seeds of the drives by their kind; each kind is an option.
     """
-    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("work", nargs="?", type=Path, help="keeps drives and results; default: a temporary folder")
-    parser.add_argument("--size", choices=("tiny", "whole"), default="whole", help="tiny: try everything, in seconds")
+    parser = argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "work", nargs="?", type=Path, help="keeps drives and results; default: a temporary folder"
+    )
+    parser.add_argument(
+        "--size",
+        choices=("tiny", "whole"),
+        default="whole",
+        help="tiny: try everything, in seconds",
+    )
     for kind, own in (seeds or {}).items():
         parser.add_argument(f"--{kind}", nargs="*", type=int, default=list(own), help="seeds")
     return parser
@@ -42,7 +55,10 @@ def options(text: str | None, seeds: Mapping[str, Iterable[int]] | None = None) 
 
 @contextmanager
 def begin(parser: argparse.ArgumentParser) -> Iterator[argparse.Namespace]:
-    """Yield the options that are given; `work` is a folder. Drives are small from now on if the size is tiny."""
+    """Yield the options that are given; `work` is a folder.
+
+    Drives are small from now on if the size is tiny.
+    """
     given = parser.parse_args()
     token = _TINY.set(given.size == "tiny")
     with tempfile.TemporaryDirectory(prefix="study-") as temporary:
@@ -65,7 +81,9 @@ def few(things: Iterable[T], count: int = 1) -> list[T]:
 
 
 def drives(given: argparse.Namespace, seeds: Iterable[str]) -> list[tuple[str, int]]:
-    """Return the kind and the seed of each drive that was asked for; one street, which is soon made, in a tiny study."""
+    """Return the kind and the seed of each drive that was asked for; one street, which is soon
+    made, in a tiny study.
+    """
     kinds = ["street"] if is_tiny() else list(seeds)
     return few((kind, seed) for kind in kinds for seed in getattr(given, kind))
 
@@ -89,7 +107,9 @@ def labels_of(scan: Scan) -> NDArray[np.unsignedinteger]:
 
 
 def interval(values: Iterable[float], shown: str = ".2f") -> str:
-    """Return the mean over drives, with its 95 % interval by the bootstrap over them if there are several."""
+    """Return the mean over drives, with its 95 % interval by the bootstrap over them if there are
+    several.
+    """
     found = np.array([value for value in values if not np.isnan(value)], np.float64)
     if len(found) < 2:
         return f"{found.mean():{shown}}" if len(found) else ""
@@ -99,7 +119,9 @@ def interval(values: Iterable[float], shown: str = ".2f") -> str:
 
 
 class Clock:
-    """Says on standard error how long a study takes, so that the table on standard output can be copied as it is."""
+    """Says on standard error how long a study takes, so that the table on standard output can be
+    copied as it is.
+    """
 
     def __init__(self) -> None:
         self.start = self.last = time.perf_counter()
@@ -107,5 +129,9 @@ class Clock:
     def __call__(self, what: str) -> None:
         """Say what is done, how long it took, and how long everything has taken."""
         now = time.perf_counter()
-        print(f"{what}: {now - self.last:.0f} s, {now - self.start:.0f} s in all", file=sys.stderr, flush=True)
+        print(
+            f"{what}: {now - self.last:.0f} s, {now - self.start:.0f} s in all",
+            file=sys.stderr,
+            flush=True,
+        )
         self.last = now

@@ -1,7 +1,10 @@
-"""What merging scans makes of wrong labels: `python docs/studies/wrong_labels.py` prints the table of docs/studies/wrong-labels.md.
+"""What merging scans makes of wrong labels: `python docs/studies/wrong_labels.py` prints the table
+of docs/studies/wrong-labels.md.
 
-Drives of 61 frames through the simulated town, each by one LiDAR with 64 channels. Some labels are made wrong, the middle frame is made from its own scan and from
-all 61, and each voxel is compared with the one that the same scans make with the labels of the simulator. The share of right points is counted over all scans.
+Drives of 61 frames through the simulated town, each by one LiDAR with 64 channels. Some labels are
+made wrong, the middle frame is made from its own scan and from all 61, and each voxel is compared
+with the one that the same scans make with the labels of the simulator. The share of right points is
+counted over all scans.
 """
 
 from __future__ import annotations
@@ -27,8 +30,12 @@ CASES = {
 }
 
 
-def write_predictions(drive: Path, out: Path, share: float, clump_m: float | None, *, fixed: bool) -> float:
-    """Write wrong labels for all scans of a drive, and return the share of the labelled points that are right."""
+def write_predictions(
+    drive: Path, out: Path, share: float, clump_m: float | None, *, fixed: bool
+) -> float:
+    """Write wrong labels for all scans of a drive, and return the share of the labelled points that
+    are right.
+    """
     (sequence,) = carlasc.open(drive).sequences().values()
     out.mkdir()
     right = total = 0
@@ -48,7 +55,13 @@ def merged(drive: Path, out: Path, window: int) -> carlasc.Grid:
     observe = carlasc.FromScans(window=(-window, window))
     frame = 2 if study.is_tiny() else MIDDLE
     carlasc.regrid(
-        drive, SPEC, out, observe=observe, frames=(frame, frame + 1), name="made", run=carlasc.Run(workers=1)
+        drive,
+        SPEC,
+        out,
+        observe=observe,
+        frames=(frame, frame + 1),
+        name="made",
+        run=carlasc.Run(workers=1),
     )
     (sequence,) = carlasc.open(out).sequences().values()
     return sequence.grid("made", frame)
@@ -58,9 +71,15 @@ def main() -> None:
     """Print the table."""
     with study.begin(study.options(__doc__, SEEDS)) as given:
         found = compare(given.work, study.few(given.town))
-    print("\n| wrong labels | right points | right voxels, one scan | right voxels, 61 scans |\n|---|---|---|---|")
+    print(
+        "\n| wrong labels | right points | right voxels, one scan | right voxels, 61 scans "
+        "|\n|---|---|---|---|"
+    )
     for name, drives in found.items():
-        print(f"| {name} | {' | '.join(study.interval(values, '.1%') for values in np.array(drives).T)} |")
+        print(
+            f"| {name} | "
+            f"{' | '.join(study.interval(values, '.1%') for values in np.array(drives).T)} |"
+        )
 
 
 def compare(work: Path, seeds: list[int]) -> dict[str, list[list[float]]]:
@@ -69,17 +88,30 @@ def compare(work: Path, seeds: list[int]) -> dict[str, list[list[float]]]:
     for seed in seeds:
         drive = work / f"Drive{seed}"
         frames, lidar = (5, Lidar(points=5_000)) if study.is_tiny() else (FRAMES, Lidar())
-        capture = SimulatedCapture(count=frames, first_frame=FIRST, seed=seed, sensors=1, bev=False, lidar=lidar)
+        capture = SimulatedCapture(
+            count=frames, first_frame=FIRST, seed=seed, sensors=1, bev=False, lidar=lidar
+        )
         carlasc.regrid(capture, SPEC, drive, run=carlasc.Run(workers=1))
-        truth = {window: merged(drive, work / f"truth{seed}-{window}", window) for window in (0, 30)}
+        truth = {
+            window: merged(drive, work / f"truth{seed}-{window}", window) for window in (0, 30)
+        }
         for number, (name, (share, clump_m, fixed)) in enumerate(CASES.items()):
             place = work / f"{seed}-{number}"
             row = [write_predictions(drive, Path(f"{place}-files"), share, clump_m, fixed=fixed)]
-            carlasc.label(drive, Path(f"{place}-labelled"), Path(f"{place}-files"), by=name, run=carlasc.Run(workers=1))
+            carlasc.label(
+                drive,
+                Path(f"{place}-labelled"),
+                Path(f"{place}-files"),
+                by=name,
+                run=carlasc.Run(workers=1),
+            )
             for window, whole in truth.items():
                 made = merged(Path(f"{place}-labelled"), Path(f"{place}-{window}"), window)
                 both = (whole.labels > 0) & (made.labels > 0)
-                row.append(np.count_nonzero(made.labels[both] == whole.labels[both]) / np.count_nonzero(both))
+                row.append(
+                    np.count_nonzero(made.labels[both] == whole.labels[both])
+                    / np.count_nonzero(both)
+                )
             rows[name].append(row)
             print(seed, name, [f"{value:.3f}" for value in row], flush=True)
     return rows

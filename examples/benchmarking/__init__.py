@@ -1,1 +1,3 @@
-"""The mini benchmark: simulated drives with three kinds of labels, the runs of the study, and their tables."""
+"""The mini benchmark: simulated drives with three kinds of labels, the runs of the study, and their
+tables.
+"""

@@ -1,11 +1,14 @@
-"""Simulated drives with four kinds of labels: what many sensors saw, and what one sensor's scans give, with and without ghost trails.
+"""Simulated drives with four kinds of labels: what many sensors saw, and what one sensor's scans
+give, with and without ghost trails.
 
-Every scan of a drive is that of the ego LiDAR. The grids of its middle frames are named after their labels:
+Every scan of a drive is that of the ego LiDAR. The grids of its middle frames are named after their
+labels:
 
     evaluation  capture truth: what all sensors of a capture saw at the instant of the frame
-    tube        the scans around the frame, merged as they are (SemanticKITTI): what moves leaves traces
-    align       the same scans, with each moving actor completed at its place in the frame; with the probability of each class
-    wrong       as align, but 20 % of the points of each scan have a wrong label, in clumps of 1 m
+    tube        the scans around the frame, merged as they are (SemanticKITTI): what moves leaves
+    traces align       the same scans, with each moving actor completed at its place in the frame;
+    with the probability of each class wrong       as align, but 20 % of the points of each scan
+    have a wrong label, in clumps of 1 m
 """
 
 from __future__ import annotations
@@ -62,7 +65,12 @@ def build_drives(
     settings = settings_of(scenes)
     kept = out / _SETTINGS
     if kept.exists() and json.loads(kept.read_text()) != settings:
-        raise ConflictError(kept, expected=json.dumps(settings), found="other scenes", advice="choose another folder")
+        raise ConflictError(
+            kept,
+            expected=json.dumps(settings),
+            found="other scenes",
+            advice="choose another folder",
+        )
     out.mkdir(parents=True, exist_ok=True)
     kept.write_text(json.dumps(settings))
     towns = [
@@ -82,13 +90,17 @@ def build_drives(
 
 
 def record_drive(writer: SequenceWriter, drive: TownDrive, scenes: Scenes) -> None:
-    """Write the scans of a stretch of a drive, with labels and flow, and the capture truth of its middle frames."""
+    """Write the scans of a stretch of a drive, with labels and flow, and the capture truth of its
+    middle frames.
+    """
     count = scenes.frames + 2 * scenes.margin
     first = choose_stretch(drive, scenes)
     poses = np.stack([drive.sensor_poses(frame, 1)[0] for frame in range(first, first + count)])
     for number in range(count):
         scan = drive.scan(first + number)
-        arrays: dict[str, Any] = {"points": np.column_stack([scan.points, np.zeros(len(scan), np.float32)])}
+        arrays: dict[str, Any] = {
+            "points": np.column_stack([scan.points, np.zeros(len(scan), np.float32)])
+        }
         arrays |= {"labels": scan.labels, "flow": scan.flow}
         if scenes.margin <= number < count - scenes.margin:
             grid = see_all(drive, first + number, scenes.sensors, scenes.spec)
@@ -101,7 +113,9 @@ def record_drive(writer: SequenceWriter, drive: TownDrive, scenes: Scenes) -> No
 
 
 def see_all(drive: TownDrive, frame: int, sensors: int, spec: GridSpec) -> Grid:
-    """Return what all sensors of the vehicle see at the instant of a frame, in the ego sensor's frame."""
+    """Return what all sensors of the vehicle see at the instant of a frame, in the ego sensor's
+    frame.
+    """
     ego = drive.sensor_poses(frame, 1)[0]
     recordings = (drive.record(frame, sensor) for sensor in range(sensors))
     seen = (
@@ -122,7 +136,9 @@ def merge_scans(folder: Path, scenes: Scenes, workers: int | None) -> None:
     )
     regrid(folder, scenes.spec, observe=tube, name="tube", frames=frames, run=Run(workers=workers))
     run, evidence = Run(workers=workers), Voting(keep_evidence=True)
-    regrid(folder, scenes.spec, observe=align, voting=evidence, name="align", frames=frames, run=run)
+    regrid(
+        folder, scenes.spec, observe=align, voting=evidence, name="align", frames=frames, run=run
+    )
     if (folder / "cartesian" / "wrong").exists():
         return
     with TemporaryDirectory(dir=folder.parent.parent, prefix=".wrong-") as temporary:
@@ -135,19 +151,23 @@ def merge_scans(folder: Path, scenes: Scenes, workers: int | None) -> None:
 
 
 def write_wrong_labels(drive: Path, out: Path) -> None:
-    """Write labels of all scans of a drive, of which 20 % are wrong: in clumps of 1 m, which are others in each scan."""
+    """Write labels of all scans of a drive, of which 20 % are wrong: in clumps of 1 m, which are
+    others in each scan.
+    """
     out.mkdir()
     (sequence,) = open_source(drive).sequences().values()
     for frame in sequence.frames("points").tolist():
         scan = sequence.scan(frame, ["labels"])
         if scan.labels is not None:
             np.save(
-                out / f"{frame:06d}.npy", wrong_labels(scan.labels, scan.points, _WRONG, clump_m=_CLUMP_M, seed=frame)
+                out / f"{frame:06d}.npy",
+                wrong_labels(scan.labels, scan.points, _WRONG, clump_m=_CLUMP_M, seed=frame),
             )
 
 
 def choose_stretch(drive: TownDrive, scenes: Scenes) -> int:
-    """Return the first frame of the stretch in which most frames show a pedestrian, and a vehicle that moves, in the grid.
+    """Return the first frame of the stretch in which most frames show a pedestrian, and a vehicle
+    that moves, in the grid.
 
     Both are rare at a random frame. The earliest of equal stretches is taken.
     """
@@ -159,7 +179,9 @@ def choose_stretch(drive: TownDrive, scenes: Scenes) -> int:
 
 
 def _who_is_near(drive: TownDrive, frame: int, within_m: float) -> tuple[bool, bool]:
-    """Return whether a pedestrian, and whether a moving vehicle other than the ego, is in the grid of a frame."""
+    """Return whether a pedestrian, and whether a moving vehicle other than the ego, is in the grid
+    of a frame.
+    """
     ego, *others = drive.actors(frame)
     places = np.array([actor.world_T_actor[:3, 3] for actor in others]).reshape(-1, 3)
     offsets = np.abs(transform_points(invert(ego.world_T_actor), places)[:, :2]).max(1, initial=0.0)

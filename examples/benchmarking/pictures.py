@@ -32,10 +32,11 @@ SCENE = "labels.png"
 
 @torch.no_grad()
 def draw_scene(rows: Sequence[Row], size: Size, folder: Path, path: Path) -> None:
-    """Draw a frame of the test split as the first run of each row of hard labels completes it, and the truth.
+    """Draw a frame of the test split as the first run of each row of hard labels completes it, and
+    the truth.
 
-    It is the frame in which the first row has the median number of phantom voxels of actors, so neither its best nor its worst one. Voxels
-    that no sensor saw are left out of all panels.
+    It is the frame in which the first row has the median number of phantom voxels of actors, so
+    neither its best nor its worst one. Voxels that no sensor saw are left out of all panels.
     """
     rows = [row for row in rows if not row.config.soft_labels]
     scenes = size.scenes
@@ -44,14 +45,22 @@ def draw_scene(rows: Sequence[Row], size: Size, folder: Path, path: Path) -> Non
     samples = [test[index] for index in range(len(test))]
     phantoms = [_count_phantoms(networks[0], sample) for sample in samples]
     sample = samples[int(np.argsort(phantoms, kind="stable")[len(samples) // 2])]
-    grids = {f"trained on {row.name}": _complete(network, sample) for row, network in zip(rows, networks, strict=True)}
+    grids = {
+        f"trained on {row.name}": _complete(network, sample)
+        for row, network in zip(rows, networks, strict=True)
+    }
     grids["capture truth"] = sample["labels"].astype(np.int64)
     colors, seen = ClassColors(CARLASC11), sample["known"]
     panels = [
-        Panel(grid_drawing(Grid(scenes.spec, np.where(seen, labels, 0).astype(np.uint8)), colors), title=title)
+        Panel(
+            grid_drawing(Grid(scenes.spec, np.where(seen, labels, 0).astype(np.uint8)), colors),
+            title=title,
+        )
         for title, labels in grids.items()
     ]
-    Image.fromarray(draw_panels(panels, size=(1500, 760), columns=3)).quantize(128).save(path, optimize=True)
+    Image.fromarray(draw_panels(panels, size=(1500, 760), columns=3)).quantize(128).save(
+        path, optimize=True
+    )
 
 
 def _trained(row: Row, size: Size, folder: Path) -> nn.Module:
@@ -59,7 +68,9 @@ def _trained(row: Row, size: Size, folder: Path) -> nn.Module:
     rate = choose_rate(size.scenes, row.config, size.trial_epochs, folder, alone)
     config = replace(row.config, learning_rate=rate)
     weights = run_folder(size.scenes, config, folder) / BEST
-    network = build_network(config.network, len(CARLASC11.names), size.scenes.spec, config.history).eval()
+    network = build_network(
+        config.network, len(CARLASC11.names), size.scenes.spec, config.history
+    ).eval()
     load_weights(network, read_weights(weights), str(weights))
     return network
 

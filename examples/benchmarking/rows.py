@@ -30,7 +30,9 @@ class Row:
 
 
 def network_rows(size: Size) -> list[Row]:
-    """Return the networks, with the optimizers and losses of their papers, trained on capture truth with both kinds of class weights."""
+    """Return the networks, with the optimizers and losses of their papers, trained on capture truth
+    with both kinds of class weights.
+    """
     motionsc, baseline = _shared(size), _baseline(size)
     networks = {
         "Baseline T=5": baseline,
@@ -66,12 +68,16 @@ def part_rows(size: Size) -> list[Row]:
     for weighting in WEIGHTINGS:
         plain = replace(_baseline(size), weighting=weighting)
         rows.append(Row(f"Baseline T=5, {weighting}", plain, size.seeds))
-        rows.append(Row(f"{HITS}, {weighting}", replace(plain, network="baseline_hits"), size.seeds))
+        rows.append(
+            Row(f"{HITS}, {weighting}", replace(plain, network="baseline_hits"), size.seeds)
+        )
     return rows
 
 
 def history_rows(size: Size) -> list[Row]:
-    """Return MotionSC and our own network without history, with history, with shuffled history, and without alignment."""
+    """Return MotionSC and our own network without history, with history, with shuffled history, and
+    without alignment.
+    """
     rows = []
     for name, plain in (
         ("MotionSC", replace(_shared(size), history=5, weighting="log")),
@@ -89,7 +95,9 @@ def history_rows(size: Size) -> list[Row]:
 
 def js3cnet_rows(size: Size) -> list[Row]:
     """Return JS3C-Net, which has a table of its own: its steps take so long that it makes fewer."""
-    config = replace(_shared(size), network="js3cnet", flips="", decay=0.7, decay_every=10, weight_decay=1e-4)
+    config = replace(
+        _shared(size), network="js3cnet", flips="", decay=0.7, decay_every=10, weight_decay=1e-4
+    )
     return [Row("JS3C-Net", replace(config, weighting="root", epochs=size.js3cnet_epochs))]
 
 

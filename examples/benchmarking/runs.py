@@ -1,4 +1,6 @@
-"""One run: its learning rate is chosen, a network is trained, scored on capture truth, and the result kept, so that it is never made twice."""
+"""One run: its learning rate is chosen, a network is trained, scored on capture truth, and the
+result kept, so that it is never made twice.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +33,15 @@ class Result:
 
     Attributes:
         settings: its settings, and those of the scenes.
-        drives: (D, K, K) confusion matrix of each test drive over the known voxels of capture truth.
+        drives: (D, K, K) confusion matrix of each test drive over the known voxels of capture
+            truth.
         frames: number of frames.
         ece_free: expected calibration error of voxels that are predicted free, mean over frames.
         ece_occupied: the same of voxels that are predicted occupied.
         train_s: duration of the training, in seconds.
         best_epoch: the epoch whose weights were taken.
-        val_miou: their mIoU on the validation split, with labels of the kind that the run was trained on.
+        val_miou: their mIoU on the validation split, with labels of the kind that the run was
+            trained on.
     """
 
     settings: Mapping[str, Any]
@@ -96,14 +100,21 @@ def on_truth(config: Config) -> Config:
 
 
 def run_folder(scenes: Scenes, config: Config, out: Path) -> Path:
-    """Return the folder of a run. Its number of epochs is not in its name: a run that was long enough to choose it goes on as a longer one."""
+    """Return the folder of a run.
+
+    Its number of epochs is not in its name: a run that was long enough to choose it goes on as a
+    longer one.
+    """
     settings = settings_of_run(scenes, config)
     del settings["run"]["epochs"]
     return out / "runs" / key_of(settings)
 
 
-def choose_rate(scenes: Scenes, config: Config, trial_epochs: int, out: Path, processes: Processes) -> float:
-    """Return the one of `RATES` with the best mIoU on the validation drives after a few epochs of the first seed on capture truth.
+def choose_rate(
+    scenes: Scenes, config: Config, trial_epochs: int, out: Path, processes: Processes
+) -> float:
+    """Return the one of `RATES` with the best mIoU on the validation drives after a few epochs of
+    the first seed on capture truth.
 
     JS3C-Net keeps that of its paper.
     """
@@ -121,7 +132,9 @@ def choose_rate(scenes: Scenes, config: Config, trial_epochs: int, out: Path, pr
 
 
 def result_of(scenes: Scenes, config: Config, out: Path, processes: Processes) -> Result:
-    """Return the result of a run. It is trained only if no result is kept; a training that was stopped continues.
+    """Return the result of a run.
+
+    It is trained only if no result is kept; a training that was stopped continues.
 
     Args:
         scenes: the scenes of the data.

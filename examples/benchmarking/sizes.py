@@ -23,10 +23,12 @@ class Scenes:
     Attributes:
         towns: number of drives in Train, Val and Test, each through a town of its own.
         frames: number of labelled frames of each drive, 0.1 s apart.
-        margin: scans before the first and after the last of these; so many scans before and after a frame are merged into its labels.
+        margin: scans before the first and after the last of these; so many scans before and after a
+            frame are merged into its labels.
         sensors: number of LiDARs of the capture truth, the ego LiDAR included.
         lidar: the LiDARs.
-        half_width_m: distance from the sensor to the sides of the grid; its height is the published -2..1 m.
+        half_width_m: distance from the sensor to the sides of the grid; its height is the published
+            -2..1 m.
         cells: number of cells of the grid along x, y and z.
     """
 
@@ -53,7 +55,8 @@ class Size:
         scenes: what is simulated.
         epochs: number of epochs of every network but JS3C-Net.
         trial_epochs: number of epochs after which the learning rate is chosen.
-        js3cnet_epochs: number of epochs of JS3C-Net, of which a step takes several times longer on a CPU.
+        js3cnet_epochs: number of epochs of JS3C-Net, of which a step takes several times longer on
+            a CPU.
         batch_size: samples per step.
         seeds: number of runs of each row.
         workers: number of processes that load data.
@@ -70,11 +73,28 @@ class Size:
 
 _NEAR = Lidar(channels=32, points=32_000, range_m=30.0)
 SIZES = {
-    "tiny": Size(Scenes((1, 1, 2), 3, 1, 2, Lidar(channels=16, points=6_000, range_m=20.0), 6.4, (16, 16, 8)), 1, 1, 1),
+    "tiny": Size(
+        Scenes(
+            (1, 1, 2), 3, 1, 2, Lidar(channels=16, points=6_000, range_m=20.0), 6.4, (16, 16, 8)
+        ),
+        1,
+        1,
+        1,
+    ),
     "small": Size(Scenes((6, 2, 4), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 3, 1, 1, batch_size=2),
-    "medium": Size(Scenes((10, 3, 8), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 18, 6, 6, batch_size=2, seeds=3),
+    "medium": Size(
+        Scenes((10, 3, 8), 11, 15, 12, _NEAR, 6.4, (32, 32, 8)), 18, 6, 6, batch_size=2, seeds=3
+    ),
     "long": Size(Scenes((20, 4, 12), 21, 15, 12, _NEAR, 6.4, (32, 32, 8)), 10, 3, 3, seeds=3),
-    "full": Size(Scenes((24, 3, 6), 100, 30, 20, Lidar(), 25.6, (128, 128, 8)), 10, 3, 10, 8, seeds=3, workers=8),
+    "full": Size(
+        Scenes((24, 3, 6), 100, 30, 20, Lidar(), 25.6, (128, 128, 8)),
+        10,
+        3,
+        10,
+        8,
+        seeds=3,
+        workers=8,
+    ),
 }
 
 

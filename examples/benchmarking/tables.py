@@ -1,4 +1,6 @@
-"""The figures of runs, tables of them, and how sure differences are: intervals over test drives and seeds."""
+"""The figures of runs, tables of them, and how sure differences are: intervals over test drives and
+seeds.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,10 @@ def phantoms(counts: Counts) -> NDArray[np.float64]:
 
 def class_figures() -> dict[str, Figure]:
     """Return the IoU of each class by its name."""
-    return {name: lambda counts, label=label: iou(counts, label) for label, name in CARLASC11.names.items()}  # type: ignore[misc]
+    return {
+        name: lambda counts, label=label: iou(counts, label)
+        for label, name in CARLASC11.names.items()
+    }  # type: ignore[misc]
 
 
 MIOU, VEHICLES = "mIoU", "Vehicles"
@@ -83,21 +88,31 @@ def _share(counts: Counts, errors: Counts) -> NDArray[np.float64]:
 
 def figure_row(runs: Sequence[Result], figures: Mapping[str, Figure]) -> tuple[str, ...]:
     """Return mean and standard deviation of the figures of a row's runs, over all test drives."""
-    return tuple(spread([float(figure(run.drives.sum(0))) for run in runs]) for figure in figures.values())
-
-
-def figure_table(title: str, groups: Mapping[str, Sequence[Result]], figures: Mapping[str, Figure]) -> FigureTable:
-    """Return a table with one row per group of runs."""
-    return FigureTable(
-        title, ("", *figures), tuple((name, *figure_row(runs, figures)) for name, runs in groups.items())
+    return tuple(
+        spread([float(figure(run.drives.sum(0))) for run in runs]) for figure in figures.values()
     )
 
 
-def difference(first: Sequence[Result], second: Sequence[Result], figure: Figure) -> tuple[float, float, float]:
-    """Return by how much a figure of the first runs is higher than that of the second, and the bounds of its 95 % interval.
+def figure_table(
+    title: str, groups: Mapping[str, Sequence[Result]], figures: Mapping[str, Figure]
+) -> FigureTable:
+    """Return a table with one row per group of runs."""
+    return FigureTable(
+        title,
+        ("", *figures),
+        tuple((name, *figure_row(runs, figures)) for name, runs in groups.items()),
+    )
 
-    The test drives are drawn again (bootstrap), the same for both; and the runs of each, so that the interval holds for other towns and other
-    seeds. With one run of each it holds for other towns only.
+
+def difference(
+    first: Sequence[Result], second: Sequence[Result], figure: Figure
+) -> tuple[float, float, float]:
+    """Return by how much a figure of the first runs is higher than that of the second, and the
+    bounds of its 95 % interval.
+
+    The test drives are drawn again (bootstrap), the same for both; and the runs of each, so that
+    the interval holds for other towns and other seeds. With one run of each it holds for other
+    towns only.
     """
     rng = np.random.default_rng(0)
     drives = len(first[0].drives)

@@ -1,1 +1,3 @@
-"""Common code of the example networks: configuration, data, losses, the training loop, prediction and speed."""
+"""Common code of the example networks: configuration, data, losses, the training loop, prediction
+and speed.
+"""

@@ -1,4 +1,6 @@
-"""The common part of the scripts: errors in one line, a message after Ctrl-C, and progress: a bar on a terminal, otherwise lines."""
+"""The common part of the scripts: errors in one line, a message after Ctrl-C, and progress: a bar
+on a terminal, otherwise lines.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ EVERY_S = 10.0  # seconds between two lines of progress without a terminal
 
 
 def run(main: Callable[..., Any], continued: str = "the same command continues") -> None:
-    """Run a script's main function as a command. It exits with 1 if the work failed, with 2 if an argument is wrong, and with 130 after Ctrl-C.
+    """Run a script's main function as a command.
+
+    It exits with 1 if the work failed, with 2 if an argument is wrong, and with 130 after Ctrl-C.
 
     Args:
         main: the function, whose parameters are options.
@@ -43,7 +47,10 @@ def run(main: Callable[..., Any], continued: str = "the same command continues")
 
 @contextmanager
 def progress_bar(description: str) -> Iterator[Callable[[int, int], None]]:
-    """Show progress on stderr: a bar on a terminal, otherwise a line every ten seconds. Yields a callback of (done, total)."""
+    """Show progress on stderr: a bar on a terminal, otherwise a line every ten seconds.
+
+    Yields a callback of (done, total).
+    """
     console = Console(stderr=True)
     if not console.is_terminal:
         line = Line()
@@ -55,7 +62,9 @@ def progress_bar(description: str) -> Iterator[Callable[[int, int], None]]:
 
 
 class Line:
-    """A line on stderr that changes: it is overwritten on a terminal, and otherwise printed again every ten seconds."""
+    """A line on stderr that changes: it is overwritten on a terminal, and otherwise printed again
+    every ten seconds.
+    """
 
     def __init__(self) -> None:
         self._last_s = time.monotonic()

@@ -37,19 +37,23 @@ class Config:
         network: one of `NETWORKS`.
         history: T, number of scans in a stack; more than 1 for `STACKED` networks only.
         align: move past scans into the newest one's frame by their poses.
-        shuffle_history: put the past scans of each stack in random order (to measure the effect of their order).
+        shuffle_history: put the past scans of each stack in random order (to measure the effect of
+            their order).
         grid: name of the grid to predict.
         remap: maps the labels to the predicted classes.
         train: split to train on, or names of sequences.
         val: split to choose the best epoch by.
         test: split to report.
         flips: directions in which samples are mirrored at random: "x", "y", "xy" or "".
-        class_weights: of the loss: "table" (the published voxel counts), "train" (counted on the training split), "none", or the file
-            that `carlasc stats --json` wrote.
-        weighting: class weights from counts: "log" (the paper's 1 / ln of the count) or "root" (the cube root of the count of the most
-            frequent class divided by the count, as for JS3C-Net); None is the network's own.
-        soft_labels: train on the probability of each class instead of labels; the grid must be made with `keep_evidence=True`.
-        free_ratio: number of free voxels in the loss per occupied one, drawn at random for each batch; 0 takes all (SSCNet: 2).
+        class_weights: of the loss: "table" (the published voxel counts), "train" (counted on the
+            training split), "none", or the file that `carlasc stats --json` wrote.
+        weighting: class weights from counts: "log" (the paper's 1 / ln of the count) or "root" (the
+            cube root of the count of the most frequent class divided by the count, as for
+            JS3C-Net); None is the network's own.
+        soft_labels: train on the probability of each class instead of labels; the grid must be made
+            with `keep_evidence=True`.
+        free_ratio: number of free voxels in the loss per occupied one, drawn at random for each
+            batch; 0 takes all (SSCNet: 2).
         epochs: passes over the training split.
         batch_size: samples per step, over all processes together.
         learning_rate: learning rate of Adam in the first epoch.
@@ -60,7 +64,8 @@ class Config:
         precision: "float32", or "bf16" for mixed precision.
         compile: compile the network with torch.compile.
         workers: number of processes that load data, for each training process.
-        save_every: number of steps after which last.pt is written within an epoch; 0 writes it after each epoch only.
+        save_every: number of steps after which last.pt is written within an epoch; 0 writes it
+            after each epoch only.
         keep_samples: keep all samples in memory after the first epoch, for data that are small.
         seed: of weights, order, flips and draws.
     """
@@ -118,11 +123,14 @@ class Config:
             raise ArgumentError("save_every", expected="0 or more", found=str(self.save_every))
         if self.history > 1 and self.network not in STACKED:
             advice = f"only {', '.join(STACKED)} take more"
-            raise ArgumentError("history", expected=f"1 for {self.network}", found=str(self.history), advice=advice)
+            raise ArgumentError(
+                "history", expected=f"1 for {self.network}", found=str(self.history), advice=advice
+            )
         if self.soft_labels and self.remap == "semantickitti19":
             raise ArgumentError(
                 "soft_labels",
-                expected="False with remap=semantickitti19, whose ignored classes are left out by their labels",
+                expected="False with remap=semantickitti19, whose ignored classes are left out by "
+                "their labels",
                 found="True",
             )
         if not set(self.flips) <= {"x", "y"}:
@@ -134,13 +142,16 @@ class Config:
 
         Raises:
             FormatError: the file does not hold settings.
-            ArgumentError: an override is not "key=value", a key does not exist, or a value is wrong.
+            ArgumentError: an override is not "key=value", a key does not exist, or a value is
+                wrong.
         """
         yaml = import_extra("yaml", "torch")
         with reading(path, "a YAML file of settings"):
             values = yaml.safe_load(path.read_text("utf-8"))
         if not isinstance(values, Mapping):
-            raise FormatError(path, expected="settings as `key: value` lines", found=f"{type(values).__name__}")
+            raise FormatError(
+                path, expected="settings as `key: value` lines", found=f"{type(values).__name__}"
+            )
         settings: dict[str, Any] = dict(values)
         for text in overrides:
             key, equals, value = text.partition("=")
@@ -150,7 +161,9 @@ class Config:
         names = [field.name for field in dataclasses.fields(cls)]
         if unknown := set(settings) - set(names):
             raise ArgumentError(
-                path, expected=f"some of {', '.join(names)}", found=", ".join(sorted(map(str, unknown)))
+                path,
+                expected=f"some of {', '.join(names)}",
+                found=", ".join(sorted(map(str, unknown))),
             )
         if "network" not in settings:
             raise FormatError(path, expected="the key network", found="none")
@@ -174,7 +187,9 @@ def _fits(value: Any, kind: Any) -> bool:
     if origin in (types.UnionType, typing.Union):  # a Literal or None is of the second type
         return any(_fits(value, part) for part in typing.get_args(kind))
     if origin is list:
-        return isinstance(value, list) and all(_fits(item, typing.get_args(kind)[0]) for item in value)
+        return isinstance(value, list) and all(
+            _fits(item, typing.get_args(kind)[0]) for item in value
+        )
     return isinstance(value, kind) and not (kind is int and isinstance(value, bool))
 
 

@@ -32,7 +32,10 @@ Values = Mapping[str, Any]  # a sample, or a batch of samples
 
 
 class ShuffleHistory:
-    """Puts the past scans of a stack in random order; the newest stays last. The order depends on the seed and the frame."""
+    """Puts the past scans of a stack in random order; the newest stays last.
+
+    The order depends on the seed and the frame.
+    """
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -41,11 +44,16 @@ class ShuffleHistory:
         """Return the sample with its history shuffled."""
         last = len(sample["valid"]) - 1
         order = [*np.random.default_rng([self.seed, sample["frame"]]).permutation(last), last]
-        return {**sample} | {name: sample[name][order] for name in ("occupancy", "visibility") if name in sample}
+        return {**sample} | {
+            name: sample[name][order] for name in ("occupancy", "visibility") if name in sample
+        }
 
 
 class SemanticKittiRule:
-    """Maps SemanticKITTI's ids to the classes of the benchmark. Voxels of ignored classes become unknown, points of them class 0."""
+    """Maps SemanticKITTI's ids to the classes of the benchmark.
+
+    Voxels of ignored classes become unknown, points of them class 0.
+    """
 
     def __call__(self, sample: Values) -> Values:
         """Return the sample in the benchmark's classes."""
@@ -57,7 +65,9 @@ class SemanticKittiRule:
         return {**sample} | mapped
 
 
-def _benchmark_classes(raw: NDArray[np.unsignedinteger]) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+def _benchmark_classes(
+    raw: NDArray[np.unsignedinteger],
+) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
     """Return SemanticKITTI's labels as those of the benchmark, and which are not ignored."""
     labelled = raw, SEMANTICKITTI
     return CONVENTIONS["semantickitti"].prepare(labelled, labelled, None)[1:]
@@ -99,7 +109,13 @@ def open_split(
         fields += task.training_fields + (("posterior",) if config.soft_labels else ())
     try:
         data = Dataset(
-            source, split, history=config.history, grid=config.grid, fields=fields, remap=remap, align=config.align
+            source,
+            split,
+            history=config.history,
+            grid=config.grid,
+            fields=fields,
+            remap=remap,
+            align=config.align,
         )
     except MissingDataError as error:
         raise error.within(f"split {split!r}") from error
@@ -111,7 +127,9 @@ def open_split(
             expected=f"at most the {frames[longest]} frames of {longest} (the longest sequence)",
             found=str(config.history),
         )
-    transforms: list[Any] = [ShuffleHistory(config.seed)] if config.shuffle_history and config.history > 1 else []
+    transforms: list[Any] = (
+        [ShuffleHistory(config.seed)] if config.shuffle_history and config.history > 1 else []
+    )
     if kitti:
         if data.classes is not SEMANTICKITTI:
             raise ArgumentError(
@@ -129,7 +147,9 @@ def open_split(
 
 
 class EpochSampler(DistributedSampler[int]):
-    """A DistributedSampler that can continue in the middle of an epoch, like `carlasc.ShardSampler`."""
+    """A DistributedSampler that can continue in the middle of an epoch, like
+    `carlasc.ShardSampler`.
+    """
 
     _trained = 0
 
@@ -149,7 +169,9 @@ class EpochSampler(DistributedSampler[int]):
 
 
 class Kept(TorchDataset[Values]):
-    """Keeps the samples of a data set in memory, before transforms are applied, for all runs of this process on the same data."""
+    """Keeps the samples of a data set in memory, before transforms are applied, for all runs of
+    this process on the same data.
+    """
 
     _samples_of: ClassVar[dict[tuple[Any, ...], dict[int, Sample]]] = {}
 
@@ -172,10 +194,12 @@ class Kept(TorchDataset[Values]):
 
 
 class TrainLoader:
-    """Batches of the training split. Order and flips differ between epochs, and depend only on the seed and the epoch.
+    """Batches of the training split.
 
-    If the data are a store with many frames per file, files are read one after the other (`carlasc.ShardSampler`), so that each file of an
-    object store is fetched once.
+    Order and flips differ between epochs, and depend only on the seed and the epoch.
+
+    If the data are a store with many frames per file, files are read one after the other
+    (`carlasc.ShardSampler`), so that each file of an object store is fetched once.
 
     Args:
         data: the split.
@@ -187,11 +211,15 @@ class TrainLoader:
     def __init__(self, data: Dataset, config: Config, rank: int = 0, world: int = 1) -> None:
         if config.batch_size % world:
             raise ArgumentError(
-                "batch_size", expected=f"a multiple of the {world} processes", found=str(config.batch_size)
+                "batch_size",
+                expected=f"a multiple of the {world} processes",
+                found=str(config.batch_size),
             )
         if len(data) < world:
             raise ArgumentError(
-                "training split", expected=f"a sample for each of the {world} processes", found=str(len(data))
+                "training split",
+                expected=f"a sample for each of the {world} processes",
+                found=str(len(data)),
             )
         self.data = data
         self.batch_size = config.batch_size
@@ -217,20 +245,26 @@ class TrainLoader:
 
 def _share_files(data: Dataset) -> bool:
     """Whether the scans of successive frames are in the same files."""
-    frames, sequence = max(zip(data.frames, data.sequences, strict=True), key=lambda pair: len(pair[0]))
+    frames, sequence = max(
+        zip(data.frames, data.sequences, strict=True), key=lambda pair: len(pair[0])
+    )
     files = [sequence.files_of("points", [frame]) for frame in frames[:3].tolist()]
     return any(before and before == after for before, after in pairwise(files))
 
 
 def eval_loader(data: Dataset, config: Config, rank: int = 0, world: int = 1) -> DataLoader[Values]:
-    """Return a loader that gives each sample once, in order. Each process takes every `world`-th sample."""
+    """Return a loader that gives each sample once, in order.
+
+    Each process takes every `world`-th sample.
+    """
     samples: Any = Kept(data, config) if config.keep_samples else data
     mine: Any = samples if world == 1 else Subset(samples, range(rank, len(data), world))
     return _loader(mine, config, max(1, config.batch_size // world))
 
 
 def _loader(data: Any, config: Config, batch_size: int, **options: Any) -> DataLoader[Values]:
-    workers = min(config.workers, os.cpu_count() or 1)  # torch warns about more workers, which do not help
+    # torch warns about more workers, which do not help
+    workers = min(config.workers, os.cpu_count() or 1)
     return DataLoader(
         data,
         batch_size,
@@ -249,12 +283,16 @@ def target_of(batch: Values, device: torch.device) -> Tensor:
 
 
 def soft_target(batch: Values, target: Tensor) -> Tensor:
-    """Return a batch's soft target (B, K, X, Y, Z) float32: the probability of each class, zeros where `target` is `IGNORE`."""
+    """Return a batch's soft target (B, K, X, Y, Z) float32: the probability of each class, zeros
+    where `target` is `IGNORE`.
+    """
     posterior = batch["posterior"].to(target.device, non_blocking=True)
     return posterior.masked_fill((target == IGNORE).unsqueeze(1), 0)
 
 
-def class_weights(source: str | Path | Source, data: Dataset, config: Config) -> NDArray[np.float32]:
+def class_weights(
+    source: str | Path | Source, data: Dataset, config: Config
+) -> NDArray[np.float32]:
     """Return the (K,) class weights of the loss for the training split `data` of `source`.
 
     Raises:
@@ -274,7 +312,9 @@ def class_weights(source: str | Path | Source, data: Dataset, config: Config) ->
                 expected=f"train for data with the classes {found}",
                 found="table, which is for CarlaSC's",
             )
-        weights = weights_of(_merge(TRAIN_VOXEL_COUNTS, REMAPS.get(config.remap or ""), num_classes))
+        weights = weights_of(
+            _merge(TRAIN_VOXEL_COUNTS, REMAPS.get(config.remap or ""), num_classes)
+        )
     else:
         weights = _read_weights(Path(config.class_weights), data)
     if len(weights) != num_classes:
@@ -282,7 +322,9 @@ def class_weights(source: str | Path | Source, data: Dataset, config: Config) ->
     return weights.astype(np.float32)
 
 
-def _merge(counts: NDArray[np.integer], remap: Remap | None, num_classes: int) -> NDArray[np.float64]:
+def _merge(
+    counts: NDArray[np.integer], remap: Remap | None, num_classes: int
+) -> NDArray[np.float64]:
     """Return the counts of a remap's target classes."""
     if remap is None:
         return counts.astype(np.float64)
@@ -292,7 +334,9 @@ def _merge(counts: NDArray[np.integer], remap: Remap | None, num_classes: int) -
     return merged
 
 
-def _count_voxels(source: str | Path | Source, config: Config, num_classes: int) -> NDArray[np.int64]:
+def _count_voxels(
+    source: str | Path | Source, config: Config, num_classes: int
+) -> NDArray[np.int64]:
     """Count the known voxels of each class over the training split."""
     config = replace(config, history=1, shuffle_history=False)
     data = open_split(source, config.train, config)
@@ -314,7 +358,8 @@ def _read_weights(path: Path, data: Dataset) -> NDArray[np.float64]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FormatError(
             path,
-            expected=f"the output of `carlasc stats --json`, with a weight for each class of {data.classes.name}",
+            expected=f"the output of `carlasc stats --json`, with a weight for each class of "
+            f"{data.classes.name}",
             found=f"something else ({error})",
         ) from error
     return weights

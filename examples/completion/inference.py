@@ -1,4 +1,6 @@
-"""Networks for inference: one call from occupancy to labels, compiled with the weights as constants."""
+"""Networks for inference: one call from occupancy to labels, compiled with the weights as
+constants.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +34,20 @@ class Completer(nn.Module):
         self.dtype = dtype
 
     def forward(self, *inputs: Any) -> Tensor:
-        """Return (B, X, Y, Z) uint8 labels for (B, T, X, Y, Z) occupancy, uint8 or float, or for other inputs of the network."""
-        outputs = self.network(*(given.to(self.dtype) if isinstance(given, Tensor) else given for given in inputs))
+        """Return (B, X, Y, Z) uint8 labels for (B, T, X, Y, Z) occupancy, uint8 or float, or for
+        other inputs of the network.
+        """
+        outputs = self.network(
+            *(given.to(self.dtype) if isinstance(given, Tensor) else given for given in inputs)
+        )
         return task_of(self.network).labels(outputs).to(torch.uint8)
 
 
 class Compiled:
     """A module that is compiled with its weights as constants, once per shape of input.
 
-    Batch norms are folded into convolutions, and the weights are arranged for the processor once, which gives most of the speed on a CPU.
+    Batch norms are folded into convolutions, and the weights are arranged for the processor once,
+    which gives most of the speed on a CPU.
     """
 
     def __init__(self, module: nn.Module, cudagraphs: bool = False) -> None:
@@ -53,7 +60,8 @@ class Compiled:
         with torch.no_grad():
             if occupancy.shape in self._shapes:
                 return self._program(occupancy)
-            with inductor.patch(self._settings):  # the first call compiles, and reads these settings
+            # the first call compiles, and reads these settings
+            with inductor.patch(self._settings):
                 labels: Tensor = self._program(occupancy)
         self._shapes.add(occupancy.shape)
         return labels
@@ -65,16 +73,18 @@ def prepare(
     """Prepare a network for inference.
 
     Args:
-        network: the network. It is put into eval mode, moved to the device and, for bf16, converted, all in place.
+        network: the network. It is put into eval mode, moved to the device and, for bf16,
+            converted, all in place.
         device: the device that computes.
-        mode: "eager" runs the network without compiling; "compile" compiles it at the first call, which takes about a minute; later calls
-            are several times faster. On CUDA, the program is replayed as a CUDA graph, with channels last. Networks with inputs of variable
-            shapes always run eagerly in float32.
+        mode: "eager" runs the network without compiling; "compile" compiles it at the first call,
+            which takes about a minute; later calls are several times faster. On CUDA, the program
+            is replayed as a CUDA graph, with channels last. Networks with inputs of variable shapes
+            always run eagerly in float32.
         bf16: compute in bfloat16; None: only on CUDA with "compile".
 
     Returns:
-        A function from (B, T, X, Y, Z) occupancy, uint8 or float, on the device, or from the other arguments of the network, to
-        (B, X, Y, Z) uint8 labels.
+        A function from (B, T, X, Y, Z) occupancy, uint8 or float, on the device, or from the other
+        arguments of the network, to (B, X, Y, Z) uint8 labels.
 
     Raises:
         DependencyError: torch.compile needs a C++ compiler, and none is installed.
@@ -100,7 +110,11 @@ def prepare(
 def check_compiler(device: torch.device) -> None:
     """Raise DependencyError if torch.compile cannot find a C++ compiler."""
     names = [os.environ["CXX"]] if "CXX" in os.environ else ["g++", "clang++"]
-    if device.type == "cpu" and sys.platform != "win32" and not any(shutil.which(name) for name in names):
+    if (
+        device.type == "cpu"
+        and sys.platform != "win32"
+        and not any(shutil.which(name) for name in names)
+    ):
         raise DependencyError(
             "torch.compile",
             expected="a C++ compiler",

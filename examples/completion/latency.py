@@ -1,4 +1,6 @@
-"""Latency and memory of a network at batch size 1, measured as in the paper: 100 repetitions after a warm-up."""
+"""Latency and memory of a network at batch size 1, measured as in the paper: 100 repetitions after
+a warm-up.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +31,11 @@ class Latency:
         history: T.
         mode: "eager" or "compile".
         median_ms: median time of the repetitions.
-        fastest_ms: shortest time of the repetitions; for ratios, it is more reliable on a busy machine.
+        fastest_ms: shortest time of the repetitions; for ratios, it is more reliable on a busy
+            machine.
         memory_mb: peak memory of the GPU, or of the whole process on a CPU.
-        speedup: shortest time of the first mode of the same run (eager float32), divided by this mode's.
+        speedup: shortest time of the first mode of the same run (eager float32), divided by this
+            mode's.
         differing: number of voxels per million whose label differs from the first mode's.
     """
 
@@ -55,15 +59,20 @@ def measure_network(
     repetitions: int = 100,
     modes: Sequence[Mode] = ("eager", "compile"),
 ) -> list[Latency]:
-    """Measure a network in several modes. Speed and labels are compared with those of the first mode.
+    """Measure a network in several modes.
 
-    Weights are random, because they do not change the time. The inputs are `_STACKS` examples of the network's task: occupancy as dense
-    as that of a scan, or a scan of 120,000 points. Networks whose inputs have no fixed shapes are measured in the first mode only.
+    Speed and labels are compared with those of the first mode.
+
+    Weights are random, because they do not change the time. The inputs are `_STACKS` examples of
+    the network's task: occupancy as dense as that of a scan, or a scan of 120,000 points. Networks
+    whose inputs have no fixed shapes are measured in the first mode only.
     """
     rng = np.random.default_rng(0)
     task = KINDS[name].task
     samples = [task.example(spec, history, rng) for _ in range(_STACKS)]
-    inputs = [task.arguments(task.prepare(collate([sample]), device), torch.uint8) for sample in samples]
+    inputs = [
+        task.arguments(task.prepare(collate([sample]), device), torch.uint8) for sample in samples
+    ]
     modes = modes if task.fixed_shapes else modes[:1]
     results: list[Latency] = []
     reference: torch.Tensor | None = None
@@ -94,7 +103,9 @@ def measure_network(
 
 
 def randomise(network: nn.Module) -> nn.Module:
-    """Give batch norms the statistics of random features, so that logits differ and no two classes are equal."""
+    """Give batch norms the statistics of random features, so that logits differ and no two classes
+    are equal.
+    """
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d | nn.BatchNorm3d):
             for tensor, spread in ((module.running_mean, 0.1), (module.running_var, 0.3)):
@@ -103,9 +114,18 @@ def randomise(network: nn.Module) -> nn.Module:
     return network
 
 
-def _time_ms(run: Callable[..., torch.Tensor], inputs: tuple[Any, ...], device: torch.device) -> float:
-    """Return the time of a call. With one thread on a CPU it is CPU time, which does not depend on other work on the machine."""
-    clock = time.process_time if device.type == "cpu" and torch.get_num_threads() == 1 else time.perf_counter
+def _time_ms(
+    run: Callable[..., torch.Tensor], inputs: tuple[Any, ...], device: torch.device
+) -> float:
+    """Return the time of a call.
+
+    With one thread on a CPU it is CPU time, which does not depend on other work on the machine.
+    """
+    clock = (
+        time.process_time
+        if device.type == "cpu" and torch.get_num_threads() == 1
+        else time.perf_counter
+    )
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     start = clock()

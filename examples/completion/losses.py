@@ -1,4 +1,6 @@
-"""The loss: weighted cross-entropy over known voxels, at every scale of a network's output, with labels or with probabilities."""
+"""The loss: weighted cross-entropy over known voxels, at every scale of a network's output, with
+labels or with probabilities.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +14,32 @@ IGNORE = 255  # label of voxels that are left out
 FREE = 0
 
 
-def completion_loss(outputs: Tensor | Sequence[Tensor], target: Tensor, class_weights: Tensor) -> tuple[Tensor, Tensor]:
+def completion_loss(
+    outputs: Tensor | Sequence[Tensor], target: Tensor, class_weights: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return the weighted sum of the cross-entropy, and the sum of the weights, at each scale.
 
-    The loss is the mean over the scales of sum / weight. Several processes add up their weights before they divide, which gives each
-    process its part of the loss of the whole batch.
+    The loss is the mean over the scales of sum / weight. Several processes add up their weights
+    before they divide, which gives each process its part of the loss of the whole batch.
 
     Args:
         outputs: (B, X, Y, Z, K) logits, or a list of them at 1/1, 1/2, 1/4, ... of the scale.
-        target: (B, X, Y, Z) int64 labels, `IGNORE` for voxels that are left out. Or (B, K, X, Y, Z) float32 probabilities of the
-            classes, zeros for voxels that are left out. Certain probabilities give exactly the loss of the labels.
+        target: (B, X, Y, Z) int64 labels, `IGNORE` for voxels that are left out. Or (B, K, X, Y, Z)
+            float32 probabilities of the classes, zeros for voxels that are left out. Certain
+            probabilities give exactly the loss of the labels.
         class_weights: (K,) float32.
 
     Returns:
         (S,) sums and (S,) weights.
     """
     sums, weights = [], []
-    measure, blocks = (_measure_soft, coarsen_soft) if target.is_floating_point() else (_measure, coarsen)
+    measure, blocks = (
+        (_measure_soft, coarsen_soft) if target.is_floating_point() else (_measure, coarsen)
+    )
     for scale, logits in enumerate([outputs] if isinstance(outputs, Tensor) else outputs):
         coarse = target if scale == 0 else blocks(target, 2**scale, len(class_weights))
-        # the loss per voxel first, then the sum, so that labels and certain probabilities are added up in the same way
+        # the loss per voxel first, then the sum, so that labels and certain probabilities are added
+        # up in the same way
         losses, counted = measure(logits.movedim(-1, 1).float(), coarse, class_weights)
         sums.append(losses.sum())
         weights.append(counted.sum())
@@ -52,7 +60,8 @@ def _measure_soft(logits: Tensor, target: Tensor, class_weights: Tensor) -> tupl
 
 
 def coarsen(target: Tensor, block: int, num_classes: int) -> Tensor:
-    """Return one label per block: the most frequent occupied class, else free if any voxel is free, else `IGNORE`.
+    """Return one label per block: the most frequent occupied class, else free if any voxel is free,
+    else `IGNORE`.
 
     If two classes are equally frequent, the lower id is taken.
 
@@ -67,7 +76,9 @@ def coarsen(target: Tensor, block: int, num_classes: int) -> Tensor:
     known = target != IGNORE
     votes = one_hot(torch.where(known, target, 0), num_classes) * known.unsqueeze(-1)
     batch, x, y, z = target.shape
-    votes = votes.reshape(batch, x // block, block, y // block, block, z // block, block, num_classes).sum((2, 4, 6))
+    votes = votes.reshape(
+        batch, x // block, block, y // block, block, z // block, block, num_classes
+    ).sum((2, 4, 6))
     occupied, most = votes[..., 1:].max(-1)
     free = torch.where(votes[..., FREE] > 0, FREE, IGNORE)
     return torch.where(occupied > 0, most + 1, free)
@@ -76,20 +87,25 @@ def coarsen(target: Tensor, block: int, num_classes: int) -> Tensor:
 def coarsen_soft(target: Tensor, block: int, num_classes: int) -> Tensor:
     """Return the probabilities of one class per block, by the rule of `coarsen`.
 
-    The probability that a block is occupied is the largest such probability of its voxels; its class is the one with the largest sum of
-    probabilities. The probability that it is free is the smallest such probability of its known voxels. If two classes are equally probable,
-    the lower id is taken.
+    The probability that a block is occupied is the largest such probability of its voxels; its
+    class is the one with the largest sum of probabilities. The probability that it is free is the
+    smallest such probability of its known voxels. If two classes are equally probable, the lower id
+    is taken.
 
     Args:
-        target: (B, K, X, Y, Z) float32, zeros for voxels that are left out; X, Y and Z multiples of `block`.
+        target: (B, K, X, Y, Z) float32, zeros for voxels that are left out; X, Y and Z multiples of
+            `block`.
         block: voxels per axis of a block.
         num_classes: K.
 
     Returns:
-        (B, K, X / block, Y / block, Z / block) float32, zeros for blocks in which all voxels are left out.
+        (B, K, X / block, Y / block, Z / block) float32, zeros for blocks in which all voxels are
+        left out.
     """
     batch, _, x, y, z = target.shape
-    blocks = target.reshape(batch, num_classes, x // block, block, y // block, block, z // block, block)
+    blocks = target.reshape(
+        batch, num_classes, x // block, block, y // block, block, z // block, block
+    )
     voxels = blocks.permute(0, 1, 2, 4, 6, 3, 5, 7).flatten(5)
     occupied, known = voxels[:, 1:].sum(1), voxels.sum(1) > 0
     free = torch.where(known, voxels[:, FREE], 1.0).amin(-1) * known.any(-1)
@@ -101,7 +117,8 @@ def coarsen_soft(target: Tensor, block: int, num_classes: int) -> Tensor:
 
 
 def balance_free(target: Tensor, ratio: float, generator: torch.Generator) -> Tensor:
-    """Keep all occupied voxels and at most `ratio` times as many free ones, drawn at random over the batch (SSCNet).
+    """Keep all occupied voxels and at most `ratio` times as many free ones, drawn at random over
+    the batch (SSCNet).
 
     Args:
         target: (B, X, Y, Z) int64 labels.
@@ -115,6 +132,8 @@ def balance_free(target: Tensor, ratio: float, generator: torch.Generator) -> Te
     wanted = int(ratio * ((target != IGNORE) & ~free).sum())
     if int(free.sum()) <= wanted:
         return target
-    draw = torch.rand(target.shape, generator=generator, device=target.device).masked_fill(~free, 2.0)
+    draw = torch.rand(target.shape, generator=generator, device=target.device).masked_fill(
+        ~free, 2.0
+    )
     last = draw.reshape(-1).kthvalue(wanted).values if wanted else -1.0
     return target.masked_fill(free & (draw > last), IGNORE)

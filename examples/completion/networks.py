@@ -36,20 +36,28 @@ class Kind:
 
 
 KINDS: Mapping[str, Kind] = {
-    "motionsc": Kind(lambda classes, spec, frames: MotionSC(classes, spec.size[2], frames), history=True),
+    "motionsc": Kind(
+        lambda classes, spec, frames: MotionSC(classes, spec.size[2], frames), history=True
+    ),
     "lmscnet_ss": Kind(lambda classes, spec, _: LMSCNet(classes, spec.size[2])),
     "lmscnet": Kind(lambda classes, spec, _: LMSCNet(classes, spec.size[2], multiscale=True)),
     "sscnet": Kind(lambda classes, _spec, _frames: SSCNet(classes)),
     "sscnet_full": Kind(lambda classes, _spec, _frames: SSCNet(classes, full=True)),
     "js3cnet": Kind(lambda classes, spec, _: JS3CNet(classes, spec), PointsAndVoxels()),
-    "js3cnet_exact": Kind(lambda classes, spec, _: JS3CNet(classes, spec, exact=True), PointsAndVoxels()),
+    "js3cnet_exact": Kind(
+        lambda classes, spec, _: JS3CNet(classes, spec, exact=True), PointsAndVoxels()
+    ),
     "js3cnet_kitti": Kind(
         lambda classes, spec, _: JS3CNet(classes, spec, channels=(3,), residual=True),
         PointsAndVoxels(voxel_m=0.05, extent=4096, remission=True),
     ),
-    "baseline": Kind(lambda classes, spec, frames: Baseline(classes, spec.size[2], frames), Seen(), history=True),
+    "baseline": Kind(
+        lambda classes, spec, frames: Baseline(classes, spec.size[2], frames), Seen(), history=True
+    ),
     "baseline_hits": Kind(
-        lambda classes, spec, frames: Baseline(classes, spec.size[2], frames), Seen(rays=False), history=True
+        lambda classes, spec, frames: Baseline(classes, spec.size[2], frames),
+        Seen(rays=False),
+        history=True,
     ),
 }
 
@@ -64,14 +72,20 @@ def build_network(name: str, num_classes: int, spec: GridSpec, history: int = 1)
         history: T, scans in a stack.
 
     Raises:
-        ArgumentError: the name is unknown, or the size of the grid is not a multiple of the network's divisors.
+        ArgumentError: the name is unknown, or the size of the grid is not a multiple of the
+            network's divisors.
     """
     if name not in KINDS:
         raise ArgumentError("network", expected=f"one of {', '.join(KINDS)}", found=repr(name))
     kind = KINDS[name]
     if history > 1 and not kind.history:
         stacked = ", ".join(other for other, its in KINDS.items() if its.history)
-        raise ArgumentError("history", expected=f"1 for {name}", found=str(history), advice=f"only {stacked} take more")
+        raise ArgumentError(
+            "history",
+            expected=f"1 for {name}",
+            found=str(history),
+            advice=f"only {stacked} take more",
+        )
     network = kind.build(num_classes, spec, history)
     check_size(network, name, spec.size)
     network.task = kind.task  # type: ignore[assignment]

@@ -1,4 +1,7 @@
-"""Completion of every frame of a data set, or of a folder of raw scans. The results are `.label` grids of the CarlaSC layout."""
+"""Completion of every frame of a data set, or of a folder of raw scans.
+
+The results are `.label` grids of the CarlaSC layout.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +58,8 @@ class Model:
     def read(cls, path: Path, history: int | None = None) -> Model:
         """Read weights, and find their network.
 
-        If `history` is None, it is read from a config.yaml beside the weights. The file also decides between networks with the same
-        weights.
+        If `history` is None, it is read from a config.yaml beside the weights. The file also
+        decides between networks with the same weights.
 
         Raises:
             FormatError: the network or the number of classes is unknown.
@@ -67,7 +70,9 @@ class Model:
         name, num_classes = identify(state, str(path), config.network if config else None)
         if num_classes not in _TABLES:
             raise FormatError(
-                path, expected="weights for 11 classes (CarlaSC) or 20 (SemanticKITTI)", found=str(num_classes)
+                path,
+                expected="weights for 11 classes (CarlaSC) or 20 (SemanticKITTI)",
+                found=str(num_classes),
             )
         if history is None:
             history = config.history if config else 1
@@ -77,14 +82,17 @@ class Model:
         """Return a function from the input fields of a sample to (X, Y, Z) labels.
 
         Raises:
-            FormatError: the weights are for another grid, number of classes or history; the message names the layer and both shapes.
+            FormatError: the weights are for another grid, number of classes or history; the message
+                names the layer and both shapes.
         """
         network = build_network(self.network, len(self.classes.names), spec, self.history)
         load_weights(network, self.state, self.where)
         run = prepare(network, device, mode)
 
         def complete(sample: Batch) -> NDArray[np.uint8]:
-            labels = run(*self.task.arguments(self.task.prepare(collate([sample]), device), torch.uint8))
+            labels = run(
+                *self.task.arguments(self.task.prepare(collate([sample]), device), torch.uint8)
+            )
             return labels[0].cpu().numpy().astype(np.uint8)
 
         return complete
@@ -108,7 +116,8 @@ def predict_dataset(
     Args:
         model: the weights.
         source: the data. They need scans, and the grid `grid` unless this is a GridSpec.
-        out: where grids are written, as the grid `evaluation` of sequences with the model's classes. None: into the data, as the grid `name`.
+        out: where grids are written, as the grid `evaluation` of sequences with the model's
+            classes. None: into the data, as the grid `name`.
         device: the device that computes.
         mode: "eager" or "compile".
         split: a split, or names of sequences; None takes all.
@@ -124,13 +133,18 @@ def predict_dataset(
         ArgumentError: `out` is None and the data are not a folder.
         ConflictError: the grid exists, and was made by another network or on another grid.
     """
-    fields = dict.fromkeys(("occupancy", *model.task.fields))  # occupancy has the geometry of the predicted grid
+    # occupancy has the geometry of the predicted grid
+    fields = dict.fromkeys(("occupancy", *model.task.fields))
     data = Dataset(source, split, history=model.history, grid=grid, fields=fields, remap=None)
     if out is None and not Path(source).is_dir():
-        raise ArgumentError("out", expected=f"a folder to write to, because {source} is not one", found="none")
+        raise ArgumentError(
+            "out", expected=f"a folder to write to, because {source} is not one", found="none"
+        )
     chosen = FrameRange.of(frames)
     jobs = [
-        (sequence, frame) for sequence in data.sequences for frame in chosen.select(sequence.frames("points")).tolist()
+        (sequence, frame)
+        for sequence in data.sequences
+        for frame in chosen.select(sequence.frames("points")).tolist()
     ]
     complete = model.complete_on(data.spec, device, mode)
     folder = layout.EVALUATION if out else name
@@ -166,12 +180,14 @@ def predict_scans(
 
     Args:
         model: the weights, for single scans.
-        folder: the scans. Their names are frame numbers; if not, they are numbered in the order of their names.
+        folder: the scans. Their names are frame numbers; if not, they are numbered in the order of
+            their names.
         out: where grids are written, as the grid `evaluation` of one sequence.
         device: the device that computes.
         mode: "eager" or "compile".
         spec: the grid to predict, in the sensor's frame.
-        right_handed: y is to the left (KITTI, nuScenes): scans are mirrored into CarlaSC's axes, and grids are in these axes.
+        right_handed: y is to the left (KITTI, nuScenes): scans are mirrored into CarlaSC's axes,
+            and grids are in these axes.
         progress: called with (done, total).
 
     Returns:
@@ -199,13 +215,17 @@ def predict_scans(
         if right_handed:
             points = points * np.array([1, -1, 1, 1], np.float32)
         frame = done - 1 if None in numbers or number is None else number
-        writer.write(f"{layout.EVALUATION}/labels", frame, complete(model.task.from_scan(points, spec)))
+        writer.write(
+            f"{layout.EVALUATION}/labels", frame, complete(model.task.from_scan(points, spec))
+        )
         if progress:
             progress(done, len(files))
     return len(files)
 
 
-def _open_writer(out: Path, path: str, grid: str, spec: GridSpec, model: Model, *, beside: bool) -> FolderWriter:
+def _open_writer(
+    out: Path, path: str, grid: str, spec: GridSpec, model: Model, *, beside: bool
+) -> FolderWriter:
     """Write the geometry and the classes of a sequence's predictions, and return its writer."""
     writer = FolderSink(out).sequence(path)
     record = {"classes": model.classes.name, "network": model.network, "history": model.history}
@@ -220,5 +240,7 @@ def _open_writer(out: Path, path: str, grid: str, spec: GridSpec, model: Model, 
         )
     writer.write_document(layout.params_file(grid), json.dumps(params).encode())
     if not beside:
-        writer.write_document(layout.METADATA, Metadata(classes=model.classes, source=model.where).to_json())
+        writer.write_document(
+            layout.METADATA, Metadata(classes=model.classes, source=model.where).to_json()
+        )
     return writer

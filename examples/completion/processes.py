@@ -40,7 +40,9 @@ class Processes:
         return value
 
     def share(self, tensors: Iterable[Tensor]) -> None:
-        """Copy the tensors of the first process to all others: the statistics of batch norms differ, because each process has other batches."""
+        """Copy the tensors of the first process to all others: the statistics of batch norms
+        differ, because each process has other batches.
+        """
         if self.world > 1:
             for tensor in tensors:
                 dist.broadcast(tensor, 0)
@@ -56,7 +58,8 @@ def join_processes(device: str = "auto") -> Iterator[Processes]:
     """Join the processes that `torchrun` started; without it, this is the only process.
 
     Args:
-        device: "cuda", "cpu", or "auto": a GPU if one is available. Under torchrun, each process uses its own GPU.
+        device: "cuda", "cpu", or "auto": a GPU if one is available. Under torchrun, each process
+            uses its own GPU.
     """
     name = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     world, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))

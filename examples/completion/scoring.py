@@ -19,11 +19,20 @@ from completion.tasks import Batch, task_of
 
 @torch.no_grad()
 def score_with_certainty(
-    network: nn.Module, loader: DataLoader[Mapping[str, Any]], num_classes: int, processes: Processes
+    network: nn.Module,
+    loader: DataLoader[Mapping[str, Any]],
+    num_classes: int,
+    processes: Processes,
 ) -> tuple[ConfusionMatrix, Uncertainty]:
-    """Return the confusion matrix of a network over the known voxels of a split, and the calibration of its probabilities."""
+    """Return the confusion matrix of a network over the known voxels of a split, and the
+    calibration of its probabilities.
+    """
     network.eval()
-    task, matrix, certainty = task_of(network), ConfusionMatrix(num_classes), Uncertainty(num_classes)
+    task, matrix, certainty = (
+        task_of(network),
+        ConfusionMatrix(num_classes),
+        Uncertainty(num_classes),
+    )
     for batch in loader:
         target = target_of(batch, processes.device)
         outputs = network(*task.arguments(task.prepare(batch, processes.device)))
@@ -46,7 +55,9 @@ def score(
     processes: Processes,
     bf16: bool = False,
 ) -> ConfusionMatrix:
-    """Return the confusion matrix of a network over the known voxels of a split, summed over all processes."""
+    """Return the confusion matrix of a network over the known voxels of a split, summed over all
+    processes.
+    """
     network.eval()
     matrix = ConfusionMatrix(num_classes)
     for batch in loader:

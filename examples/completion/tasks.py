@@ -1,4 +1,6 @@
-"""The interface between the scripts and a network: its inputs from a sample, its loss and its predictions."""
+"""The interface between the scripts and a network: its inputs from a sample, its loss and its
+predictions.
+"""
 
 from __future__ import annotations
 
@@ -18,23 +20,31 @@ Batch = Mapping[str, Any]
 
 
 def root_weights(counts: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
-    """Return the cube root of the count of the most frequent class divided by the count of each class; 0 for classes that do not occur."""
+    """Return the cube root of the count of the most frequent class divided by the count of each
+    class; 0 for classes that do not occur.
+    """
     counts = np.asarray(counts, np.float64)
     return np.where(counts > 0, np.cbrt(counts.max() / np.maximum(counts, 1)), 0)
 
 
-WEIGHTINGS: Mapping[str, Callable[[NDArray[Any]], NDArray[np.float64]]] = {"log": class_weights, "root": root_weights}
+WEIGHTINGS: Mapping[str, Callable[[NDArray[Any]], NDArray[np.float64]]] = {
+    "log": class_weights,
+    "root": root_weights,
+}
 """The class weights of the loss for the number of voxels of each class."""
 
 
 class Task:
-    """The task of a network from occupancy to the logits of all voxels. Networks with other tasks have a subclass.
+    """The task of a network from occupancy to the logits of all voxels.
+
+    Networks with other tasks have a subclass.
 
     Attributes:
         fields: fields of a sample that are inputs of the network.
         training_fields: further fields for its loss, besides the labels of the voxels.
         weighting: default weighting of classes in its loss: one of `WEIGHTINGS`.
-        fixed_shapes: whether the shapes of its inputs are always the same, so that it can be compiled.
+        fixed_shapes: whether the shapes of its inputs are always the same, so that it can be
+            compiled.
     """
 
     fields: tuple[str, ...] = ("occupancy",)
@@ -50,14 +60,18 @@ class Task:
         return {"occupancy": occupancy}
 
     def example(self, spec: GridSpec, history: int, rng: np.random.Generator) -> Batch:
-        """Return the `fields` of a random sample with the density of a scan (1 of 20 voxels), to measure times."""
+        """Return the `fields` of a random sample with the density of a scan (1 of 20 voxels), to
+        measure times.
+        """
         return {"occupancy": (rng.random((history, *spec.size)) < 0.05).astype(np.uint8)}
 
     def seen(self, sample: Batch, spec: GridSpec) -> NDArray[np.uint8]:
         """Return (X, Y, Z) occupancy of a sample's own scan, for pictures."""
         return sample["occupancy"][-1]
 
-    def prepare(self, batch: Batch, device: torch.device, draw: torch.Generator | None = None) -> Batch:
+    def prepare(
+        self, batch: Batch, device: torch.device, draw: torch.Generator | None = None
+    ) -> Batch:
         """Return a batch with the inputs of the network and of its loss, on the device.
 
         Args:
@@ -71,12 +85,17 @@ class Task:
         """Return the arguments of the network for a prepared batch; occupancy in the dtype."""
         return (batch["occupancy"].to(dtype),)
 
-    def loss(self, outputs: Any, batch: Batch, target: Tensor, class_weights: Tensor) -> tuple[Tensor, Tensor]:
+    def loss(
+        self, outputs: Any, batch: Batch, target: Tensor, class_weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return the S parts of the loss, as `completion_loss` does: (S,) sums and (S,) weights."""
         return completion_loss(outputs, target, class_weights)
 
     def balance(self, network: nn.Module, parts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (S,) factors of the parts in the loss, and a number to add. Here, the loss is the mean of the parts."""
+        """Return (S,) factors of the parts in the loss, and a number to add.
+
+        Here, the loss is the mean of the parts.
+        """
         return torch.full_like(parts, 1 / len(parts)), parts.new_zeros(())
 
     def logits(self, outputs: Any) -> Tensor:
@@ -96,5 +115,7 @@ VOXELS = Task()
 
 
 def task_of(network: nn.Module) -> Task:
-    """Return the task of a network from `build_network`; for other networks, the task of occupancy grids."""
+    """Return the task of a network from `build_network`; for other networks, the task of occupancy
+    grids.
+    """
     return getattr(network, "task", VOXELS)

@@ -27,7 +27,9 @@ class Board:
         self._writer: Any = None
         if enabled:
             import_extra("tensorboard", "torch")
-            self._writer = import_extra("torch.utils.tensorboard", "torch").SummaryWriter(str(folder))
+            self._writer = import_extra("torch.utils.tensorboard", "torch").SummaryWriter(
+                str(folder)
+            )
 
     def __enter__(self) -> Self:
         return self
@@ -36,18 +38,29 @@ class Board:
         if self._writer is not None:
             self._writer.close()
 
-    def add_epoch(self, epoch: int, loss: float, learning_rate: float, matrix: ConfusionMatrix) -> None:
+    def add_epoch(
+        self, epoch: int, loss: float, learning_rate: float, matrix: ConfusionMatrix
+    ) -> None:
         """Add the scores of an epoch."""
         geometry = matrix.completeness()
-        scalars = {"train/loss": loss, "train/learning_rate": learning_rate, "val/mIoU": matrix.miou}
+        scalars = {
+            "train/loss": loss,
+            "train/learning_rate": learning_rate,
+            "val/mIoU": matrix.miou,
+        }
         scalars |= {"val/accuracy": matrix.accuracy, "val/precision": geometry.precision}
         scalars |= {"val/recall": geometry.recall, "val/IoU": geometry.iou}
-        scalars |= {f"val_class/{name}": float(matrix.iou[index]) for index, name in self.classes.names.items()}
+        scalars |= {
+            f"val_class/{name}": float(matrix.iou[index])
+            for index, name in self.classes.names.items()
+        }
         for name, value in scalars.items():
             if np.isfinite(value):
                 self._writer.add_scalar(name, value, epoch)
 
-    def add_pictures(self, epoch: int, network: nn.Module, data: Dataset, device: torch.device) -> None:
+    def add_pictures(
+        self, epoch: int, network: nn.Module, data: Dataset, device: torch.device
+    ) -> None:
         """Add pictures from above: input, prediction and truth side by side."""
         network.eval()
         for place in np.unique(np.linspace(0, len(data) - 1, _PICTURES).astype(int)).tolist():
@@ -64,7 +77,8 @@ class Board:
 
 
 def view_from_above(labels: NDArray[Any], classes: ClassTable) -> NDArray[np.uint8]:
-    """Return an (X, Y, 3) picture of (X, Y, Z) labels: the colour of the highest occupied voxel, white if there is none.
+    """Return an (X, Y, 3) picture of (X, Y, Z) labels: the colour of the highest occupied voxel,
+    white if there is none.
 
     Forward (x) is up.
     """

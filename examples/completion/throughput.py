@@ -28,19 +28,27 @@ class Throughput:
     network: float
 
 
-def measure_throughput(source: str | Path, config: Config, device: torch.device, batches: int = 20) -> Throughput:
-    """Measure loader and network separately, with the settings of a run. The first batches are not counted, because workers start meanwhile."""
+def measure_throughput(
+    source: str | Path, config: Config, device: torch.device, batches: int = 20
+) -> Throughput:
+    """Measure loader and network separately, with the settings of a run.
+
+    The first batches are not counted, because workers start meanwhile.
+    """
     data = open_split(source, config.train, config, training=True)
     loader = TrainLoader(data, config)
     endless = itertools.chain.from_iterable(loader.epoch(number) for number in itertools.count())
-    warm = max(2, 2 * config.workers)  # batches that workers may have prepared before the measurement
+    # batches that workers may have prepared before the measurement
+    warm = max(2, 2 * config.workers)
     batch = next(itertools.islice(endless, warm, None))
     start = time.perf_counter()
     loaded = sum(len(loaded["frame"]) for loaded in itertools.islice(endless, batches))
     loader_rate = loaded / (time.perf_counter() - start)
 
     num_classes = max(data.classes.names) + 1
-    network = build_network(config.network, num_classes, data.spec, config.history).to(device).train()
+    network = (
+        build_network(config.network, num_classes, data.spec, config.history).to(device).train()
+    )
     optimizer = torch.optim.Adam(network.parameters())
     task, target = task_of(network), target_of(batch, device)
     weights = torch.ones(num_classes, device=device)

@@ -20,7 +20,14 @@ from carlasc.errors import ArgumentError, CarlascError, ConflictError
 from carlasc.metrics import ConfusionMatrix
 from completion.command import Line
 from completion.config import Config
-from completion.data import TrainLoader, class_weights, eval_loader, open_split, soft_target, target_of
+from completion.data import (
+    TrainLoader,
+    class_weights,
+    eval_loader,
+    open_split,
+    soft_target,
+    target_of,
+)
 from completion.inference import check_compiler
 from completion.losses import balance_free
 from completion.networks import build_network
@@ -28,7 +35,13 @@ from completion.processes import Processes
 from completion.scoring import score
 from completion.tasks import task_of
 from completion.tensorboard import Board
-from completion.weights import load_weights, read_checkpoint, read_weights, write_checkpoint, write_weights
+from completion.weights import (
+    load_weights,
+    read_checkpoint,
+    read_weights,
+    write_checkpoint,
+    write_weights,
+)
 
 LAST, BEST, CONFIG = "last.pt", "best.safetensors", "config.yaml"
 
@@ -64,11 +77,17 @@ class Progress:
 
 
 def train(
-    source: str | Path | Source, config: Config, out: Path, processes: Processes, *, resume: bool = False
+    source: str | Path | Source,
+    config: Config,
+    out: Path,
+    processes: Processes,
+    *,
+    resume: bool = False,
 ) -> Progress:
     """Train a network on a data set.
 
-    Writes to `out`: config.yaml, last.pt (to continue from), best.safetensors (the weights of the best epoch by mIoU) and TensorBoard's files.
+    Writes to `out`: config.yaml, last.pt (to continue from), best.safetensors (the weights of the
+    best epoch by mIoU) and TensorBoard's files.
 
     Args:
         source: the data, anything that `carlasc.open` takes.
@@ -78,7 +97,8 @@ def train(
         resume: continue from last.pt; the result equals that of a run without interruption.
 
     Raises:
-        CarlascError: a split is empty, the loss is not finite, memory is not sufficient, or `out` holds another run.
+        CarlascError: a split is empty, the loss is not finite, memory is not sufficient, or `out`
+            holds another run.
     """
     data = open_split(source, config.train, config, training=True)
     loader = TrainLoader(data, config, processes.rank, processes.world)
@@ -88,7 +108,9 @@ def train(
     weights = torch.from_numpy(class_weights(source, data, config)).to(processes.device)
 
     torch.manual_seed(config.seed)
-    network = build_network(config.network, num_classes, data.spec, config.history).to(processes.device)
+    network = build_network(config.network, num_classes, data.spec, config.history).to(
+        processes.device
+    )
     optimizer = torch.optim.Adam(
         network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
     )
@@ -108,7 +130,9 @@ def train(
             start = time.perf_counter()
             task_of(network).set_epoch(network, progress.epoch)
             first = progress.step
-            _train_epoch((network, stepped), optimizer, loader, weights, progress, config, processes, save)
+            _train_epoch(
+                (network, stepped), optimizer, loader, weights, progress, config, processes, save
+            )
             loss = progress.loss_so_far / len(loader)
             elapsed_s = time.perf_counter() - start
             learning_rate = optimizer.param_groups[0]["lr"]
@@ -148,11 +172,21 @@ def _begin(out: Path, config: Config, processes: Processes) -> Progress:
 
 
 def _resume(out: Path, config: Config, parts: dict[str, Any]) -> Progress:
-    """Load last.pt. Nothing else is needed, because order, flips and random draws depend only on the seed, the epoch and the step."""
+    """Load last.pt.
+
+    Nothing else is needed, because order, flips and random draws depend only on the seed, the epoch
+    and the step.
+    """
     before = Config.read(out / CONFIG) if (out / CONFIG).is_file() else config
-    changed = [f.name for f in dataclasses.fields(Config) if getattr(before, f.name) != getattr(config, f.name)]
+    changed = [
+        f.name
+        for f in dataclasses.fields(Config)
+        if getattr(before, f.name) != getattr(config, f.name)
+    ]
     if changed := [
-        name for name in changed if name not in ("epochs", "patience", "workers", "save_every", "keep_samples")
+        name
+        for name in changed
+        if name not in ("epochs", "patience", "workers", "save_every", "keep_samples")
     ]:
         raise ConflictError(
             out / CONFIG,
@@ -175,7 +209,9 @@ def _prepare(network: nn.Module, config: Config, processes: Processes) -> nn.Mod
         network = DistributedDataParallel(network, device_ids=ids)
     if config.compile and not fixed_shapes:
         raise ArgumentError(
-            "compile", expected=f"False for {config.network}, whose inputs have no fixed shapes", found="True"
+            "compile",
+            expected=f"False for {config.network}, whose inputs have no fixed shapes",
+            found="True",
         )
     if config.compile:
         check_compiler(processes.device)
@@ -193,18 +229,26 @@ def _train_epoch(
     processes: Processes,
     save: Callable[[], None],
 ) -> None:
-    """Make the remaining steps of an epoch, and record them in `progress`. `networks` are the network itself, and its wrapped form."""
+    """Make the remaining steps of an epoch, and record them in `progress`.
+
+    `networks` are the network itself, and its wrapped form.
+    """
     networks[1].train()
     epoch, line = progress.epoch, Line()
     for step, batch in enumerate(loader.epoch(epoch, progress.step), progress.step):
         try:
-            loss = _train_step(networks, optimizer, batch, class_weights, (epoch, step), config, processes)
+            loss = _train_step(
+                networks, optimizer, batch, class_weights, (epoch, step), config, processes
+            )
         except (torch.OutOfMemoryError, RuntimeError, ValueError) as error:
-            if "more than 1 value per channel" in str(error):  # torch's message for a batch norm with a single value
+            # torch's message for a batch norm with a single value
+            if "more than 1 value per channel" in str(error):
                 raise CarlascError(
                     f"epoch {epoch + 1}, batch {step + 1}",
-                    problem=f"{len(batch['frame'])} sample is too little for a batch norm on such a small grid",
-                    advice=f"choose a batch_size so that the last batch of the {len(loader.data)} samples has more than one",
+                    problem=f"{len(batch['frame'])} sample is too little for a batch norm on such "
+                    f"a small grid",
+                    advice=f"choose a batch_size so that the last batch of the {len(loader.data)} "
+                    f"samples has more than one",
                 ) from error
             if not _is_out_of_memory(error):
                 raise
@@ -216,18 +260,27 @@ def _train_epoch(
                 + ("" if config.precision == "bf16" else " or --set precision=bf16"),
             ) from error
         if not math.isfinite(loss):
-            names = ", ".join(f"{s} {int(f)}" for s, f in zip(batch["sequence"], batch["frame"], strict=True))
+            names = ", ".join(
+                f"{s} {int(f)}" for s, f in zip(batch["sequence"], batch["frame"], strict=True)
+            )
             raise CarlascError(
                 f"epoch {epoch + 1}, batch {step + 1}",
                 problem=f"the loss is {loss} (frames {names})",
                 advice=f"try a smaller learning rate; the last finished epoch is in {LAST}",
             )
         progress.step, progress.loss_so_far = step + 1, progress.loss_so_far + loss
-        if config.save_every and progress.step % config.save_every == 0 and progress.step < len(loader):
+        if (
+            config.save_every
+            and progress.step % config.save_every == 0
+            and progress.step < len(loader)
+        ):
             save()
         if processes.first:
             mean = progress.loss_so_far / (step + 1)
-            line.show(f"epoch {epoch + 1}/{config.epochs}  batch {step + 1}/{len(loader)}  loss {mean:.4f}")
+            line.show(
+                f"epoch {epoch + 1}/{config.epochs}  batch {step + 1}/{len(loader)}  loss "
+                f"{mean:.4f}"
+            )
 
 
 def _train_step(
@@ -256,7 +309,8 @@ def _train_step(
     factors, offset = task.balance(network, sums)
     own = (factors * sums / weights.clamp_min(1e-12)).sum()  # this process's share of the loss
     optimizer.zero_grad(set_to_none=True)
-    torch.autograd.backward(own * processes.world + offset)  # gradients are averaged over the processes
+    # gradients are averaged over the processes
+    torch.autograd.backward(own * processes.world + offset)
     optimizer.step()
     return float(processes.sum(own.detach()) + offset.detach())
 
@@ -278,7 +332,8 @@ def _print_epoch(progress: Progress, config: Config, matrix: ConfusionMatrix) ->
     mark = "  best" if progress.best_epoch == progress.epoch else ""
     start = "\r" if sys.stderr.isatty() else ""
     print(
-        f"{start}epoch {progress.epoch}/{config.epochs}  loss {progress.losses[-1]:.4f}  mIoU {100 * matrix.miou:.2f}"
+        f"{start}epoch {progress.epoch}/{config.epochs}  loss {progress.losses[-1]:.4f}  mIoU "
+        f"{100 * matrix.miou:.2f}"
         f"  IoU {100 * geometry.iou:.2f}  {progress.samples_per_s[-1]:.1f} samples/s{mark}",
         file=sys.stderr,
     )

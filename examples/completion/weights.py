@@ -1,4 +1,7 @@
-"""Reading and writing weights: state dicts as `.pt` or `.safetensors`. Code in a file is never run."""
+"""Reading and writing weights: state dicts as `.pt` or `.safetensors`.
+
+Code in a file is never run.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +27,11 @@ _MARKS = {  # a name that only the state dict of one network has, searched in th
     "js3cnet_kitti": "seg_head.sparseModel.2.0.1.0.weight",
     "baseline": "voxels.weight",
 }
+# networks whose weights have the same names as those of another
 _VARIANTS = {
     "js3cnet_exact": "js3cnet",
     "baseline_hits": "baseline",
-}  # networks whose weights have the same names as those of another
+}
 
 
 def read_weights(path: Path) -> StateDict:
@@ -47,7 +51,9 @@ def read_weights(path: Path) -> StateDict:
         state = read_checkpoint(path)
     if isinstance(state.get("network"), dict) and "epoch" in state:  # a checkpoint of ours
         state = state["network"]
-    if not state or not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()):
+    if not state or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    ):
         raise FormatError(path, expected="a state dict (names to tensors)", found=_describe(state))
     return state
 
@@ -61,13 +67,20 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     with reading(path, "a state dict without code, which would not be run"):
         state = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(state, Mapping):
-        raise FormatError(path, expected="a state dict (names to tensors)", found=f"{type(state).__name__}")
+        raise FormatError(
+            path, expected="a state dict (names to tensors)", found=f"{type(state).__name__}"
+        )
     return dict(state)
 
 
 def write_weights(path: Path, network: nn.Module) -> None:
-    """Write a network's state dict, as safetensors if the name ends in .safetensors. The file is complete or does not exist."""
-    state = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
+    """Write a network's state dict, as safetensors if the name ends in .safetensors.
+
+    The file is complete or does not exist.
+    """
+    state = {
+        name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
+    }
     if path.suffix == ".safetensors":
         path.parent.mkdir(parents=True, exist_ok=True)
         import_extra("safetensors.torch", "torch").save_file(state, _beside(path))
@@ -87,7 +100,8 @@ def load_weights(network: nn.Module, state: Mapping[str, Tensor], where: str) ->
     """Load a state dict strictly; `where` is the file named in errors.
 
     Raises:
-        FormatError: a layer is missing, unknown, or of another shape; the message names it and both shapes.
+        FormatError: a layer is missing, unknown, or of another shape; the message names it and both
+            shapes.
     """
     own = network.state_dict()
     for name, value in own.items():
@@ -115,10 +129,13 @@ def load_weights(network: nn.Module, state: Mapping[str, Tensor], where: str) ->
     network.load_state_dict(dict(state), strict=True)
 
 
-def identify(state: Mapping[str, Tensor], where: str, trained: str | None = None) -> tuple[str, int]:
+def identify(
+    state: Mapping[str, Tensor], where: str, trained: str | None = None
+) -> tuple[str, int]:
     """Return the name of the network that a state dict belongs to, and the number of classes.
 
-    `trained` is the name of the network in the settings of the run, which decides between networks with the same weights.
+    `trained` is the name of the network in the settings of the run, which decides between networks
+    with the same weights.
 
     Raises:
         FormatError: the network is unknown.
@@ -126,7 +143,9 @@ def identify(state: Mapping[str, Tensor], where: str, trained: str | None = None
     name = next((name for name, mark in _MARKS.items() if mark in state), None)
     if name is None:
         raise FormatError(
-            where, expected=f"weights of {', '.join(_MARKS)}", found=f"a first layer named {next(iter(state))}"
+            where,
+            expected=f"weights of {', '.join(_MARKS)}",
+            found=f"a first layer named {next(iter(state))}",
         )
     if trained in _VARIANTS and _VARIANTS[trained] == name:
         name = trained
@@ -141,7 +160,9 @@ def identify(state: Mapping[str, Tensor], where: str, trained: str | None = None
     layer = last.get(_VARIANTS.get(name, name), "seg_head_1_1.conv_classes.bias")
     if layer not in state or not state[layer].ndim:
         found = _shape(state[layer]) if layer in state else "none"
-        raise FormatError(where, expected=f"the layer {layer}, a number for each class", found=found)
+        raise FormatError(
+            where, expected=f"the layer {layer}, a number for each class", found=found
+        )
     return name, len(state[layer])
 
 
@@ -156,7 +177,11 @@ def _advice(layer: str) -> str:
 
 
 def _describe(state: Mapping[str, Any]) -> str:
-    other = [name for name, value in state.items() if not (isinstance(name, str) and isinstance(value, Tensor))]
+    other = [
+        name
+        for name, value in state.items()
+        if not (isinstance(name, str) and isinstance(value, Tensor))
+    ]
     return f"{type(state[other[0]]).__name__} under {other[0]!r}" if other else "an empty one"
 
 

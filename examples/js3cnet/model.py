@@ -1,6 +1,8 @@
-"""JS3C-Net: a sparse U-Net labels the points, a dense network completes the scene from their logits, and nearby points refine each voxel.
+"""JS3C-Net: a sparse U-Net labels the points, a dense network completes the scene from their
+logits, and nearby points refine each voxel.
 
-X. Yan et al.: Sparse Single Sweep LiDAR Point Cloud Segmentation via Learning Contextual Shape Priors from Scene Completion, AAAI 2021.
+X. Yan et al.: Sparse Single Sweep LiDAR Point Cloud Segmentation via Learning Contextual Shape
+Priors from Scene Completion, AAAI 2021.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ NEIGHBOURS = 8
 
 
 class Prediction(NamedTuple):
-    """The output: (N, K - 1) logits of all points, scan after scan, and (B, X, Y, Z, K) logits of the voxels."""
+    """The output: (N, K - 1) logits of all points, scan after scan, and (B, X, Y, Z, K) logits of
+    the voxels.
+    """
 
     points: Tensor
     voxels: Tensor
@@ -43,7 +47,9 @@ class Unit(nn.Module):
 
     def forward(self, rows: Tensor) -> Tensor:
         """Take (N, C) to (N, D)."""
-        return leaky_relu(self.bn["bn"](linear(rows, self.get_parameter(self._weight).flatten(1))), 0.2)
+        return leaky_relu(
+            self.bn["bn"](linear(rows, self.get_parameter(self._weight).flatten(1))), 0.2
+        )
 
 
 class SegmentationHead(nn.Module):
@@ -59,16 +65,20 @@ class SegmentationHead(nn.Module):
         self.linear = nn.Linear(WIDTH, num_classes)
 
     def forward(self, features: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Take (N, inputs) features and (N, 4) int64 cells (item, x, y, z) to (N, K - 1) logits and (N, 16) shape features."""
+        """Take (N, inputs) features and (N, 4) int64 cells (item, x, y, z) to (N, K - 1) logits and
+        (N, 16) shape features.
+        """
         x = self.sparseModel((features, cells))
         shape = self.shape_embedding(x)
         return self.linear(x + shape), shape
 
 
 def pool(features: Tensor, cells: Tensor, size: tuple[int, int, int, int]) -> Tensor:
-    """Return a dense volume of the points' features: zeros, and the mean over five slots where a cell has points.
+    """Return a dense volume of the points' features: zeros, and the mean over five slots where a
+    cell has points.
 
-    The slots hold the first five points of the cell in order; remaining slots hold the first point again.
+    The slots hold the first five points of the cell in order; remaining slots hold the first point
+    again.
 
     Args:
         features: (N, C).
@@ -80,17 +90,23 @@ def pool(features: Tensor, cells: Tensor, size: tuple[int, int, int, int]) -> Te
     """
     ordered, points = cells.sort(stable=True)
     _, counts = torch.unique_consecutive(ordered, return_counts=True)
-    rank = torch.arange(len(cells), device=cells.device) - (counts.cumsum(0) - counts).repeat_interleave(counts)
+    rank = torch.arange(len(cells), device=cells.device) - (
+        counts.cumsum(0) - counts
+    ).repeat_interleave(counts)
     empty = (POINTS_PER_CELL - counts).clamp_min(0).repeat_interleave(counts)
     slots = torch.where(rank == 0, 1 + empty, 1)
     kept = rank < POINTS_PER_CELL
     rows = features[points[kept]] * (slots[kept] / POINTS_PER_CELL).unsqueeze(1).to(features.dtype)
     batch, x, y, z = size
-    volume = features.new_zeros(batch * x * y * z, features.shape[1]).index_add(0, ordered[kept], rows)
+    volume = features.new_zeros(batch * x * y * z, features.shape[1]).index_add(
+        0, ordered[kept], rows
+    )
     return volume.reshape(batch, x, y, z, -1).permute(0, 4, 1, 2, 3)
 
 
-def convolution(inputs: int, outputs: int, kernel: int = 3, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+def convolution(
+    inputs: int, outputs: int, kernel: int = 3, stride: int = 1, dilation: int = 1
+) -> nn.Sequential:
     """Return a dense convolution with batch norm and ReLU."""
     padding = kernel // 2 * dilation
     layer = nn.Conv3d(inputs, outputs, kernel, stride, padding, dilation)
@@ -126,10 +142,12 @@ class Decoder(nn.Module):
 
 
 def nearest(supports: Tensor, queries: Tensor, search: Search) -> Tensor:
-    """Return the (Q, 8) int64 nearest supports of each query, the nearest first, for whole-numbered positions (S, 3) and (Q, 3).
+    """Return the (Q, 8) int64 nearest supports of each query, the nearest first, for whole-numbered
+    positions (S, 3) and (Q, 3).
 
-    "topk" takes the lower index if two are equally near. "tree" takes either, and is many times faster on a CPU. If there are fewer than
-    eight supports, the first one is repeated. It also replaces index 0, which the reference implementation treats as empty.
+    "topk" takes the lower index if two are equally near. "tree" takes either, and is many times
+    faster on a CPU. If there are fewer than eight supports, the first one is repeated. It also
+    replaces index 0, which the reference implementation treats as empty.
     """
     count = min(NEIGHBOURS, len(supports))
     if search == "tree":
@@ -139,7 +157,8 @@ def nearest(supports: Tensor, queries: Tensor, search: Search) -> Tensor:
     else:
         places, own = torch.arange(len(supports), device=queries.device), supports.double()
         parts = []
-        for part in torch.split(queries.double(), max(1, 2**24 // len(supports))):  # 128 MiB of distances at a time
+        # 128 MiB of distances at a time
+        for part in torch.split(queries.double(), max(1, 2**24 // len(supports))):
             squared = (part**2).sum(1, keepdim=True) + (own**2).sum(1) - 2 * part @ own.T
             parts.append((squared * len(supports) + places).topk(count, largest=False).indices)
         found = torch.cat(parts)
@@ -148,7 +167,9 @@ def nearest(supports: Tensor, queries: Tensor, search: Search) -> Tensor:
 
 
 class Interaction(nn.Module):
-    """Refines the logits of each coarse voxel with the shape features of the occupied voxels nearest to it."""
+    """Refines the logits of each coarse voxel with the shape features of the occupied voxels
+    nearest to it.
+    """
 
     lower: Tensor  # (3,) float32, the corner of the grid
     voxel: Tensor  # (3,) float32, the widths of a voxel
@@ -164,21 +185,40 @@ class Interaction(nn.Module):
         self.register_buffer("voxel", voxel.float(), persistent=False)
 
     def forward(self, coarse: Tensor, shape: Tensor) -> Tensor:
-        """Take (B, K, x, y, z) coarse logits and a (B, 16, X, Y, Z) volume of shape features to fused coarse logits."""
-        cells = torch.cartesian_prod(*(torch.arange(n, device=coarse.device) for n in coarse.shape[2:]))
+        """Take (B, K, x, y, z) coarse logits and a (B, 16, X, Y, Z) volume of shape features to
+        fused coarse logits.
+        """
+        cells = torch.cartesian_prod(
+            *(torch.arange(n, device=coarse.device) for n in coarse.shape[2:])
+        )
         near = coarse.new_zeros(len(coarse), len(cells), WIDTH)
-        found = {item: self._relate(cells, volume) for item, volume in enumerate(shape.detach()) if volume.any()}
+        found = {
+            item: self._relate(cells, volume)
+            for item, volume in enumerate(shape.detach())
+            if volume.any()
+        }
         if found:  # otherwise, no point is inside the grid
-            relations, features = (torch.stack(parts) for parts in zip(*found.values(), strict=True))
+            relations, features = (
+                torch.stack(parts) for parts in zip(*found.values(), strict=True)
+            )
             weights = self.relation_w(relations.flatten(0, 2)).reshape(features.shape)
             near = near.index_copy(
-                0, torch.tensor(list(found), device=near.device), (features * weights).mean(2).to(near.dtype)
+                0,
+                torch.tensor(list(found), device=near.device),
+                (features * weights).mean(2).to(near.dtype),
             )
         rows = torch.cat([near, coarse.flatten(2).transpose(1, 2)], 2).flatten(0, 1)
-        return self.fuse_mlps(rows).reshape(len(coarse), len(cells), -1).transpose(1, 2).reshape(coarse.shape)
+        return (
+            self.fuse_mlps(rows)
+            .reshape(len(coarse), len(cells), -1)
+            .transpose(1, 2)
+            .reshape(coarse.shape)
+        )
 
     def _relate(self, cells: Tensor, volume: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (Q, 8, 10) positions of the neighbours of each coarse cell, and (Q, 8, 16) their features, for one item."""
+        """Return (Q, 8, 10) positions of the neighbours of each coarse cell, and (Q, 8, 16) their
+        features, for one item.
+        """
         supports = volume.any(0).nonzero()
         here, there = self._centres(cells, 2), self._centres(supports, 1)
         if self.exact:  # in units of half a voxel
@@ -190,7 +230,9 @@ class Interaction(nn.Module):
         return relation, volume[:, supports[:, 0], supports[:, 1], supports[:, 2]].T[found]
 
     def _centres(self, cells: Tensor, step: int) -> Tensor:
-        """Return the centres of cells that are `step` voxels wide, in metres; without `exact`, in whole metres, as in the reference implementation."""
+        """Return the centres of cells that are `step` voxels wide, in metres; without `exact`, in
+        whole metres, as in the reference implementation.
+        """
         centres = (cells + 0.5) * (step * self.voxel) + self.lower
         return centres if self.exact else centres.trunc()
 
@@ -198,14 +240,20 @@ class Interaction(nn.Module):
 class CompletionHead(nn.Module):
     """From a dense volume of point features to the logits of all voxels."""
 
-    def __init__(self, inputs: int, num_classes: int, spec: GridSpec, exact: bool, search: Search) -> None:
+    def __init__(
+        self, inputs: int, num_classes: int, spec: GridSpec, exact: bool, search: Search
+    ) -> None:
         super().__init__()
         self.Decoder = Decoder(inputs, num_classes)
         self.interaction_module = Interaction(num_classes, spec, exact, search)
-        self.upsample = nn.Sequential(nn.Conv3d(num_classes, 8 * num_classes, 1), nn.BatchNorm3d(8 * num_classes))
+        self.upsample = nn.Sequential(
+            nn.Conv3d(num_classes, 8 * num_classes, 1), nn.BatchNorm3d(8 * num_classes)
+        )
 
     def forward(self, volume: Tensor) -> Tensor:
-        """Take (B, F, X, Y, Z), the last 16 of F the shape features, to (B, X, Y, Z, K) logits, which are 0 or more."""
+        """Take (B, F, X, Y, Z), the last 16 of F the shape features, to (B, X, Y, Z, K) logits,
+        which are 0 or more.
+        """
         fused = self.interaction_module(self.Decoder(volume), volume[:, -WIDTH:])
         parts = self.upsample(fused).relu().unflatten(1, (-1, 2, 2, 2))  # (B, K, a, b, d, x, y, z)
         return parts.permute(0, 5, 2, 6, 3, 7, 4, 1).reshape(len(volume), *volume.shape[2:], -1)
@@ -219,7 +267,8 @@ class JS3CNet(nn.Module):
         spec: the Cartesian grid to complete. X, Y and Z must be even.
         channels: columns of a point (x, y, z in metres, and a fourth) that are its features.
         residual: use residual blocks in the U-Net.
-        exact: search neighbours by their true distance. The reference implementation truncates all positions to whole metres.
+        exact: search neighbours by their true distance. The reference implementation truncates all
+            positions to whole metres.
         search: how neighbours are searched: "tree" (needs SciPy) or "topk".
     """
 
@@ -237,26 +286,43 @@ class JS3CNet(nn.Module):
     ) -> None:
         super().__init__()
         if spec.coordinates != "cartesian":
-            raise ArgumentError("grid", expected="a Cartesian one for JS3C-Net", found=spec.coordinates)
+            raise ArgumentError(
+                "grid", expected="a Cartesian one for JS3C-Net", found=spec.coordinates
+            )
         self.spec, self.channels = spec, list(channels)
         self.seg_head = SegmentationHead(num_classes - 1, len(channels), residual)
-        self.complet_head = CompletionHead(num_classes - 1 + WIDTH, num_classes, spec, exact, search)
-        self.seg_sigma, self.complet_sigma = (nn.Parameter(torch.empty(1).uniform_(0.2, 1)) for _ in range(2))
+        self.complet_head = CompletionHead(
+            num_classes - 1 + WIDTH, num_classes, spec, exact, search
+        )
+        self.seg_sigma, self.complet_sigma = (
+            nn.Parameter(torch.empty(1).uniform_(0.2, 1)) for _ in range(2)
+        )
         # Weights of the published files that the network does not use.
-        self.voxelpool = nn.ModuleDict({"relation_w": nn.Conv1d(10, WIDTH, 1)}).requires_grad_(False)
+        self.voxelpool = nn.ModuleDict({"relation_w": nn.Conv1d(10, WIDTH, 1)}).requires_grad_(
+            False
+        )
 
     def forward(self, points: Sequence[Tensor], cells: Sequence[Tensor]) -> Prediction:
         """Label points and complete scans.
 
         Args:
-            points: (N_i, 4) float32 of each scan, sensor frame, metres; the fourth column is used by some configurations.
-            cells: (N_i, 3) int64, the U-Net's cell of each point, 0 or more (see `js3cnet.task.site_cells`).
+            points: (N_i, 4) float32 of each scan, sensor frame, metres; the fourth column is used
+                by some configurations.
+            cells: (N_i, 3) int64, the U-Net's cell of each point, 0 or more (see
+                `js3cnet.task.site_cells`).
         """
         logits, shape = self.segment(points, cells)
         places = [self._places(scan[:, :3]) for scan in points]
-        flat = torch.cat([place + item * self.spec.num_voxels * (place >= 0) for item, place in enumerate(places)])
+        flat = torch.cat(
+            [
+                place + item * self.spec.num_voxels * (place >= 0)
+                for item, place in enumerate(places)
+            ]
+        )
         inside = flat >= 0
-        volume = pool(torch.cat([logits, shape], 1)[inside], flat[inside], (len(points), *self.spec.size))
+        volume = pool(
+            torch.cat([logits, shape], 1)[inside], flat[inside], (len(points), *self.spec.size)
+        )
         return Prediction(logits, self.complet_head(volume))
 
     def segment(self, points: Sequence[Tensor], cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -265,12 +331,17 @@ class JS3CNet(nn.Module):
         return self.seg_head(torch.cat(list(points))[:, self.channels], torch.cat(keyed))
 
     def _places(self, xyz: Tensor) -> Tensor:
-        """Return the flat index of each point's voxel, -1 outside. The reference divides in float64, by bounds in float32."""
+        """Return the flat index of each point's voxel, -1 outside.
+
+        The reference divides in float64, by bounds in float32.
+        """
         lower, voxel = (value.to(xyz.device) for value in _geometry(self.spec))
         size = torch.tensor(self.spec.size, device=xyz.device)
         grid = ((xyz.double() - lower) / voxel).floor().long()
         x, y, z = grid.unbind(1)
-        return torch.where(((grid >= 0) & (grid < size)).all(1), (x * size[1] + y) * size[2] + z, -1)
+        return torch.where(
+            ((grid >= 0) & (grid < size)).all(1), (x * size[1] + y) * size[2] + z, -1
+        )
 
 
 def _geometry(spec: GridSpec) -> tuple[Tensor, Tensor]:

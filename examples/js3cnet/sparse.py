@@ -1,9 +1,11 @@
 """Sparse 3-D convolutions in plain PyTorch, and the U-Net that JS3C-Net builds of them.
 
-Features exist only at sites: the voxels that hold a point. Sites are sorted by one integer key each, so that neighbours are found by
-binary search, and a convolution is one gather, one matrix product and one `index_add` per kernel offset. There is no dense volume.
-Rows are gathered by `index_select`, which on a CPU is several times faster than indexing with brackets.
-Names, order and layout of the weights are those of SparseConvNet (B. Graham et al., CVPR 2018), whose checkpoints load unchanged.
+Features exist only at sites: the voxels that hold a point. Sites are sorted by one integer key
+each, so that neighbours are found by binary search, and a convolution is one gather, one matrix
+product and one `index_add` per kernel offset. There is no dense volume. Rows are gathered by
+`index_select`, which on a CPU is several times faster than indexing with brackets. Names, order and
+layout of the weights are those of SparseConvNet (B. Graham et al., CVPR 2018), whose checkpoints
+load unchanged.
 """
 
 from __future__ import annotations
@@ -26,15 +28,15 @@ class Level:
 
     def __init__(self, cells: Tensor) -> None:
         """Find the sites among (N, 4) int64 `cells`, which may repeat."""
-        self._side = (
-            int(cells[:, 1:].max()) + 3 if len(cells) else 3
-        )  # a neighbour beyond the border has a key of its own
+        # a neighbour beyond the border has a key of its own
+        self._side = int(cells[:, 1:].max()) + 3 if len(cells) else 3
         self._keys, self.site_of = torch.unique(self._pack(cells), return_inverse=True)
         self.cells = cells.new_empty(len(self._keys), 4).index_copy_(0, self.site_of, cells)
 
     @cached_property
     def neighbours(self) -> list[tuple[Tensor, Tensor]]:
-        """For the first 13 of the 27 offsets of a 3 x 3 x 3 kernel: the (P,) sites s + offset, and the (P,) sites s.
+        """For the first 13 of the 27 offsets of a 3 x 3 x 3 kernel: the (P,) sites s + offset, and
+        the (P,) sites s.
 
         The other offsets are the opposite ones, whose pairs are these in reverse.
         """
@@ -42,21 +44,27 @@ class Level:
         for k in range(13):
             dx, dy, dz = k // 9 - 1, k // 3 % 3 - 1, k % 3 - 1
             wanted = self._keys + ((dx * self._side) + dy) * self._side + dz
-            place = torch.searchsorted(self._keys, wanted)  # an earlier key, so that the index is never beyond the end
+            # an earlier key, so that the index is never beyond the end
+            place = torch.searchsorted(self._keys, wanted)
             sites = (self._keys[place] == wanted).nonzero().squeeze(1)
             pairs.append((place[sites], sites))
         return pairs
 
     @cached_property
     def coarser(self) -> Level:
-        """The sites at half the resolution. Its `site_of` is the parent of each site of this level."""
+        """The sites at half the resolution.
+
+        Its `site_of` is the parent of each site of this level.
+        """
         halved = self.cells.clone()
         halved[:, 1:] //= 2
         return Level(halved)
 
     @cached_property
     def children(self) -> list[Tensor]:
-        """For each of the 8 offsets of a 2 x 2 x 2 kernel, the sites that have it from their parent."""
+        """For each of the 8 offsets of a 2 x 2 x 2 kernel, the sites that have it from their
+        parent.
+        """
         x, y, z = (self.cells[:, 1:] % 2).unbind(1)
         offsets = 4 * x + 2 * y + z
         return [(offsets == k).nonzero().squeeze(1) for k in range(8)]
@@ -67,7 +75,9 @@ class Level:
 
 
 class Sites(NamedTuple):
-    """Features (S, C) at the sites of the last of `levels`, which are those that led here, the finest first."""
+    """Features (S, C) at the sites of the last of `levels`, which are those that led here, the
+    finest first.
+    """
 
     features: Tensor
     levels: tuple[Level, ...]
@@ -80,7 +90,9 @@ class ToSites(nn.Module):
         """Take (N, C) float32 features and (N, 4) int64 cells."""
         features, cells = points
         level = Level(cells)
-        sums = features.new_zeros(len(level.cells), features.shape[1]).index_add(0, level.site_of, features)
+        sums = features.new_zeros(len(level.cells), features.shape[1]).index_add(
+            0, level.site_of, features
+        )
         counts = torch.bincount(level.site_of, minlength=len(level.cells))
         return Sites(sums / counts.unsqueeze(1), (level,))
 
@@ -101,12 +113,18 @@ class NormReLU(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.weight, self.bias = nn.Parameter(torch.ones(channels)), nn.Parameter(torch.zeros(channels))
+        self.weight, self.bias = (
+            nn.Parameter(torch.ones(channels)),
+            nn.Parameter(torch.zeros(channels)),
+        )
         self.register_buffer("running_mean", torch.zeros(channels))
         self.register_buffer("running_var", torch.ones(channels))
 
     def forward(self, sites: Sites) -> Sites:
-        """Return sites of the same level. A single site has no variance: the running statistics are used for it."""
+        """Return sites of the same level.
+
+        A single site has no variance: the running statistics are used for it.
+        """
         training = self.training and len(sites.features) > 1
         own = self.running_mean, self.running_var, self.weight, self.bias
         normed = batch_norm(sites.features, *own, training, momentum=0.1, eps=1e-4)
@@ -130,7 +148,9 @@ class Convolution(nn.Module):
 
 
 class SameSites(Convolution):
-    """A submanifold convolution, 3 x 3 x 3: sites stay the same, and absent neighbours count as zero."""
+    """A submanifold convolution, 3 x 3 x 3: sites stay the same, and absent neighbours count as
+    zero.
+    """
 
     def forward(self, sites: Sites) -> Sites:
         """Return sites of the same level."""
@@ -209,16 +229,24 @@ class Join(nn.Module):
 
 
 def block(inputs: int, outputs: int, residual: bool) -> list[nn.Module]:
-    """Return the modules of a block: norm, ReLU, convolution; residual: twice, and a shortcut around both."""
+    """Return the modules of a block: norm, ReLU, convolution; residual: twice, and a shortcut
+    around both.
+    """
     once = [NormReLU(inputs), SameSites(inputs, outputs)]
     if not residual:
         return [nn.Sequential(*once)]
     shortcut = nn.Identity() if inputs == outputs else PerSite(inputs, outputs)
-    return [Table([shortcut, nn.Sequential(*once, NormReLU(outputs), SameSites(outputs, outputs))]), Add()]
+    return [
+        Table([shortcut, nn.Sequential(*once, NormReLU(outputs), SameSites(outputs, outputs))]),
+        Add(),
+    ]
 
 
 def unet(widths: tuple[int, ...], residual: bool) -> nn.Sequential:
-    """Return the U-Net whose levels have these widths, the finest first. Its order makes the names of SparseConvNet's weights."""
+    """Return the U-Net whose levels have these widths, the finest first.
+
+    Its order makes the names of SparseConvNet's weights.
+    """
     width, *deeper = widths
     if not deeper:
         return nn.Sequential(*block(width, width, residual))

@@ -30,7 +30,9 @@ class PointsAndVoxels(Task):
     weighting = "root"
     fixed_shapes = False
 
-    def __init__(self, voxel_m: float = 0.1, extent: int = 2048, *, remission: bool = False) -> None:
+    def __init__(
+        self, voxel_m: float = 0.1, extent: int = 2048, *, remission: bool = False
+    ) -> None:
         self.fields = ("points", "remission") if remission else ("points",)
         self.voxel_m = voxel_m
         self.extent = extent
@@ -41,11 +43,14 @@ class PointsAndVoxels(Task):
         return {name: np.array(columns[name], np.float32, order="C") for name in self.fields}
 
     def example(self, spec: GridSpec, history: int, rng: np.random.Generator) -> Batch:
-        """Return a scan of 120,000 points: 64 beams in a street with houses on both sides, with noise of 2 cm."""
+        """Return a scan of 120,000 points: 64 beams in a street with houses on both sides, with
+        noise of 2 cm.
+        """
         azimuth = np.tile(np.linspace(-np.pi, np.pi, 1875, endpoint=False), 64)
         elevation = np.repeat(np.radians(np.linspace(-24.8, 2.0, 64)), 1875)
         rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], 1)
-        side_m = 9 + 3 * (np.floor(8 * azimuth / np.pi) % 3)  # distance of the fronts of houses from the sensor
+        # distance of the fronts of houses from the sensor
+        side_m = 9 + 3 * (np.floor(8 * azimuth / np.pi) % 3)
         with np.errstate(divide="ignore"):
             reach = np.minimum(side_m / np.abs(rays[:, 1]), 45)
             ground = np.where(rays[:, 2] < 0, -1.8 / rays[:, 2], np.inf)
@@ -57,11 +62,14 @@ class PointsAndVoxels(Task):
         """Return (X, Y, Z) occupancy of a sample's scan, for pictures."""
         return VOXELS.from_scan(sample["points"], spec)["occupancy"][0]
 
-    def prepare(self, batch: Batch, device: torch.device, draw: torch.Generator | None = None) -> Batch:
+    def prepare(
+        self, batch: Batch, device: torch.device, draw: torch.Generator | None = None
+    ) -> Batch:
         """Add the U-Net's `cells`, and leave points beyond them out.
 
         Raises:
-            ArgumentError: a scan has no points, or values that are not finite, or no remission if it needs one; names the frame.
+            ArgumentError: a scan has no points, or values that are not finite, or no remission if
+                it needs one; names the frame.
         """
         prepared = {**batch} | {"points": [], "cells": [], "point_labels": []}
         for i, xyz in enumerate(batch["points"]):
@@ -69,7 +77,10 @@ class PointsAndVoxels(Task):
             if "remission" in self.fields:
                 scan[:, 3] = batch["remission"][i]
             self._check(
-                scan, f"{batch['sequence'][i]} {int(batch['frame'][i])}: points" if "frame" in batch else "points"
+                scan,
+                f"{batch['sequence'][i]} {int(batch['frame'][i])}: points"
+                if "frame" in batch
+                else "points",
             )
             cells, within = site_cells(xyz, self.voxel_m, self.extent, draw)
             prepared["points"].append(scan[within].to(device))
@@ -80,28 +91,49 @@ class PointsAndVoxels(Task):
 
     def _check(self, scan: Tensor, where: str) -> None:
         if not len(scan):
-            raise ArgumentError(where, expected="one point or more", found="none", advice="leave the frame out")
+            raise ArgumentError(
+                where, expected="one point or more", found="none", advice="leave the frame out"
+            )
         if wrong := int((~torch.isfinite(scan)).any(1).sum()):
-            raise ArgumentError(where, expected="finite values", found=f"{wrong} points with others")
+            raise ArgumentError(
+                where, expected="finite values", found=f"{wrong} points with others"
+            )
         if "remission" in self.fields and not scan[:, 3].any():
             raise ArgumentError(
-                where, expected="their remission in the fourth column, as in KITTI", found="zeros", advice="use js3cnet"
+                where,
+                expected="their remission in the fourth column, as in KITTI",
+                found="zeros",
+                advice="use js3cnet",
             )
 
     def arguments(self, batch: Batch, dtype: torch.dtype = torch.float32) -> tuple[Any, ...]:
         """Return points and cells."""
         return batch["points"], batch["cells"]
 
-    def loss(self, outputs: Prediction, batch: Batch, target: Tensor, class_weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the parts for the points and for the voxels. Points of class 0, which means free for voxels, are left out."""
+    def loss(
+        self, outputs: Prediction, batch: Batch, target: Tensor, class_weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the parts for the points and for the voxels.
+
+        Points of class 0, which means free for voxels, are left out.
+        """
         labels, weights = torch.cat(batch["point_labels"]).long() - 1, class_weights[1:]
-        points = cross_entropy(outputs.points.float(), labels, weights, ignore_index=-1, reduction="sum")
+        points = cross_entropy(
+            outputs.points.float(), labels, weights, ignore_index=-1, reduction="sum"
+        )
         voxels, counted = completion_loss(outputs.voxels, target, class_weights)
-        return torch.cat([points[None], voxels]), torch.cat([weights[labels[labels >= 0]].sum()[None], counted])
+        return torch.cat([points[None], voxels]), torch.cat(
+            [weights[labels[labels >= 0]].sum()[None], counted]
+        )
 
     def balance(self, network: nn.Module, parts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return 1 / s^2 of both parts, and the sum of 2 ln s: a larger s reduces the weight of its part."""
-        variances = torch.cat([network.get_parameter("seg_sigma"), network.get_parameter("complet_sigma")]) ** 2
+        """Return 1 / s^2 of both parts, and the sum of 2 ln s: a larger s reduces the weight of its
+        part.
+        """
+        variances = (
+            torch.cat([network.get_parameter("seg_sigma"), network.get_parameter("complet_sigma")])
+            ** 2
+        )
         return 1 / variances, variances.log().sum()
 
     def logits(self, outputs: Prediction) -> Tensor:
@@ -116,11 +148,14 @@ class PointsAndVoxels(Task):
                 module.momentum = max(0.5 * 0.5 ** (epoch // 10), 0.01)
 
 
-def site_cells(xyz: Tensor, voxel_m: float, extent: int, draw: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-    """Return the U-Net's (N, 3) int64 cell of each of (N, 3) points, and (N,) which of them are within its extent.
+def site_cells(
+    xyz: Tensor, voxel_m: float, extent: int, draw: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return the U-Net's (N, 3) int64 cell of each of (N, 3) points, and (N,) which of them are
+    within its extent.
 
-    With a generator the scan is sheared, mirrored, turned and moved at random, as the authors do for training. Without one it is only
-    moved to the corner of the grid.
+    With a generator the scan is sheared, mirrored, turned and moved at random, as the authors do
+    for training. Without one it is only moved to the corner of the grid.
     """
     if draw is None:
         moved, room = xyz / voxel_m, torch.zeros(3)
@@ -132,6 +167,8 @@ def site_cells(xyz: Tensor, voxel_m: float, extent: int, draw: torch.Generator |
         turn[0, 0] = turn[1, 1] = angle.cos()
         turn[0, 1], turn[1, 0] = angle.sin(), -angle.sin()
         moved = (xyz - xyz.mean(0)) @ (matrix / voxel_m @ turn)
-        room = (extent - 1 - (moved.amax(0) - moved.amin(0))).clamp_min(0) * torch.rand(3, generator=draw)
+        room = (extent - 1 - (moved.amax(0) - moved.amin(0))).clamp_min(0) * torch.rand(
+            3, generator=draw
+        )
     cells = (moved - moved.amin(0) + room).long()
     return cells, (cells < extent).all(1)

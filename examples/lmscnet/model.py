@@ -1,6 +1,8 @@
-"""LMSCNet: a 2-D U-Net over the ground plane, height as channels, and a light 3-D segmentation head.
+"""LMSCNet: a 2-D U-Net over the ground plane, height as channels, and a light 3-D segmentation
+head.
 
-L. Roldao, R. de Charette, A. Verroust-Blondet: LMSCNet: Lightweight Multiscale 3D Semantic Completion, 3DV 2020.
+L. Roldao, R. de Charette, A. Verroust-Blondet: LMSCNet: Lightweight Multiscale 3D Semantic
+Completion, 3DV 2020.
 """
 
 from __future__ import annotations
@@ -10,17 +12,30 @@ from torch import Tensor, nn
 
 
 class SegmentationHead(nn.Module):
-    """Lift (B, Z, X, Y) features to (B, K, Z, X, Y) logits: 3-D convolutions around a dilated pyramid (ASPP)."""
+    """Lift (B, Z, X, Y) features to (B, K, Z, X, Y) logits: 3-D convolutions around a dilated
+    pyramid (ASPP).
+    """
 
-    def __init__(self, num_classes: int, features: int = 8, dilations: tuple[int, ...] = (1, 2, 3)) -> None:
+    def __init__(
+        self, num_classes: int, features: int = 8, dilations: tuple[int, ...] = (1, 2, 3)
+    ) -> None:
         super().__init__()
 
         def branches() -> nn.ModuleList:
-            return nn.ModuleList(nn.Conv3d(features, features, 3, padding=d, dilation=d, bias=False) for d in dilations)
+            return nn.ModuleList(
+                nn.Conv3d(features, features, 3, padding=d, dilation=d, bias=False)
+                for d in dilations
+            )
 
         self.conv0 = nn.Conv3d(1, features, 3, padding=1)
-        self.conv1, self.bn1 = branches(), nn.ModuleList(nn.BatchNorm3d(features) for _ in dilations)
-        self.conv2, self.bn2 = branches(), nn.ModuleList(nn.BatchNorm3d(features) for _ in dilations)
+        self.conv1, self.bn1 = (
+            branches(),
+            nn.ModuleList(nn.BatchNorm3d(features) for _ in dilations),
+        )
+        self.conv2, self.bn2 = (
+            branches(),
+            nn.ModuleList(nn.BatchNorm3d(features) for _ in dilations),
+        )
         self.conv_classes = nn.Conv3d(features, num_classes, 3, padding=1)
 
     def forward(self, features: Tensor) -> Tensor:
@@ -38,11 +53,13 @@ def voxels_last(logits: Tensor) -> Tensor:
 
 
 class LMSCNet(nn.Module):
-    """LMSCNet SS (`multiscale=False`: one head, at full scale) or LMSCNet (heads at 1/1, 1/2, 1/4 and 1/8).
+    """LMSCNet SS (`multiscale=False`: one head, at full scale) or LMSCNet (heads at 1/1, 1/2, 1/4
+    and 1/8).
 
     Args:
         num_classes: K.
-        height: Z, cells along z; the number f of feature channels. X, Y and Z must be multiples of 8.
+        height: Z, cells along z; the number f of feature channels. X, Y and Z must be multiples of
+            8.
         multiscale: whether the coarse outputs are classified, too.
     """
 
@@ -51,7 +68,12 @@ class LMSCNet(nn.Module):
     def __init__(self, num_classes: int, height: int, *, multiscale: bool = False) -> None:
         super().__init__()
         f, f2, f3, f4 = height, int(height * 1.5), height * 2, int(height * 2.5)
-        c2, c4, c8 = height // 2, height // 4, height // 8  # channels of the coarse outputs: their heights
+        # channels of the coarse outputs: their heights
+        c2, c4, c8 = (
+            height // 2,
+            height // 4,
+            height // 8,
+        )
 
         self.Encoder_block1 = nn.Sequential(*_two_convolutions(f, f))
         self.Encoder_block2 = nn.Sequential(nn.MaxPool2d(2), *_two_convolutions(f, f2))
@@ -88,7 +110,8 @@ class LMSCNet(nn.Module):
             occupancy: (B, 1, X, Y, Z) float32, 1 where the scan has a point.
 
         Returns:
-            (B, X, Y, Z, K) logits. LMSCNet in training mode: a list of them, at 1/1, 1/2, 1/4 and 1/8 of the scale.
+            (B, X, Y, Z, K) logits. LMSCNet in training mode: a list of them, at 1/1, 1/2, 1/4 and
+            1/8 of the scale.
         """
         skip1 = self.Encoder_block1(occupancy[:, -1].permute(0, 3, 1, 2))
         skip2 = self.Encoder_block2(skip1)
@@ -101,7 +124,10 @@ class LMSCNet(nn.Module):
         x = torch.cat([self.deconv1_4(out4), skip2, self.deconv_1_8__1_2(out8)], dim=1)
         out2 = self.conv_out_scale_1_2(self.conv1_2(x).relu())
 
-        x = torch.cat([self.deconv1_2(out2), skip1, self.deconv_1_4__1_1(out4), self.deconv_1_8__1_1(out8)], dim=1)
+        x = torch.cat(
+            [self.deconv1_2(out2), skip1, self.deconv_1_4__1_1(out4), self.deconv_1_8__1_1(out8)],
+            dim=1,
+        )
         out1 = self.conv1_1(x).relu()
 
         full = voxels_last(self.seg_head_1_1(out1))

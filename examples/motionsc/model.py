@@ -1,7 +1,7 @@
 """MotionSC: a spatio-temporal pyramid over a stack of scans, and the segmentation head of LMSCNet.
 
-J. Wilson et al.: MotionSC: Data Set and Network for Real-Time Semantic Mapping in Dynamic Environments, RA-L 2022.
-The backbone is MotionNet's (P. Wu, S. Chen, D. Metaxas, CVPR 2020).
+J. Wilson et al.: MotionSC: Data Set and Network for Real-Time Semantic Mapping in Dynamic
+Environments, RA-L 2022. The backbone is MotionNet's (P. Wu, S. Chen, D. Metaxas, CVPR 2020).
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ class TemporalConvolution(nn.Module):
 
 
 class SpatioTemporalPyramid(nn.Module):
-    """MotionNet's backbone (STPN): four stages down, time convolved away after the first two, and four stages up.
+    """MotionNet's backbone (STPN): four stages down, time convolved away after the first two, and
+    four stages up.
 
     Args:
         height: Z, the channels of the input and of the output. X and Y must be multiples of 16.
@@ -57,7 +58,8 @@ class SpatioTemporalPyramid(nn.Module):
         x3 = self._encode("3", x2)
         x4 = self._encode("4", x3)
 
-        x0, x1, x2, x3, x4 = (features.amax(dim=1) for features in (x0, x1, x2, x3, x4))  # over what is left of time
+        # over what is left of time
+        x0, x1, x2, x3, x4 = (features.amax(dim=1) for features in (x0, x1, x2, x3, x4))
 
         x3 = self._decode("5", x4, x3)
         x2 = self._decode("6", x3, x2)
@@ -73,7 +75,10 @@ class SpatioTemporalPyramid(nn.Module):
 
     def _stage(self, name: str, x: Tensor) -> Tensor:
         for part in (1, 2):
-            convolution, norm = self.get_submodule(f"conv{name}_{part}"), self.get_submodule(f"bn{name}_{part}")
+            convolution, norm = (
+                self.get_submodule(f"conv{name}_{part}"),
+                self.get_submodule(f"bn{name}_{part}"),
+            )
             x = norm(convolution(x)).relu()
         return x
 

@@ -1,4 +1,5 @@
-"""Runs the notebooks from top to bottom, each in a folder that is removed afterwards, and keeps their outputs in them.
+"""Runs the notebooks from top to bottom, each in a folder that is removed afterwards, and keeps
+their outputs in them.
 
 `python examples/notebooks/run.py` after a change of a notebook, or of what it shows.
 """
@@ -20,11 +21,16 @@ def run(path: Path) -> nbformat.NotebookNode:
     """
     notebook = nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]
     with tempfile.TemporaryDirectory() as folder:
-        NotebookClient(notebook, timeout=600, resources={"metadata": {"path": folder}}, record_timing=False).execute()
+        NotebookClient(
+            notebook, timeout=600, resources={"metadata": {"path": folder}}, record_timing=False
+        ).execute()
     for cell in notebook.cells:
         for output in cell.get("outputs", ()):
             output.get("metadata", {}).clear()
-    notebook.metadata = {"kernelspec": notebook.metadata["kernelspec"], "language_info": {"name": "python"}}
+    notebook.metadata = {
+        "kernelspec": notebook.metadata["kernelspec"],
+        "language_info": {"name": "python"},
+    }
     return notebook
 
 

@@ -1,6 +1,8 @@
-"""SSCNet: 3-D convolutions with dilation at a quarter of the scale, and SSCNet-full, which learns the upsampling.
+"""SSCNet: 3-D convolutions with dilation at a quarter of the scale, and SSCNet-full, which learns
+the upsampling.
 
-S. Song et al.: Semantic Scene Completion from a Single Depth Image, CVPR 2017. SSCNet-full as in LMSCNet's paper.
+S. Song et al.: Semantic Scene Completion from a Single Depth Image, CVPR 2017. SSCNet-full as in
+LMSCNet's paper.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ class SSCNet(nn.Module):
 
     Args:
         num_classes: K. X, Y and Z must be multiples of 4.
-        full: upsample by a transposed convolution (SSCNet-full) rather than to the nearest coarse voxel.
+        full: upsample by a transposed convolution (SSCNet-full) rather than to the nearest coarse
+            voxel.
     """
 
     divisors = (4, 4, 4)  # cells of the grid must be multiples of these
@@ -35,8 +38,14 @@ class SSCNet(nn.Module):
         self.conv3_1, self.conv3_2 = convolution(32, 64), convolution(64, 64)
 
         self.conv3_3, self.conv3_4 = convolution(64, 64), convolution(64, 64)
-        self.conv3_5, self.conv3_6 = convolution(64, 64, dilation=2), convolution(64, 64, dilation=2)
-        self.conv3_7, self.conv3_8 = convolution(64, 64, dilation=2), convolution(64, 64, dilation=2)
+        self.conv3_5, self.conv3_6 = (
+            convolution(64, 64, dilation=2),
+            convolution(64, 64, dilation=2),
+        )
+        self.conv3_7, self.conv3_8 = (
+            convolution(64, 64, dilation=2),
+            convolution(64, 64, dilation=2),
+        )
 
         self.conv4_1, self.conv4_2 = nn.Conv3d(192, 128, 1), nn.Conv3d(128, 128, 1)
         if full:
@@ -68,7 +77,11 @@ class SSCNet(nn.Module):
 
         x = torch.cat([x4, x3, x2], dim=1)
         x = self.conv4_2(self.conv4_1(x).relu()).relu()
-        logits = self.deconv_classes(x) if self.full else interpolate(self.conv_classes(x), scale_factor=4)
+        logits = (
+            self.deconv_classes(x)
+            if self.full
+            else interpolate(self.conv_classes(x), scale_factor=4)
+        )
         return logits.permute(0, 3, 4, 2, 1)
 
 

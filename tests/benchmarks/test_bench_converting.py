@@ -29,7 +29,11 @@ def source(tmp_path_factory):
 
 
 def test_bench_copy(benchmark, source, tmp_path):
-    files = [path for name in ("velodyne", "labels") for path in sorted((source / "sequences" / "00" / name).iterdir())]
+    files = [
+        path
+        for name in ("velodyne", "labels")
+        for path in sorted((source / "sequences" / "00" / name).iterdir())
+    ]
 
     def copy():
         for path in files:
@@ -59,14 +63,20 @@ def test_bench_convert(benchmark, source, tmp_path):
 def traffic(tmp_path_factory):
     root = tmp_path_factory.mktemp("traffic")
     write_kitti(
-        root, TownDrive(4, "heavy", Lidar(channels=64, points=POINTS)), range(240, 240 + FRAMES), voxels_every=0
+        root,
+        TownDrive(4, "heavy", Lidar(channels=64, points=POINTS)),
+        range(240, 240 + FRAMES),
+        voxels_every=0,
     )
     return root
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_bench_convert_with_flow(benchmark, traffic, tmp_path, workers):
-    """The check of the poses, reading, the motion of actors and writing. Few scans: most is the check, and the start of the processes."""
+    """The check of the poses, reading, the motion of actors and writing.
+
+    Few scans: most is the check, and the start of the processes.
+    """
 
     def run():
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
@@ -80,6 +90,8 @@ def test_bench_velocities(benchmark):
     rng = np.random.default_rng(0)
     body = rng.uniform(0, 1, (300, 3)) * (4.4, 1.8, 1.5)
     body[:150, 1] = 0  # a flank
-    observations = [body + (0.8 * i, 0, 0) + rng.uniform(-0.02, 0.02, body.shape) for i in range(20)]
+    observations = [
+        body + (0.8 * i, 0, 0) + rng.uniform(-0.02, 0.02, body.shape) for i in range(20)
+    ]
     _, velocities, _ = benchmark(estimate_path, observations, np.arange(20) * 0.1, rigid=True)
     assert np.abs(velocities - (8, 0, 0)).max() < 0.5

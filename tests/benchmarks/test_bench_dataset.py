@@ -1,7 +1,8 @@
 """Loading a sample from plain files, warm, in one process, against the plain NumPy loader.
 
-`pytest tests/benchmarks/test_bench_dataset.py --benchmark-enable` measures scans of 125,000 points on the published grid;
-without that every case runs once on small scans. `python tests/benchmarks/test_bench_dataset.py` prints the table of docs/performance.md.
+`pytest tests/benchmarks/test_bench_dataset.py --benchmark-enable` measures scans of 125,000 points
+on the published grid; without that every case runs once on small scans. `python
+tests/benchmarks/test_bench_dataset.py` prints the table of docs/performance.md.
 """
 
 from __future__ import annotations
@@ -47,11 +48,15 @@ def write_street(folder: Path, full: bool) -> Path:
 @pytest.fixture(scope="module")
 def street(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     full = not request.config.getoption("benchmark_disable")
-    return write_street(tmp_path_factory.mktemp("street") / "Train" / "Town01_Light" / "cartesian", full)
+    return write_street(
+        tmp_path_factory.mktemp("street") / "Train" / "Town01_Light" / "cartesian", full
+    )
 
 
 def places(history: int, in_order: bool) -> np.ndarray:
-    """Return the frames to load: none has padding, and at random none shares a scan with the one before."""
+    """Return the frames to load: none has padding, and at random none shares a scan with the one
+    before.
+    """
     frames = np.arange(history - 1, FRAMES)
     return frames if in_order else np.random.default_rng(0).permutation(frames)
 
@@ -82,7 +87,8 @@ def test_bench_loading(benchmark, street, history, order, what, loader):
 def _milliseconds(load: Callable[[int], object], frames: np.ndarray, repeats: int) -> float:
     """Return the mean over frames of each one's best time in several passes.
 
-    Processor time: with one thread and warm files it is the time on an idle machine, on a busy one too.
+    Processor time: with one thread and warm files it is the time on an idle machine, on a busy one
+    too.
     """
     best = np.full(len(frames), np.inf)
     for _ in range(repeats):
@@ -99,7 +105,10 @@ def print_table() -> None:
         street = write_street(Path(temporary) / "Train" / "Town01_Light" / "cartesian", full=True)
         points = np.mean([path.stat().st_size / 16 for path in (street / "velodyne").iterdir()])
         print(f"{points:.0f} points a scan\n")
-        print("| sample | order | plain NumPy | carlasc | ratio | reading alone |\n|---|---|---|---|---|---|")
+        print(
+            "| sample | order | plain NumPy | carlasc | ratio | reading alone "
+            "|\n|---|---|---|---|---|---|"
+        )
         for what in ("occupancy", "density"):
             for history in (1, 5, 16):
                 plain = PlainLoader(street, history, density=what == "density")
@@ -109,9 +118,12 @@ def print_table() -> None:
                     dataset[0]
                     ours = _milliseconds(dataset.__getitem__, frames, 10)
                     theirs = _milliseconds(plain.__getitem__, frames[:6], 3)
-                    floor = _milliseconds(lambda frame, h=history: _read(street, frame, h), frames, 5)
+                    floor = _milliseconds(
+                        lambda frame, h=history: _read(street, frame, h), frames, 5
+                    )
                     print(
-                        f"| {what}, T = {history} | {order} | {theirs:.1f} ms | {ours:.2f} ms | {theirs / ours:.0f}x | {floor:.2f} ms |"
+                        f"| {what}, T = {history} | {order} | {theirs:.1f} ms | {ours:.2f} ms | "
+                        f"{theirs / ours:.0f}x | {floor:.2f} ms |"
                     )
 
 

@@ -1,7 +1,8 @@
-"""What it costs a frame of `regrid` that its files are synced: the same run with and without, by turns.
+"""What it costs a frame of `regrid` that its files are synced: the same run with and without, by
+turns.
 
-`pytest tests/benchmarks/test_bench_durability.py --benchmark-enable -m slow` makes frames of 20 sensors on the published grid; without that both
-cases run once on small scans.
+`pytest tests/benchmarks/test_bench_durability.py --benchmark-enable -m slow` makes frames of 20
+sensors on the published grid; without that both cases run once on small scans.
 """
 
 from __future__ import annotations

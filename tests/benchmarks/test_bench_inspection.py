@@ -1,4 +1,7 @@
-"""`validate --full` on scans of 131,072 rays and the published grids. Small scans where benchmarks are off."""
+"""`validate --full` on scans of 131,072 rays and the published grids.
+
+Small scans where benchmarks are off.
+"""
 
 from __future__ import annotations
 
@@ -55,5 +58,9 @@ def test_bench_validate(benchmark: Any, tmp_path: Path, coordinates: str) -> Non
         writer.write("flow", number, np.zeros((len(points), 3), np.float32))
         writer.write("evaluation/labels", number, grid.labels.astype(np.uint32))
         writer.write("evaluation/counts", number, np.asarray(grid.counts, np.float32))
-    result = benchmark.pedantic(validate, (tmp_path,), {"every": 1}, rounds=3 if benchmark.enabled else 1)
-    assert [(found.sampled, list(found.voxel_share)) for found in result.sequences] == [(frames, ["evaluation"])]
+    result = benchmark.pedantic(
+        validate, (tmp_path,), {"every": 1}, rounds=3 if benchmark.enabled else 1
+    )
+    assert [(found.sampled, list(found.voxel_share)) for found in result.sequences] == [
+        (frames, ["evaluation"])
+    ]

@@ -1,4 +1,7 @@
-"""How long a frame from merged scans takes, with its votes in a table, and how much memory. Small inputs where benchmarks are off."""
+"""How long a frame from merged scans takes, with its votes in a table, and how much memory.
+
+Small inputs where benchmarks are off.
+"""
 
 from __future__ import annotations
 
@@ -23,19 +26,37 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.storage import FolderSink, FolderSource, layout
 from carlasc.testing.drives import KINDS, SimulatedDrive
 
-pytestmark = [pytest.mark.slow, pytest.mark.benchmark(timer=time.process_time)]  # of one thread, whatever else runs
+# of one thread, whatever else runs
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.benchmark(timer=time.process_time),
+]
 
-IDS = {"road": "Road", "building": "Building", "vegetation": "Vegetation", "pole": "Pole", "pedestrian": "Pedestrian"}
+IDS = {
+    "road": "Road",
+    "building": "Building",
+    "vegetation": "Vegetation",
+    "pole": "Pole",
+    "pedestrian": "Pedestrian",
+}
 LABELS = np.array([0, *(CARLA.id_of(IDS.get(kind, "Vehicle")) for kind in KINDS[1:])], np.uint32)
 
 
 def feed_of(folder: Path, full: bool, **options: Any) -> ScanFeed:
-    """Write a drive of 31 scans of 57,600 rays, or of 3 small ones, and return what reads them, merged with options."""
-    drive = SimulatedDrive(frames=31, channels=32, columns=1800) if full else SimulatedDrive(frames=3)
+    """Write a drive of 31 scans of 57,600 rays, or of 3 small ones, and return what reads them,
+    merged with options.
+    """
+    drive = (
+        SimulatedDrive(frames=31, channels=32, columns=1800) if full else SimulatedDrive(frames=3)
+    )
     with FolderSink(folder) as sink, sink.sequence("cartesian") as writer:
         for frame in range(drive.frames):
             scan = drive.scan(frame)
-            writer.write("points", frame, np.hstack([scan.points[:, :3], np.zeros((len(scan.points), 1), np.float32)]))
+            writer.write(
+                "points",
+                frame,
+                np.hstack([scan.points[:, :3], np.zeros((len(scan.points), 1), np.float32)]),
+            )
             writer.write("labels", frame, LABELS[scan.kinds])
         mount = drive.sensors[0].vehicle_T_sensor
         poses = drive.world_T_vehicle(drive.times) @ mount
@@ -46,10 +67,18 @@ def feed_of(folder: Path, full: bool, **options: Any) -> ScanFeed:
 
 @pytest.mark.parametrize("keep_evidence", [False, True], ids=["grid", "and evidence"])
 @pytest.mark.parametrize("res", [0.4, 0.2, 0.1])
-def test_a_frame_from_merged_scans(benchmark: Any, tmp_path: Path, res: float, keep_evidence: bool) -> None:
+def test_a_frame_from_merged_scans(
+    benchmark: Any, tmp_path: Path, res: float, keep_evidence: bool
+) -> None:
     feed = feed_of(tmp_path, benchmark.enabled)
     spec = GridSpec.published().with_resolution(res)
-    plan = GridPlan(spec, "evaluation", feed.options, Voting(keep=True, keep_evidence=keep_evidence), FrameRange())
+    plan = GridPlan(
+        spec,
+        "evaluation",
+        feed.options,
+        Voting(keep=True, keep_evidence=keep_evidence),
+        FrameRange(),
+    )
     frame = int(feed.frames[len(feed.frames) // 2])
 
     def make() -> tuple[MergedFrame, Any]:
@@ -68,12 +97,16 @@ def test_a_frame_from_merged_scans(benchmark: Any, tmp_path: Path, res: float, k
 @pytest.mark.parametrize("places", [1, 20], ids=["one place", "turning"])
 @pytest.mark.parametrize("rays", ["all", "enough"])
 @pytest.mark.parametrize("res", [0.4, 0.2])
-def test_a_frame_with_a_part_of_the_rays(benchmark: Any, tmp_path: Path, res: float, rays: Any, places: int) -> None:
+def test_a_frame_with_a_part_of_the_rays(
+    benchmark: Any, tmp_path: Path, res: float, rays: Any, places: int
+) -> None:
     feed = feed_of(tmp_path, benchmark.enabled, rays=rays)
     if places > 1:  # the LiDAR turns while the vehicle moves: a step of a centimetre each
         with FolderSink(tmp_path) as sink, sink.sequence("cartesian") as writer:
             for frame in feed.frames.tolist():
-                part = np.arange(len(feed.sequence.read("points", frame)), dtype=np.float32) * places
+                part = (
+                    np.arange(len(feed.sequence.read("points", frame)), dtype=np.float32) * places
+                )
                 steps = np.floor(part / len(part)) - places // 2
                 writer.write("origins", frame, np.outer(steps, [0.01, 0, 0]).astype(np.float32))
         (feed.sequence,) = FolderSource(tmp_path).sequences().values()

@@ -31,13 +31,17 @@ def frame():
     rng = np.random.default_rng(0)
     shape, shares = (128, 128, 8), np.r_[0.9, np.full(10, 0.01)]
     target = rng.choice(K, shape, p=shares).astype(np.uint8)
-    pred = np.where(rng.random(shape) < 0.9, target, rng.choice(K, shape, p=shares)).astype(np.uint8)
+    pred = np.where(rng.random(shape) < 0.9, target, rng.choice(K, shape, p=shares)).astype(
+        np.uint8
+    )
     counts = rng.integers(0, 10, shape) * (rng.random(shape) < 0.6)
     return pred, target, counts.astype(np.float32)
 
 
 def per_class_loop(pred, target, counts):
-    """True positives, false positives and false negatives of each class, a pass over the voxels for each."""
+    """True positives, false positives and false negatives of each class, a pass over the voxels for
+    each.
+    """
     mask = counts > 0
     return [
         (
@@ -66,7 +70,9 @@ def test_bench_per_class_loop(benchmark, frame):
 
 @pytest.fixture(scope="module")
 def street():
-    """A street of 128 x 128 x 8 voxels: ground, walls, cars with instance ids; a prediction that errs here and there; 8 origins."""
+    """A street of 128 x 128 x 8 voxels: ground, walls, cars with instance ids; a prediction that
+    errs here and there; 8 origins.
+    """
     rng = np.random.default_rng(1)
     spec = GridSpec.published("cartesian")
     truth, ids = np.zeros(spec.size, np.uint8), np.zeros(spec.size, np.uint32)
@@ -75,9 +81,9 @@ def street():
     for number in range(1, 40):
         x, y = rng.integers(32, 92), rng.integers(0, 118)
         truth[x : x + 5, y : y + 10, 1:4], ids[x : x + 5, y : y + 10, 1:4] = 10, number
-    pred = np.where(rng.random(spec.size) < 0.03, rng.integers(0, K, spec.size), np.roll(truth, 1, axis=0)).astype(
-        np.uint8
-    )
+    pred = np.where(
+        rng.random(spec.size) < 0.03, rng.integers(0, K, spec.size), np.roll(truth, 1, axis=0)
+    ).astype(np.uint8)
     pred_ids = np.where(pred == 10, np.roll(ids, 1, axis=0), 0)
     origins = np.column_stack([np.zeros(8), np.linspace(-20, 20, 8), np.zeros(8)])
     return spec, (pred, pred_ids), (truth, ids), origins
@@ -93,14 +99,20 @@ def test_bench_rayiou(benchmark, street):
 @pytest.mark.benchmark(group="rays", timer=time.process_time)
 def test_bench_rayiou_in_numpy(benchmark, street):
     spec, (pred, _), (truth, _), origins = street
-    score = benchmark.pedantic(rayiou, (pred, truth, spec, origins, rayiou_directions(), K), rounds=2)
-    assert score == pytest.approx(RayIoU(K).update(pred, truth, spec, origins).compute().rayiou, abs=1e-9)
+    score = benchmark.pedantic(
+        rayiou, (pred, truth, spec, origins, rayiou_directions(), K), rounds=2
+    )
+    assert score == pytest.approx(
+        RayIoU(K).update(pred, truth, spec, origins).compute().rayiou, abs=1e-9
+    )
 
 
 @pytest.mark.benchmark(group="segments", timer=time.process_time)
 def test_bench_panoptic_quality(benchmark, street):
     _, pred, truth, _ = street
-    assert 0 < benchmark(lambda: PanopticQuality(K, THINGS).update(pred, truth).compute().mean()) < 1
+    assert (
+        0 < benchmark(lambda: PanopticQuality(K, THINGS).update(pred, truth).compute().mean()) < 1
+    )
 
 
 @pytest.mark.benchmark(group="segments", timer=time.process_time)
@@ -114,8 +126,13 @@ def test_bench_panoptic_quality_in_numpy(benchmark, street):
 def test_bench_all_conventions(benchmark, frame, tmp_path):
     pred, target, counts = frame
     for name, labels in (("predicted", pred), ("true", target)):
-        with FolderSink(tmp_path / name) as sink, sink.sequence("Val/Town01_Light/cartesian") as writer:
-            writer.write_document("evaluation/params.json", to_json(GridSpec.published().to_params()))
+        with (
+            FolderSink(tmp_path / name) as sink,
+            sink.sequence("Val/Town01_Light/cartesian") as writer,
+        ):
+            writer.write_document(
+                "evaluation/params.json", to_json(GridSpec.published().to_params())
+            )
             for number in range(FRAMES):
                 writer.write("evaluation/labels", number, labels.astype(np.uint32))
                 writer.write("evaluation/counts", number, counts)

@@ -1,4 +1,6 @@
-"""A frame through each example network, eagerly: the baseline of docs/performance.md, `python examples/latency.py` has the rest."""
+"""A frame through each example network, eagerly: the baseline of docs/performance.md, `python
+examples/latency.py` has the rest.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,13 @@ SPEC = GridSpec.published().with_size((32, 32, 8))
 
 
 @pytest.mark.benchmark(group="networks, 32 x 32 x 8, eager")
-@pytest.mark.parametrize(("name", "history"), [("motionsc", 1), ("motionsc", 5), ("lmscnet_ss", 1), ("sscnet_full", 1)])
+@pytest.mark.parametrize(
+    ("name", "history"), [("motionsc", 1), ("motionsc", 5), ("lmscnet_ss", 1), ("sscnet_full", 1)]
+)
 def test_bench_network(benchmark, name, history):
-    occupancy = torch.from_numpy((np.random.default_rng(0).random((1, history, *SPEC.size)) < 0.05).astype(np.uint8))
+    occupancy = torch.from_numpy(
+        (np.random.default_rng(0).random((1, history, *SPEC.size)) < 0.05).astype(np.uint8)
+    )
     run = prepare(build_network(name, 11, SPEC, history), torch.device("cpu"), "eager")
     labels = benchmark(run, occupancy)
     assert labels.shape == (1, *SPEC.size)

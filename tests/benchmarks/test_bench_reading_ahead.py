@@ -1,7 +1,9 @@
-"""Samples of 16 scans from a zarr store behind an HTTP server on this machine, with read-ahead, against the same store on disk in the same order.
+"""Samples of 16 scans from a zarr store behind an HTTP server on this machine, with read-ahead,
+against the same store on disk in the same order.
 
-`python tests/benchmarks/test_bench_reading_ahead.py` measures scans of 120,000 points and prints the table of docs/studies/scale.md. In pytest
-every case runs once on small scans, to see that it works.
+`python tests/benchmarks/test_bench_reading_ahead.py` measures scans of 120,000 points and prints
+the table of docs/studies/scale.md. In pytest every case runs once on small scans, to see that it
+works.
 """
 
 from __future__ import annotations
@@ -33,7 +35,12 @@ pytestmark = pytest.mark.slow
 
 HISTORY, BATCH, PIECE = 16, 4, 4 << 20
 DELAY_S = 0.05  # of each answer of the slow server
-SHARD, WINDOW, AHEAD = 32, 2, 2  # the data set must be several times as long as what is mixed and fetched ahead
+# the data set must be several times as long as what is mixed and fetched ahead
+SHARD, WINDOW, AHEAD = (
+    32,
+    2,
+    2,
+)
 
 
 def write_store(root: Path, sequences: int, frames: int, full: bool) -> Path:
@@ -44,8 +51,14 @@ def write_store(root: Path, sequences: int, frames: int, full: bool) -> Path:
     rng = np.random.default_rng(0)
     for number in range(sequences):
         noise = (rng.uniform(-0.02, 0.02, points.shape).astype(np.float32) for _ in range(frames))
-        scans = [np.column_stack([points + shift, np.zeros(len(points), np.float32)]) for shift in noise]
-        write_drive(root / "files" / "Train" / f"Town{number:02d}_Light" / "cartesian", range(frames), scans=scans)
+        scans = [
+            np.column_stack([points + shift, np.zeros(len(points), np.float32)]) for shift in noise
+        ]
+        write_drive(
+            root / "files" / "Train" / f"Town{number:02d}_Light" / "cartesian",
+            range(frames),
+            scans=scans,
+        )
     store = pack(root / "files", root / "served" / "carlasc.zarr").out
     shutil.rmtree(root / "files")
     return store
@@ -60,7 +73,9 @@ def served(folder: Path, delay_s: float = 0.0) -> Iterator[str]:
         str(folder),
         str(delay_s),
     ]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as server:
         assert server.stdout is not None and server.stdin is not None
         try:
             yield server.stdout.readline().strip()
@@ -69,7 +84,9 @@ def served(folder: Path, delay_s: float = 0.0) -> Iterator[str]:
 
 
 def samples_per_s(source: Any, workers: int, cache_size: int = 0) -> tuple[float, int]:
-    """Load an epoch; return its rate with everything from opening the store on, and the number of samples."""
+    """Load an epoch; return its rate with everything from opening the store on, and the number of
+    samples.
+    """
     torch = pytest.importorskip("torch")
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
@@ -88,17 +105,26 @@ def needed(store: Path) -> set[str]:
     """Return the files that the samples are read from."""
     fields = ("points", "evaluation/labels", "evaluation/counts")
     sequences = carlasc.open(store).sequences().values()
-    return {path for s in sequences for field in fields for path in s.files_of(field, s.frames(field).tolist())}
+    return {
+        path
+        for s in sequences
+        for field in fields
+        for path in s.files_of(field, s.frames(field).tolist())
+    }
 
 
 def bytes_per_s(url: str, store: Path) -> float:
-    """Return the rate of the server alone: files of the store, one after another, in four ranges at a time."""
+    """Return the rate of the server alone: files of the store, one after another, in four ranges at
+    a time.
+    """
     tree = RemoteTree(url)
     paths = [path for path in store.rglob("*") if path.is_file() and path.stat().st_size > PIECE]
     start = time.perf_counter()
     for path in paths:
         size, name = path.stat().st_size, path.relative_to(store).as_posix()
-        tree.read_ranges([(name, first, min(first + PIECE, size)) for first in range(0, size, PIECE)])
+        tree.read_ranges(
+            [(name, first, min(first + PIECE, size)) for first in range(0, size, PIECE)]
+        )
     return sum(path.stat().st_size for path in paths) / (time.perf_counter() - start)
 
 
@@ -117,11 +143,19 @@ def print_table(repeats: int = 3) -> None:
         size = sum((store / path).stat().st_size for path in needed(store))
         cache_size = size * 3 // 4
         with served(store.parent) as url, served(store.parent, DELAY_S) as slow_url:
-            places = {"on disk": str(store), "server": f"{url}/{store.name}", "slow": f"{slow_url}/{store.name}"}
+            places = {
+                "on disk": str(store),
+                "server": f"{url}/{store.name}",
+                "slow": f"{slow_url}/{store.name}",
+            }
             raw = bytes_per_s(places["server"], store) / 1e6
-            print(f"{size / 1e6:.0f} MB of files, cache of {cache_size / 1e6:.0f} MB, server alone {raw:.0f} MB/s\n")
             print(
-                "| workers | on disk | server | share | server, 50 ms late | share |\n|---:|---:|---:|---:|---:|---:|"
+                f"{size / 1e6:.0f} MB of files, cache of {cache_size / 1e6:.0f} MB, server alone "
+                f"{raw:.0f} MB/s\n"
+            )
+            print(
+                "| workers | on disk | server | share | server, 50 ms late | share "
+                "|\n|---:|---:|---:|---:|---:|---:|"
             )
             for workers in (0, 2):
                 rates: dict[str, list[float]] = {name: [] for name in places}

@@ -36,7 +36,11 @@ def test_bench_full_grid(benchmark, name, view):
 
 @pytest.mark.benchmark(group="rendering")
 def test_bench_scan(benchmark):
-    points = np.random.default_rng(0).uniform((-25, -25, -2), (25, 25, 1), (130_000, 3)).astype(np.float32)
+    points = (
+        np.random.default_rng(0)
+        .uniform((-25, -25, -2), (25, 25, 1), (130_000, 3))
+        .astype(np.float32)
+    )
     benchmark.pedantic(render_scan, (Scan(points),), rounds=5, warmup_rounds=1)
 
 
@@ -50,5 +54,9 @@ def test_bench_film(benchmark, tmp_path, workers):
         sequence.write("evaluation/labels", frame, np.roll(street(spec).labels, frame, axis=0))
     scene = Scene(tmp_path / "data", frames=(0, 20))
     benchmark.pedantic(
-        render, (scene, tmp_path / "film.mp4"), {"run": Run(workers), "overwrite": True}, rounds=2, warmup_rounds=1
+        render,
+        (scene, tmp_path / "film.mp4"),
+        {"run": Run(workers), "overwrite": True},
+        rounds=2,
+        warmup_rounds=1,
     )

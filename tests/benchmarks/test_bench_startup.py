@@ -14,11 +14,15 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.benchmark(group="startup")
-@pytest.mark.parametrize("command", ["--version", "--help", "info --help", "info DATA", "stats DATA"])
+@pytest.mark.parametrize(
+    "command", ["--version", "--help", "info --help", "info DATA", "stats DATA"]
+)
 def test_bench_a_command(benchmark, tmp_path, command):
     data = write_dataset(tmp_path)
     arguments = [str(data) if word == "DATA" else word for word in command.split()]
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    environment = {
+        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
+    }
 
     def run():
         line = [sys.executable, "-m", "carlasc", *arguments]
@@ -28,8 +32,10 @@ def test_bench_a_command(benchmark, tmp_path, command):
 
 
 _FIRST_USES = {
-    "pictures": "from carlasc.core.grids import Grid, GridSpec; from carlasc.viewing import render_grid\n"
-    "spec = GridSpec.published(); render_grid(Grid(spec, np.ones(spec.size, np.uint8)), size=(128, 72))",
+    "pictures": "from carlasc.core.grids import Grid, GridSpec; from carlasc.viewing import "
+    "render_grid\n"
+    "spec = GridSpec.published(); render_grid(Grid(spec, np.ones(spec.size, np.uint8)), "
+    "size=(128, 72))",
     "scores": "from carlasc.metrics.confusion import count_arrays\n"
     "count_arrays(np.zeros(9, np.uint8), np.zeros(9, np.uint8), None, 3)",
 }

@@ -1,7 +1,8 @@
 """Loading a sample, and reading a stack, from every store, warm, in one process.
 
-`pytest tests/benchmarks/test_bench_storage.py --benchmark-enable` measures scans of 125,000 points on the published grid; without that
-every case runs once on small scans. `python tests/benchmarks/test_bench_storage.py` prints the table of docs/storage.md.
+`pytest tests/benchmarks/test_bench_storage.py --benchmark-enable` measures scans of 125,000 points
+on the published grid; without that every case runs once on small scans. `python
+tests/benchmarks/test_bench_storage.py` prints the table of docs/storage.md.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ def write_stores(root: Path, full: bool) -> dict[str, Path]:
         points = street_frame(1, channels, columns)[0].points
     rng = np.random.default_rng(0)
     noise = (rng.uniform(-0.02, 0.02, points.shape).astype(np.float32) for _ in range(FRAMES))
-    scans = [np.column_stack([points + shift, np.zeros(len(points), np.float32)]) for shift in noise]
+    scans = [
+        np.column_stack([points + shift, np.zeros(len(points), np.float32)]) for shift in noise
+    ]
     write_drive(root / "files" / PATH, range(FRAMES), scans=scans)
     stores = {"files": root / "files"}
     for name in STORES[1:]:
@@ -47,8 +50,12 @@ def write_stores(root: Path, full: bool) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def stores(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return write_stores(tmp_path_factory.mktemp("stores"), not request.config.getoption("benchmark_disable"))
+def stores(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    return write_stores(
+        tmp_path_factory.mktemp("stores"), not request.config.getoption("benchmark_disable")
+    )
 
 
 @pytest.mark.benchmark(group="storage: samples of 16 scans")
@@ -80,13 +87,18 @@ def test_bench_one_field_from_every_store(benchmark, stores, store, field):
 
 
 def places(order: str) -> list[int]:
-    """Return the frames to load: none has padding, and at random few share scans with the one before."""
+    """Return the frames to load: none has padding, and at random few share scans with the one
+    before.
+    """
     frames = np.arange(HISTORY - 1, FRAMES)
-    return (frames if order == "in order" else np.random.default_rng(0).permutation(frames)).tolist()
+    return (
+        frames if order == "in order" else np.random.default_rng(0).permutation(frames)
+    ).tolist()
 
 
 def _milliseconds(loads, repeats):
-    """Return each load's mean over frames of the best of several passes; the loads take turns, so that all meet the same machine.
+    """Return each load's mean over frames of the best of several passes; the loads take turns, so
+    that all meet the same machine.
 
     Processor time of all threads: on an idle machine a stack takes that by the number of cores.
     """
@@ -98,7 +110,10 @@ def _milliseconds(loads, repeats):
                 load(item)
                 took = time.process_time() - start
                 best[name, place] = min(best.get((name, place), np.inf), took)
-    return {name: 1e3 * np.mean([best[name, k] for k in range(len(items))]) for name, (_, items) in loads.items()}
+    return {
+        name: 1e3 * np.mean([best[name, k] for k in range(len(items))])
+        for name, (_, items) in loads.items()
+    }
 
 
 def print_table() -> None:
@@ -107,15 +122,25 @@ def print_table() -> None:
         stores = write_stores(Path(temporary), full=True)
         rows = {}
         for order in ("random", "in order"):
-            loads = {name: (Dataset(path, history=HISTORY).__getitem__, places(order)) for name, path in stores.items()}
+            loads = {
+                name: (Dataset(path, history=HISTORY).__getitem__, places(order))
+                for name, path in stores.items()
+            }
             rows[f"a sample of 16 scans, {order}"] = _milliseconds(loads, 5)
         for field in ("points", "evaluation/labels", "evaluation/counts"):
-            sequences = {name: carlasc.open(path).sequences()[PATH] for name, path in stores.items()}
-            loads = {name: (lambda f, s=s, n=field: s.read(n, f).sum(), range(FRAMES)) for name, s in sequences.items()}
+            sequences = {
+                name: carlasc.open(path).sequences()[PATH] for name, path in stores.items()
+            }
+            loads = {
+                name: (lambda f, s=s, n=field: s.read(n, f).sum(), range(FRAMES))
+                for name, s in sequences.items()
+            }
             rows[f"`{field}` of a frame, summed"] = _milliseconds(loads, 5)
         print(f"| | {' | '.join(STORES)} |\n|---|{'---:|' * len(STORES)}")
         for what, times in rows.items():
-            cells = [f"{times[name]:.2f} ms ({times[name] / times['files']:.2f}x)" for name in STORES]
+            cells = [
+                f"{times[name]:.2f} ms ({times[name] / times['files']:.2f}x)" for name in STORES
+            ]
             print(f"| {what} | {' | '.join(cells)} |")
 
 

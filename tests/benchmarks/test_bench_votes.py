@@ -1,4 +1,6 @@
-"""The file of a frame's votes at 0.1 m: 4.3 million rows, of 20 LiDARs. A small grid where benchmarks are off.
+"""The file of a frame's votes at 0.1 m: 4.3 million rows, of 20 LiDARs.
+
+A small grid where benchmarks are off.
 
 `numpy` is what it is measured by: `numpy.savez_compressed`, whose file is 3 % smaller.
 """
@@ -26,7 +28,9 @@ FIELD = layout.field_named("evaluation/votes")
 @cache
 def street_votes(full: bool) -> NDArray[Any]:
     observations = street_frame(distinct=5) if full else street_frame(2, 16, 128)
-    return count_votes(observations, GridSpec.published().with_resolution(0.1 if full else 0.4)).to_sparse()
+    return count_votes(
+        observations, GridSpec.published().with_resolution(0.1 if full else 0.4)
+    ).to_sparse()
 
 
 def save(votes: NDArray[Any]) -> bytes:

@@ -1,4 +1,7 @@
-"""How fast an instant seen by 20 LiDARs becomes votes, beside the plain NumPy version. Small inputs where benchmarks are off."""
+"""How fast an instant seen by 20 LiDARs becomes votes, beside the plain NumPy version.
+
+Small inputs where benchmarks are off.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,11 @@ from helpers.scenes.lidar_frames import street_frame
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.voting.ballot import Observation, count_votes
 
-pytestmark = [pytest.mark.slow, pytest.mark.benchmark(timer=time.process_time)]  # of one thread, whatever else runs
+# of one thread, whatever else runs
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.benchmark(timer=time.process_time),
+]
 
 FINEST = GridSpec.published().with_resolution(0.1)
 CASES = {
@@ -40,7 +47,9 @@ def test_votes(benchmark: Any, case: str) -> None:
     spec, rule = CASES[case]
     observations = frame(benchmark.enabled)
     vote(observations[:1], spec, rule)  # compiled and loaded
-    grid = benchmark.pedantic(vote, args=(observations, spec, rule), rounds=10 if benchmark.enabled else 1)
+    grid = benchmark.pedantic(
+        vote, args=(observations, spec, rule), rounds=10 if benchmark.enabled else 1
+    )
     assert grid.known.any()
 
 
@@ -62,5 +71,7 @@ def test_merging_60_scans(benchmark: Any) -> None:
     observations = (frame(benchmark.enabled) * 30)[:60]
     spec = GridSpec.published()
     vote(observations[:1], spec, "sensor")
-    grid = benchmark.pedantic(vote, args=(observations, spec, "sensor"), rounds=3 if benchmark.enabled else 1)
+    grid = benchmark.pedantic(
+        vote, args=(observations, spec, "sensor"), rounds=3 if benchmark.enabled else 1
+    )
     assert grid.known.any()

@@ -91,7 +91,9 @@ def test_the_last_line_of_a_frame_in_a_times_file_is_valid(tmp_path):
 def test_times_are_written_as_in_the_golden_capture(tmp_path, golden_capture):
     for frame in (102, 100, 101):
         CaptureWriter(tmp_path).write_times({frame: [frame * 0.1]})
-    assert (tmp_path / "raw/times0.txt").read_bytes() == (golden_capture / "raw/times0.txt").read_bytes()
+    assert (tmp_path / "raw/times0.txt").read_bytes() == (
+        golden_capture / "raw/times0.txt"
+    ).read_bytes()
 
 
 def test_a_capture_without_pictures_has_none(tmp_path):
@@ -130,13 +132,18 @@ def test_a_missing_folder_sensor_or_frame_is_named(tmp_path):
     with pytest.raises(MissingDataError, match="nowhere: expected a folder, found nothing"):
         Capture(tmp_path / "nowhere")
     (tmp_path / "raw").mkdir()
-    with pytest.raises(MissingDataError, match="raw: expected the folder velodyne0 of the ego sensor, found no sensor"):
+    with pytest.raises(
+        MissingDataError,
+        match="raw: expected the folder velodyne0 of the ego sensor, found no sensor",
+    ):
         _ = Capture(tmp_path).sensors
     (tmp_path / "raw/velodyne2").mkdir()
     with pytest.raises(MissingDataError, match=r"found only the sensors \[2\]"):
         _ = Capture(tmp_path).sensors
     (tmp_path / "raw/velodyne0").mkdir()
-    with pytest.raises(MissingDataError, match="raw: expected frames such as velodyne0/100.npy, found none"):
+    with pytest.raises(
+        MissingDataError, match="raw: expected frames such as velodyne0/100.npy, found none"
+    ):
         _ = Capture(tmp_path).frames
 
 
@@ -156,17 +163,41 @@ def test_a_sensor_without_points_is_listed_all_the_same(tmp_path):
 
 INVALID = {  # folder -> (array that is written over it, what the error says)
     "wrong type": ("velodyne0", np.zeros((300, 3)), "expected float32 values, found float64"),
-    "wrong shape": ("velodyne0", np.zeros((300, 4), np.float32), "expected an array of N x 3 values, found 300 x 4"),
-    "too flat": ("velodyne0", np.zeros(900, np.float32), "expected an array of N x 3 values, found 900"),
+    "wrong shape": (
+        "velodyne0",
+        np.zeros((300, 4), np.float32),
+        "expected an array of N x 3 values, found 300 x 4",
+    ),
+    "too flat": (
+        "velodyne0",
+        np.zeros(900, np.float32),
+        "expected an array of N x 3 values, found 900",
+    ),
     "NaN": (
         "velodyne0",
         np.full((300, 3), np.nan, np.float32),
         "expected finite coordinates, found .*nan.* at point 0",
     ),
-    "infinite": ("velodyne0", np.full((300, 3), np.inf, np.float32), "expected finite coordinates, found .*inf.*"),
-    "beyond the table": ("labels0", np.full(300, 25, np.uint32), "expected class ids 0..24 .*, found 25 in 300 of 300"),
-    "short labels": ("labels0", np.zeros(299, np.uint32), "expected 300 values, one per point .*, found 299"),
-    "long instances": ("instances0", np.zeros(301, np.uint32), "expected 300 values, one per point .*, found 301"),
+    "infinite": (
+        "velodyne0",
+        np.full((300, 3), np.inf, np.float32),
+        "expected finite coordinates, found .*inf.*",
+    ),
+    "beyond the table": (
+        "labels0",
+        np.full(300, 25, np.uint32),
+        "expected class ids 0..24 .*, found 25 in 300 of 300",
+    ),
+    "short labels": (
+        "labels0",
+        np.zeros(299, np.uint32),
+        "expected 300 values, one per point .*, found 299",
+    ),
+    "long instances": (
+        "instances0",
+        np.zeros(301, np.uint32),
+        "expected 300 values, one per point .*, found 301",
+    ),
     "signed labels": ("labels0", np.zeros(300, np.int32), "expected uint32 values, found int32"),
     "NaN velocity": ("velocities0", np.full((1, 4), np.nan), "expected finite"),
     "scaled pose": ("pose0", 2 * np.eye(4), "expected a rigid transform"),
@@ -190,7 +221,10 @@ def test_an_invalid_file_is_named_with_what_was_expected_and_found(tmp_path, inv
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda data: data[:-5], r"expected 3728 bytes \(300 x 3 float32\), found 3723: the file is cut short"),
+        (
+            lambda data: data[:-5],
+            r"expected 3728 bytes \(300 x 3 float32\), found 3723: the file is cut short",
+        ),
         (
             lambda data: data + b"more",
             r"expected 3728 bytes .*, found 3732: the file is cut short, or something was added",
@@ -210,7 +244,9 @@ def test_a_file_of_another_size_is_named(tmp_path, change, message):
 
 def test_a_recording_without_labels_is_not_written(tmp_path):
     scan = Scan(np.zeros((1, 3), np.float32))
-    with pytest.raises(FormatError, match="sensor 0, frame 5: expected a scan with labels and instances"):
+    with pytest.raises(
+        FormatError, match="sensor 0, frame 5: expected a scan with labels and instances"
+    ):
         CaptureWriter(tmp_path).write(0, 5, SensorRecording(scan, np.eye(4), np.empty((0, 4))))
 
 
@@ -235,9 +271,13 @@ def test_captures_are_found_up_to_three_levels_down_and_not_in_hidden_folders(tm
 def test_a_frame_exists_with_all_sensors_and_its_picture(tmp_path):
     write_capture(tmp_path, frames=1)
     writer = CaptureWriter(tmp_path)
-    assert writer.has_frame(100, sensors=2, bev=True) and not writer.has_frame(100, sensors=3, bev=False)
+    assert writer.has_frame(100, sensors=2, bev=True) and not writer.has_frame(
+        100, sensors=3, bev=False
+    )
     (tmp_path / "raw/bev/100.jpg").unlink()
-    assert writer.has_frame(100, sensors=2, bev=False) and not writer.has_frame(100, sensors=2, bev=True)
+    assert writer.has_frame(100, sensors=2, bev=False) and not writer.has_frame(
+        100, sensors=2, bev=True
+    )
 
 
 def test_a_frame_is_timed_when_all_its_sensors_are(tmp_path):
@@ -276,4 +316,6 @@ def test_times_files_are_in_the_order_of_frames_and_keep_the_lines_that_they_hav
 def test_a_pose_that_is_not_rigid_is_not_written(tmp_path):
     recording = make_recording()
     with pytest.raises(FormatError, match="sensor 0, frame 5: expected a rigid transform"):
-        CaptureWriter(tmp_path).write(0, 5, SensorRecording(recording.scan, 2 * np.eye(4), recording.velocities))
+        CaptureWriter(tmp_path).write(
+            0, 5, SensorRecording(recording.scan, 2 * np.eye(4), recording.velocities)
+        )

@@ -20,7 +20,9 @@ from carlasc import Run
 from carlasc.inspection import validate
 from carlasc.running import open_cluster
 
-COMMANDS = "simulate regrid convert export pack unpack stats validate report evaluate render".split()
+COMMANDS = (
+    "simulate regrid convert export pack unpack stats validate report evaluate render".split()
+)
 FRAMES = 12
 
 pytestmark = pytest.mark.needs("distributed")
@@ -96,7 +98,17 @@ def test_what_reads_a_data_set_prints_the_same(capture):
 @pytest.mark.slow
 def test_a_film_is_the_same(capture, tmp_path):
     root, _ = capture
-    command = ("render", root / "whole", "--view", "bev", "--size", "160x120", "--frames", "0:4", "-o")
+    command = (
+        "render",
+        root / "whole",
+        "--view",
+        "bev",
+        "--size",
+        "160x120",
+        "--frames",
+        "0:4",
+        "-o",
+    )
     run(*command, tmp_path / "one.gif", "--workers", 1)
     run(*command, tmp_path / "two.gif", "--cluster", "local:2")
     assert (tmp_path / "one.gif").read_bytes() == (tmp_path / "two.gif").read_bytes()
@@ -120,7 +132,10 @@ def test_ctrl_c_stops_the_workers_at_once_and_the_next_run_finishes(capture, tmp
     ]
     start = time.monotonic()
     with subprocess.Popen(
-        [*command, "--cluster", "local:2"], stderr=subprocess.PIPE, text=True, start_new_session=True
+        [*command, "--cluster", "local:2"],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
     ) as process:
         _, stderr = process.communicate(timeout=60)
     with suppress(ProcessLookupError):
@@ -168,14 +183,18 @@ def test_jobs_of_slurm(capture, tmp_path):
     assert read_tree(tmp_path / "out") == whole
     assert len(slurm.read_jobs(fake)) == 2
     assert sorted(slurm.read_jobs(fake, "cancelled")) == sorted(slurm.read_jobs(fake))
-    assert all("#SBATCH --cpus-per-task=1" in script.read_text() for script in fake.glob("job-*.sh"))
+    assert all(
+        "#SBATCH --cpus-per-task=1" in script.read_text() for script in fake.glob("job-*.sh")
+    )
 
 
 @pytest.mark.slow
 def test_wrong_clusters_are_one_line(capture, tmp_path):
     root, _ = capture
     command = ("regrid", root, "-o", tmp_path, "--preset", "coarse", "--cluster")
-    assert run(*command, "nowhere", code=2).startswith("carlasc: --cluster: expected local, local:N, tcp://HOST:PORT")
+    assert run(*command, "nowhere", code=2).startswith(
+        "carlasc: --cluster: expected local, local:N, tcp://HOST:PORT"
+    )
     environment = {"DASK_CARLASC__CONNECT_TIMEOUT": "500ms"}
     stderr = run(*command, "tcp://127.0.0.1:1", code=1, **environment)
     assert stderr.startswith("carlasc: cluster tcp://127.0.0.1:1: no scheduler answers: ")

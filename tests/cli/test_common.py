@@ -59,7 +59,9 @@ def test_ctrl_c_that_another_error_hides_is_ctrl_c(error, between):
 
 
 def run_with_options(error):
-    """Run a command that has some of the library's arguments as options, and fails with an error; return its message."""
+    """Run a command that has some of the library's arguments as options, and fails with an error;
+    return its message.
+    """
 
     def action(
         source: str,
@@ -166,7 +168,9 @@ def test_numbers_are_counted():
 
 
 def test_numpy_values_become_json():
-    result = run(lambda: print_json({"a": np.float32(0.5), "b": np.arange(3), "c": frozenset({2, 1})}))
+    result = run(
+        lambda: print_json({"a": np.float32(0.5), "b": np.arange(3), "c": frozenset({2, 1})})
+    )
     assert json.loads(result.stdout) == {"a": 0.5, "b": [0, 1, 2], "c": [1, 2]}
 
 
@@ -175,7 +179,9 @@ def test_version_and_unknown_commands():
         [sys.executable, "-m", "carlasc", "--version"], capture_output=True, check=True
     ).stdout.strip()
     assert (
-        subprocess.run([sys.executable, "-m", "carlasc", "frobnicate"], capture_output=True, check=False).returncode
+        subprocess.run(
+            [sys.executable, "-m", "carlasc", "frobnicate"], capture_output=True, check=False
+        ).returncode
         == 2
     )
 

@@ -30,24 +30,47 @@ def test_the_list_names_the_converters():
 
 
 def test_there_and_back_by_two_commands(source, tmp_path):
-    options = ("--classes", "semantickitti", "--axes", "right", "--grids", "voxels", "--flow", "none")
+    options = (
+        "--classes",
+        "semantickitti",
+        "--axes",
+        "right",
+        "--grids",
+        "voxels",
+        "--flow",
+        "none",
+    )
     result = run("convert", "kitti", source, tmp_path / "middle", *options)
     assert result.exit_code == 0, result.output
     assert "3 frames converted" in result.output
     result = run("export", "kitti", tmp_path / "middle", tmp_path / "out")
     assert result.exit_code == 0, result.output
     for name in ("velodyne/000001.bin", "voxels/000002.invalid"):
-        before, after = (folder / "sequences" / "00" / name for folder in (source, tmp_path / "out"))
+        before, after = (
+            folder / "sequences" / "00" / name for folder in (source, tmp_path / "out")
+        )
         assert before.read_bytes() == after.read_bytes()
 
 
 def test_grids_are_made_by_default_and_figures_are_json(source, tmp_path):
-    result = run("convert", "kitti", source, tmp_path / "out", "--window", "-1:1", "--dynamic", "drop", "--json")
+    result = run(
+        "convert",
+        "kitti",
+        source,
+        tmp_path / "out",
+        "--window",
+        "-1:1",
+        "--dynamic",
+        "drop",
+        "--json",
+    )
     assert result.exit_code == 0, result.output
     values = json.loads(result.stdout)
     assert values["made"] == 3
     assert values["grids"] == [str(tmp_path / "out/Train/KITTI_00/cartesian/evaluation")]
-    params = json.loads((tmp_path / "out/Train/KITTI_00/cartesian/evaluation/params.json").read_text())
+    params = json.loads(
+        (tmp_path / "out/Train/KITTI_00/cartesian/evaluation/params.json").read_text()
+    )
     assert params["carlasc"]["window"] == "-1:1"
     assert params["carlasc"]["dynamic"] == "drop"
     assert params["carlasc"]["min_range_m"] == 2.5

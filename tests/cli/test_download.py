@@ -24,7 +24,9 @@ ZIP = "/val_cartesian.zip"
 def make_zip(size: int) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        archive.writestr("Val/Town07_Light/cartesian/poses.txt", np.random.default_rng(0).bytes(size))
+        archive.writestr(
+            "Val/Town07_Light/cartesian/poses.txt", np.random.default_rng(0).bytes(size)
+        )
     return buffer.getvalue()
 
 
@@ -38,7 +40,8 @@ def test_a_split_is_fetched_and_unpacked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--split", "dev"], [], ["--what", "fine", "--split", "val"], ["--split", "val", "--keep"]]
+    "arguments",
+    [["--split", "dev"], [], ["--what", "fine", "--split", "val"], ["--split", "val", "--keep"]],
 )
 def test_wrong_usage_exits_2(tmp_path: Path, arguments: list[str]) -> None:
     assert CliRunner().invoke(app, ["download", str(tmp_path), *arguments]).exit_code == 2
@@ -57,11 +60,24 @@ def test_ctrl_c_keeps_what_came_and_the_next_run_goes_on(tmp_path: Path) -> None
     content = make_zip(40 << 20)
     with serve(Site({ZIP: content})) as site:
         site.before = lambda number: time.sleep(0.5 if number > 2 else 0)
-        arguments = ["download", str(tmp_path), "--split", "val", "--base-url", site.url, "--connections", "1"]
-        listen = (
-            "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # a background job ignores it
-        )
-        command = [sys.executable, "-c", f"{listen}; from carlasc.cli import main; main()", *arguments]
+        arguments = [
+            "download",
+            str(tmp_path),
+            "--split",
+            "val",
+            "--base-url",
+            site.url,
+            "--connections",
+            "1",
+        ]
+        # a background job ignores it
+        listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+        command = [
+            sys.executable,
+            "-c",
+            f"{listen}; from carlasc.cli import main; main()",
+            *arguments,
+        ]
         process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         record = tmp_path / "val_cartesian.zip.part.json"
         deadline = time.monotonic() + 60

@@ -23,9 +23,13 @@ def data(tmp_path):
     rng = np.random.default_rng(0)
     for name in ("pred", "truth"):
         writer = FolderSink(tmp_path / name).sequence(PATH)
-        writer.write_document(layout.params_file("evaluation"), json.dumps(SPEC.to_params()).encode())
+        writer.write_document(
+            layout.params_file("evaluation"), json.dumps(SPEC.to_params()).encode()
+        )
         for frame in range(2):
-            writer.write("evaluation/labels", frame, rng.integers(0, 23, SPEC.size).astype(np.uint32))
+            writer.write(
+                "evaluation/labels", frame, rng.integers(0, 23, SPEC.size).astype(np.uint32)
+            )
             writer.write("evaluation/counts", frame, np.ones(SPEC.size, np.float32))
     return tmp_path / "pred", tmp_path / "truth"
 
@@ -84,7 +88,9 @@ def test_all_conventions_are_printed_a_row_each_with_the_reason_where_there_is_n
 def test_frames_are_written_drawn_and_broken_down(data, tmp_path):
     pytest.importorskip("matplotlib")
     csv, plot = tmp_path / "frames.csv", tmp_path / "frames.png"
-    result = run(*data, "--per-frame", csv, "--plot", plot, "--by", "distance", "--by", "visibility")
+    result = run(
+        *data, "--per-frame", csv, "--plot", plot, "--by", "distance", "--by", "visibility"
+    )
     assert result.exit_code == 0, result.output
     assert csv.read_text().startswith("sequence,frame,miou")
     assert len(csv.read_text().splitlines()) == 3
@@ -111,11 +117,13 @@ def test_files_of_semantickitti_are_scored_by_its_rules(tmp_path):
         labels.tofile(folder / "000000.label")
     mask = tmp_path / "sequences" / "08" / "voxels" / "000000.invalid"
     mask.write_bytes(np.packbits(np.zeros(size, bool)).tobytes())
-    mask.with_suffix(".bin").write_bytes(np.packbits(truth > 0).tobytes())  # the occupancy of a scan, no counts
+    # the occupancy of a scan, no counts
+    mask.with_suffix(".bin").write_bytes(np.packbits(truth > 0).tobytes())
     values = json.loads(run(tmp_path, tmp_path, "--json").stdout)
     assert (values["convention"], values["frames"]) == ("semantickitti", 1)
     assert values["class_iou"]["road"] == pytest.approx(0.5)
     assert values["iou"] == 1.0
     near = json.loads(run(tmp_path, tmp_path, "--json", "--far", "2.9").stdout)
-    assert near["class_iou"]["road"] == pytest.approx(0.0)  # the first half of the road, from 2 to 3 m, is called a car
+    # the first half of the road, from 2 to 3 m, is called a car
+    assert near["class_iou"]["road"] == pytest.approx(0.0)
     assert near["scored_voxels"] < values["scored_voxels"] == 256 * 256 * 32

@@ -28,18 +28,27 @@ def test_a_group_becomes_options_and_comes_back_as_an_object():
     flat = flatten(command)
     names = list(inspect.signature(flat).parameters)
     assert {"window", "stride", "workers", "cluster", "name"} <= set(names)
-    given = {name: parameter.default for name, parameter in inspect.signature(flat).parameters.items()}
+    given = {
+        name: parameter.default for name, parameter in inspect.signature(flat).parameters.items()
+    }
     flat(**given | {"stride": 3, "motion": "flow", "name": "y"})
     ((scans, work, name),) = seen
     assert scans == ScanFlags(stride=3, motion="flow") and scans.is_given
     assert work == OneWorkerFlags() and not work.is_given
     assert name == "y"
     merged = scans.from_scans(PoseOptions("file"))
-    assert (merged.stride, merged.motion, merged.poses) == (3, MotionOptions("flow"), PoseOptions("file"))
+    assert (merged.stride, merged.motion, merged.poses) == (
+        3,
+        MotionOptions("flow"),
+        PoseOptions("file"),
+    )
 
 
 def test_regrid_and_convert_have_the_same_grid_options():
-    of = {function: set(inspect.signature(flatten(function)).parameters) for function in (regrid, convert.convert)}
+    of = {
+        function: set(inspect.signature(flatten(function)).parameters)
+        for function in (regrid, convert.convert)
+    }
 
     def making(making: GroundTruthFlags) -> None:
         """Take the options alone."""
@@ -57,7 +66,10 @@ def test_regrid_and_convert_have_the_same_grid_options():
         (("info", "--jsn"), "carlasc: no such option: --jsn"),
         (("pack",), "carlasc: missing argument 'SOURCE'"),
         (("stats", "--workers", "0"), "carlasc: invalid value for '--workers'"),
-        (("regrid", "--preset", "finest"), "carlasc: invalid value for '--preset': 'finest' is not one of 'coarse'"),
+        (
+            ("regrid", "--preset", "finest"),
+            "carlasc: invalid value for '--preset': 'finest' is not one of 'coarse'",
+        ),
         (("regrid", "--res"), "carlasc: option '--res' requires an argument"),
         (("info", "a", "b"), "carlasc: got unexpected extra argument"),
     ],

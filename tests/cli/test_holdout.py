@@ -41,7 +41,9 @@ def test_held_out_rays_are_part_of_the_json(street):
 
 def test_dynamic_changes_what_is_measured(street):
     shares = [
-        json.loads(run(street, *OPTIONS, "--json", "--dynamic", dynamic).stdout)["holdout"]["total"]["rays"]
+        json.loads(run(street, *OPTIONS, "--json", "--dynamic", dynamic).stdout)["holdout"][
+            "total"
+        ]["rays"]
         for dynamic in ("tube", "align")
     ]
     assert shares[0]["passed_object"] > shares[1]["passed_object"]

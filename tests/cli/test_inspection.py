@@ -93,9 +93,15 @@ def test_stats_prints_both_tables_and_draws_the_plot(sequence: Path, tmp_path: P
 
 @pytest.mark.parametrize(("plot", "missing", "code"), [("a.png", True, 1), ("a.doc", False, 2)])
 def test_stats_refuses_a_plot_that_it_cannot_draw_before_it_counts(
-    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plot: str, missing: bool, code: int
+    sequence: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    plot: str,
+    missing: bool,
+    code: int,
 ) -> None:
-    monkeypatch.delattr("carlasc.storage.published.PublishedSequence.read")  # reading a frame would fail
+    # reading a frame would fail
+    monkeypatch.delattr("carlasc.storage.published.PublishedSequence.read")
     if missing:
         for module in ("matplotlib", "matplotlib.figure"):
             monkeypatch.setitem(sys.modules, module, None)

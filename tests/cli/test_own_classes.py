@@ -1,4 +1,6 @@
-"""Data with a class table of their own, as a converter of a third party writes them, in every command."""
+"""Data with a class table of their own, as a converter of a third party writes them, in every
+command.
+"""
 
 import json
 import re
@@ -27,10 +29,14 @@ def run(*arguments):
 def write_drive(folder, frames=6):
     """Write a straight drive between walls, on a road, behind a car that drives as fast."""
     rng = np.random.default_rng(0)
-    road = np.column_stack([rng.uniform(-12, 16, 3000), rng.uniform(-5, 5, 3000), np.full(3000, -1.8)])
+    road = np.column_stack(
+        [rng.uniform(-12, 16, 3000), rng.uniform(-5, 5, 3000), np.full(3000, -1.8)]
+    )
     walls = rng.uniform((-12, 0, -1.8), (16, 0.2, 1.0), (3000, 3))
     walls[:, 1] += np.where(rng.random(3000) < 0.5, 6, -6)
-    blocks = rng.uniform((-1, -1, -1.8), (1, 1, 1), (1200, 3)) + rng.choice([(-8, 4, 0), (3, -4, 0), (11, 4, 0)], 1200)
+    blocks = rng.uniform((-1, -1, -1.8), (1, 1, 1), (1200, 3)) + rng.choice(
+        [(-8, 4, 0), (3, -4, 0), (11, 4, 0)], 1200
+    )
     static = np.concatenate([road, walls, blocks])
     labels = np.repeat([1, 3, 3], [len(road), len(walls), len(blocks)]).astype(np.uint8)
     car = rng.uniform((5, -1, -1.7), (9, 1, -0.3), (500, 3))
@@ -49,7 +55,9 @@ def write_drive(folder, frames=6):
 
 @pytest.fixture(scope="module")
 def converted(tmp_path_factory):
-    """Install the converter as pip would, and convert with the data set's own labels and with CarlaSC's."""
+    """Install the converter as pip would, and convert with the data set's own labels and with
+    CarlaSC's.
+    """
     site, root = tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("lab")
     code = CODE.read_text()
     (site / "lab_converter.py").write_text(code)
@@ -121,7 +129,9 @@ def test_it_is_packed_and_unpacked(converted, tmp_path, ending):
     assert sequence.metadata == own.metadata and sequence.metadata.classes.name == "lab"
     run("unpack", tmp_path / f"a.{ending}", tmp_path / "back")
     document = f"{PATH}/carlasc.json"
-    assert (tmp_path / "back" / document).read_bytes() == (converted / "own" / document).read_bytes()
+    assert (tmp_path / "back" / document).read_bytes() == (
+        converted / "own" / document
+    ).read_bytes()
 
 
 def test_it_is_scored_by_its_own_classes(converted):
@@ -133,7 +143,18 @@ def test_it_is_scored_by_its_own_classes(converted):
 
 
 def test_it_is_regridded_from_its_scans(converted, tmp_path):
-    run("regrid", converted / "own", "-o", tmp_path, "--observe", "scans", "--res", "1.6", "--workers", 1)
+    run(
+        "regrid",
+        converted / "own",
+        "-o",
+        tmp_path,
+        "--observe",
+        "scans",
+        "--res",
+        "1.6",
+        "--workers",
+        1,
+    )
     (sequence,) = carlasc.open(tmp_path).sequences().values()
     assert sequence.metadata.classes.names == NAMES
     (grid,) = sequence.grids
@@ -149,7 +170,9 @@ def test_a_dataset_gives_its_ids(converted):
 
 
 def test_the_remap_of_the_converter_gives_the_same_grids_in_carlas_classes(converted):
-    own, carla = (next(iter(carlasc.open(converted / name).sequences().values())) for name in ("own", "carla"))
+    own, carla = (
+        next(iter(carlasc.open(converted / name).sequences().values())) for name in ("own", "carla")
+    )
     mapping = np.array([0, 7, 10, 1])
     assert np.array_equal(mapping[own.read("labels", 2)], carla.read("labels", 2))
     (name,) = own.grids

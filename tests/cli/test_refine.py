@@ -22,7 +22,9 @@ def call(*options):
 def drive(tmp_path_factory):
     """A drive of six scans whose poses are off by some centimetres."""
     folder = tmp_path_factory.mktemp("drive")
-    capture = SimulatedCapture(count=6, sensors=1, seed=3, bev=False, lidar=Lidar(channels=32, points=30_000))
+    capture = SimulatedCapture(
+        count=6, sensors=1, seed=3, bev=False, lidar=Lidar(channels=32, points=30_000)
+    )
     carlasc.regrid(capture, SPEC, folder / "Train" / "One", run=Run(workers=1))
     poses = open_store(folder).sequences()["Train/One/cartesian"].poses
     wrong = wrong_poses(poses, jitter_m=0.04, jitter_rad=0.002, seed=1)
@@ -34,7 +36,9 @@ def test_it_says_what_was_done_to_each_sequence_and_what_was_written(drive, tmp_
     done = call(drive, "-o", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
     first, note, last = done.stdout.splitlines()
-    assert first.startswith("Train/One/cartesian: poses were refined: neighbouring scans disagreed by ")
+    assert first.startswith(
+        "Train/One/cartesian: poses were refined: neighbouring scans disagreed by "
+    )
     assert note == "note: evaluation_16x16x4/ left out, because of other poses"
     assert last == f"{tmp_path}/out: poses of 1 of 1 sequence refined; 24 files linked, 0 written"
     again = call(tmp_path / "out", "-o", tmp_path / "again", "--json")
@@ -48,14 +52,21 @@ def test_it_says_what_was_done_to_each_sequence_and_what_was_written(drive, tmp_
 def test_the_options_of_poses_reach_the_run(drive, tmp_path):
     call(drive, "-o", tmp_path / "good")
     assert call(tmp_path / "good", "-o", tmp_path / "out").exit_code == 0
-    assert call(tmp_path / "good", "-o", tmp_path / "out", "--refine", "always", "--overwrite").exit_code == 0
+    assert (
+        call(
+            tmp_path / "good", "-o", tmp_path / "out", "--refine", "always", "--overwrite"
+        ).exit_code
+        == 0
+    )
     files = [tmp_path / name / "Train/One/cartesian/poses.txt" for name in ("good", "out")]
     assert files[0].read_bytes() != files[1].read_bytes()
     (tmp_path / "good/Train/One/cartesian/poses.txt").unlink()
     failed = call(tmp_path / "good", "-o", tmp_path / "none", "--poses", "file")
     assert failed.exit_code == 1
     assert (
-        failed.stderr.count("\n") == 1 and "expected poses" in failed.stderr and "`--poses kiss-icp`" in failed.stderr
+        failed.stderr.count("\n") == 1
+        and "expected poses" in failed.stderr
+        and "`--poses kiss-icp`" in failed.stderr
     )
 
 

@@ -31,7 +31,9 @@ def test_inside_a_sequences_folder_res_is_all_it_needs(capture):
     assert result.stdout.splitlines()[0] == "cartesian/evaluation_256x256x15"
     assert "cartesian 256 x 256 x 15: 3 frames made in" in result.stdout
     assert result.stderr == ""  # no bar where there is no terminal
-    assert (capture / "cartesian/evaluation_256x256x15/000002.bin").stat().st_size == 256 * 256 * 15 * 4
+    assert (
+        capture / "cartesian/evaluation_256x256x15/000002.bin"
+    ).stat().st_size == 256 * 256 * 15 * 4
     assert "0 frames made (3 existed)" in _regrid("--res", 0.2).stdout
 
 
@@ -39,7 +41,11 @@ def test_where_there_is_no_terminal_long_work_prints_a_line_now_and_then(capture
     monkeypatch.setattr(common, "_LINE_S", 0)
     result = _regrid("--res", 0.8)
     lines = result.stderr.splitlines()[-3:]
-    assert [re.fullmatch(r"regrid: (\d) of 3 frames, \d+ s", line)[1] for line in lines] == ["1", "2", "3"]
+    assert [re.fullmatch(r"regrid: (\d) of 3 frames, \d+ s", line)[1] for line in lines] == [
+        "1",
+        "2",
+        "3",
+    ]
     assert result.stdout.splitlines()[0] == "cartesian/evaluation_64x64x4"
 
 
@@ -51,8 +57,28 @@ def test_the_published_cartesian_grid_is_called_evaluation_and_another_of_its_si
 
 
 def test_every_option_reaches_the_run(capture):
-    options = ["--size", "16,12,4", "--bounds", "-8,8,-6,6,-2,1", "--free-step-m", 0.5, "--voting", "sample"]
-    result = _regrid(capture, "-o", "out", *options, "--frames", "101:", "--keep-votes", "--name", "mine", "--json")
+    options = [
+        "--size",
+        "16,12,4",
+        "--bounds",
+        "-8,8,-6,6,-2,1",
+        "--free-step-m",
+        0.5,
+        "--voting",
+        "sample",
+    ]
+    result = _regrid(
+        capture,
+        "-o",
+        "out",
+        *options,
+        "--frames",
+        "101:",
+        "--keep-votes",
+        "--name",
+        "mine",
+        "--json",
+    )
     assert result.exit_code == 0, result.stderr
     printed = json.loads(result.stdout)
     assert (printed["made"], printed["skipped"], printed["failures"]) == (2, 0, [])
@@ -62,7 +88,14 @@ def test_every_option_reaches_the_run(capture):
     assert params == GridSpec("cartesian", (16, 12, 4), (-8, -6, -2), (8, 6, 1)).to_params()
     assert (record["free_step_m"], record["voting"], record["frames"]) == (0.5, "sample", "101:")
     assert sorted(name.split("/")[-1] for name in read_tree(capture / "out/cartesian/mine")) == [
-        *("000000.bin", "000000.label", "000000.votes.npz", "000001.bin", "000001.label", "000001.votes.npz"),
+        *(
+            "000000.bin",
+            "000000.label",
+            "000000.votes.npz",
+            "000001.bin",
+            "000001.label",
+            "000001.votes.npz",
+        ),
         "carlasc-report.json",
         "params.json",
     ]
@@ -103,7 +136,10 @@ def test_bad_frames_are_listed_at_the_end_and_the_exit_code_tells(capture):
         (["--size", "1.5,10,10"], "--size: expected 3 whole numbers"),
         (["--res", 0.2, "--bounds", "1,-1,0,1,0,1"], "expected lower < upper on every axis"),
         (["--res", 0.2, "--bounds", "1,2,3"], "--bounds: expected 6 numbers"),
-        (["--preset", "coarse", "--bounds", "0,1,0,1,0,1"], "--bounds: expected none, because --preset has bounds"),
+        (
+            ["--preset", "coarse", "--bounds", "0,1,0,1,0,1"],
+            "--bounds: expected none, because --preset has bounds",
+        ),
         (
             ["--preset", "cylindrical", "--coordinates", "cartesian"],
             "--coordinates: expected cylindrical with --preset cylindrical",
@@ -111,7 +147,10 @@ def test_bad_frames_are_listed_at_the_end_and_the_exit_code_tells(capture):
         (["--preset", "huge"], "'huge'"),
         (["--preset", "coarse", "--voting", "twice"], "'twice'"),
         (["--preset", "coarse", "--free-step-m", 0], "--free-step-m: expected a positive number"),
-        (["--preset", "coarse", "--frames", "9:3"], "--frames: expected a range that holds a frame"),
+        (
+            ["--preset", "coarse", "--frames", "9:3"],
+            "--frames: expected a range that holds a frame",
+        ),
         (["--preset", "coarse", "--window", "2:9"], "--window: expected a range that contains 0"),
         (["--preset", "coarse", "--window", "all"], "--window: expected A:B"),
         (["--preset", "coarse", "--stride", 0], "--stride: expected at least 1"),
@@ -157,7 +196,12 @@ def test_advice_names_options_where_the_library_names_arguments(tmp_path, captur
     assert _regrid("--preset", "coarse").exit_code == 0
     advice = _regrid("--preset", "coarse", "--voting", "sample").stderr
     assert "choose another `--name`, or replace the grid with `--overwrite`" in advice
-    assert "`--out`" in _regrid("--preset", "coarse", "--name", "velodyne2", "-o", street, "--frames", "100").stderr
+    assert (
+        "`--out`"
+        in _regrid(
+            "--preset", "coarse", "--name", "velodyne2", "-o", street, "--frames", "100"
+        ).stderr
+    )
 
 
 def test_options_for_scans_and_grids_say_what_observes_the_scene(capture):

@@ -41,7 +41,11 @@ def test_frames_become_a_film_and_figures_are_json(golden_capture, tmp_path):
     ("options", "code", "word"),
     [
         (["--frames", 9], 1, "expected frames 9:10"),
-        (["-o", "a.bmp"], 2, "--out: expected a file name that ends in .png or .gif or .mp4 or .webp, found a.bmp"),
+        (
+            ["-o", "a.bmp"],
+            2,
+            "--out: expected a file name that ends in .png or .gif or .mp4 or .webp, found a.bmp",
+        ),
         (["--size", "big"], 2, "--size"),
         (["--viewpoint", "zoom=3"], 2, "--viewpoint: expected"),
         (["--what", "errors"], 2, "give it with `--truth`"),
@@ -52,15 +56,25 @@ def test_frames_become_a_film_and_figures_are_json(golden_capture, tmp_path):
         (["--orbit", "-o", "a.png"], 2, "--orbit: expected a film"),
         (["elsewhere"], 2, "SOURCE: expected one, found 2: draw several with --grid-of"),
         (["--caption", "one"], 2, "--caption: expected several sources or frames in one picture"),
-        (["--grid-of", "--caption", "one", "--caption", "two"], 2, "--caption: expected one for each of the 1 panels"),
+        (
+            ["--grid-of", "--caption", "one", "--caption", "two"],
+            2,
+            "--caption: expected one for each of the 1 panels",
+        ),
         (["--color", "views"], 1, "make the grid again with `carlasc regrid --keep-evidence`"),
-        (["--color", "votes", "--what", "scan"], 2, "--color: expected class where no grid is shown"),
+        (
+            ["--color", "votes", "--what", "scan"],
+            2,
+            "--color: expected class where no grid is shown",
+        ),
         (["--style", "paper", "-o", "a.gif"], 2, "--style: expected screen for a film"),
         (["--boxes", "--no-ego"], 1, "expected the field boxes, or points with instances"),
         (["--dpi", 1], 2, "--dpi: expected 30 to 2400"),
     ],
 )
-def test_a_mistake_is_one_line_and_the_right_exit_code(golden_capture, tmp_path, monkeypatch, options, code, word):
+def test_a_mistake_is_one_line_and_the_right_exit_code(
+    golden_capture, tmp_path, monkeypatch, options, code, word
+):
     monkeypatch.chdir(tmp_path)
     result = call(golden_capture / "cartesian", *options)
     assert result.exit_code == code
@@ -72,7 +86,15 @@ def test_two_grids_on_paper_and_their_legend(golden_capture, tmp_path):
     sources = [golden_capture / name for name in ("cartesian", "cylindrical")]
     options = ["--style", "paper", "--size", "6cmx3cm", "--dpi", 200, "--color", "votes"]
     result = call(
-        "--grid-of", *sources, "-o", tmp_path / "a.png", "--caption", "boxes", "--caption", "wedges", *options
+        "--grid-of",
+        *sources,
+        "-o",
+        tmp_path / "a.png",
+        "--caption",
+        "boxes",
+        "--caption",
+        "wedges",
+        *options,
     )
     assert result.exit_code == 0, result.stderr
     assert f"{tmp_path}/a.legend.png: the legend" in result.stdout.splitlines()

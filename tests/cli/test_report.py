@@ -32,7 +32,14 @@ def test_a_report_is_printed_with_its_actors(made):
     assert result.exit_code == 0, result.output
     lines = result.output.splitlines()
     assert lines[0] == f"cartesian/{GRID}"
-    for text in ("known ", "convergence ", "1 moving (1 Vehicle)", "window -2:2", "Static m", "0..5"):
+    for text in (
+        "known ",
+        "convergence ",
+        "1 moving (1 Vehicle)",
+        "window -2:2",
+        "Static m",
+        "0..5",
+    ):
         assert text in result.output
     assert "held-out rays" not in result.output
 

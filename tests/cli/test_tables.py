@@ -41,14 +41,18 @@ def test_a_table_of_many_classes_has_one_class_per_row(width, count):
     header, rows = scores(count)
     text = printed(width, header, rows, title="IoU of each class")
     assert text.startswith("IoU of each class\n")
-    assert cells(text) == [[name, figure] for name, figure in zip(header[1:], rows[0][1:], strict=True)]
+    assert cells(text) == [
+        [name, figure] for name, figure in zip(header[1:], rows[0][1:], strict=True)
+    ]
     assert max(map(len, text.splitlines())) <= width
 
 
 def test_a_table_of_few_classes_is_turned_only_where_it_does_not_fit():
     header, rows = scores(7)
     assert cells(printed(160, header, rows)) == rows
-    assert cells(printed(60, header, rows)) == [list(pair) for pair in zip(header[1:], rows[0][1:], strict=True)]
+    assert cells(printed(60, header, rows)) == [
+        list(pair) for pair in zip(header[1:], rows[0][1:], strict=True)
+    ]
 
 
 @pytest.mark.parametrize(("columns", "turned"), [(10, False), (11, True)])
@@ -60,12 +64,17 @@ def test_more_than_ten_columns_are_turned_even_where_they_fit(columns, turned):
 @pytest.mark.parametrize("width", WIDTHS)
 def test_what_is_still_too_wide_is_printed_in_parts_with_the_names_of_the_rows(width):
     header = ["Sequence", *NAMES[:20]]
-    rows = [[f"Train/Town{n:02d}_Heavy/cartesian", *(f"{n}.{c:02d}" for c in range(20))] for n in range(9)]
+    rows = [
+        [f"Train/Town{n:02d}_Heavy/cartesian", *(f"{n}.{c:02d}" for c in range(20))]
+        for n in range(9)
+    ]
     text = printed(width, header, rows)
     found = {name: [] for name in NAMES[:20]}
     for name, *figures in cells(text):
         found[name] += figures
-    assert found == {name: [row[place + 1] for row in rows] for place, name in enumerate(NAMES[:20])}
+    assert found == {
+        name: [row[place + 1] for row in rows] for place, name in enumerate(NAMES[:20])
+    }
     assert max(map(len, text.splitlines())) <= width
     for row in rows:
         assert row[0].split("/")[1] + "/" in text
@@ -74,8 +83,18 @@ def test_what_is_still_too_wide_is_printed_in_parts_with_the_names_of_the_rows(w
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("count", [11, 20, 34])
 def test_rows_that_must_stay_rows_stay_so_at_every_width(width, count):
-    header = ["Class", "points", "points %", "voxels", "voxels %", *(f"{s} voxels %" for s in ("Train", "Val", "Test"))]
-    rows = [[name, "12,345,678", "10.00", "123,456,789", "99.99", "1.00", "2.00", "3.00"] for name in NAMES[:count]]
+    header = [
+        "Class",
+        "points",
+        "points %",
+        "voxels",
+        "voxels %",
+        *(f"{s} voxels %" for s in ("Train", "Val", "Test")),
+    ]
+    rows = [
+        [name, "12,345,678", "10.00", "123,456,789", "99.99", "1.00", "2.00", "3.00"]
+        for name in NAMES[:count]
+    ]
     found = {name: [] for name in NAMES[:count]}
     text = printed(width, header, rows, turn=False)
     for name, *figures in cells(text):

@@ -1,4 +1,5 @@
-"""Run by test_ncore.py in an environment with NCore's own library: writes what is given as a store, and what the library reads of it.
+"""Run by test_ncore.py in an environment with NCore's own library: writes what is given as a store,
+and what the library reads of it.
 
 Usage: python ncore_library.py FOLDER, with given.npz and given.json in it.
 """
@@ -50,10 +51,13 @@ def write(folder, given, observations):
     for name in names:
         poses.store_static_pose(name, "rig", given[f"mount/{name}"])
         lidar = writer.register_component_writer(LidarSensorComponent.Writer, name)
-        count = len({key for key in given.files if key.startswith(f"{name}/") and key.endswith("/span")})
+        count = len(
+            {key for key in given.files if key.startswith(f"{name}/") and key.endswith("/span")}
+        )
         for number in range(count):
             frame = {
-                key: given[f"{name}/{number}/{key}"] for key in ("direction", "timestamp_us", "distance_m", "intensity")
+                key: given[f"{name}/{number}/{key}"]
+                for key in ("direction", "timestamp_us", "distance_m", "intensity")
             }
             lidar.store_frame(
                 **frame,
@@ -84,7 +88,12 @@ def read(paths):
             [loader.pose_graph.evaluate_poses("rig", "world", np.array(end)) for end in ends]
         )
     boxes = [
-        [int(box.track_id.rpartition("-")[2]), box.timestamp_us, *box.bbox3.centroid, *box.bbox3.dim]
+        [
+            int(box.track_id.rpartition("-")[2]),
+            box.timestamp_us,
+            *box.bbox3.centroid,
+            *box.bbox3.dim,
+        ]
         for box in loader.get_cuboid_track_observations()
     ]
     return found | {"boxes": np.array(boxes)}

@@ -16,7 +16,9 @@ BOX = np.random.default_rng(0).uniform(-0.5, 0.5, (150, 3)) * (4.4, 1.8, 1.5)
 
 
 def scan_of(number, actors, pose):
-    """Return points, labels and numbers of boxes that drive straight on: actor -> (class, first place, m/s, frames that see it)."""
+    """Return points, labels and numbers of boxes that drive straight on: actor -> (class, first
+    place, m/s, frames that see it).
+    """
     points, labels, instances = [np.full((1, 3), 50.0)], [40], [0]
     for actor, (label, place, velocity, seen) in actors.items():
         if number in seen:
@@ -41,7 +43,10 @@ def estimate(frames, actors, classes=SEMANTICKITTI, poses=None, damaged=(), run=
 
 def test_only_actors_of_moving_classes_get_a_velocity_where_a_table_has_them():
     frames = range(12)
-    actors = {1: (MOVING_CAR, (10, 0, 0), (6, 0, 0), frames), 2: (CAR, (10, 8, 0), (6, 0, 0), frames)}
+    actors = {
+        1: (MOVING_CAR, (10, 0, 0), (6, 0, 0), frames),
+        2: (CAR, (10, 8, 0), (6, 0, 0), frames),
+    }
     velocities = estimate(frames, actors)
     assert {actor for by_actor in velocities.values() for actor in by_actor} == {1}
     np.testing.assert_allclose(velocities[6][1], (6, 0, 0), atol=0.3)
@@ -51,7 +56,8 @@ def test_velocities_are_in_the_frame_of_each_scans_sensor():
     frames = range(12)
     poses = np.stack([rotation_z(np.pi / 2) @ translation((0.1 * frame, 0, 0)) for frame in frames])
     velocities = estimate(frames, {1: (MOVING_CAR, (0, 12, 0), (0, 5, 0), frames)}, poses=poses)
-    np.testing.assert_allclose(velocities[6][1], (5, 0, 0), atol=0.3)  # the sensor looks along the world's y
+    # the sensor looks along the world's y
+    np.testing.assert_allclose(velocities[6][1], (5, 0, 0), atol=0.3)
 
 
 def test_an_actor_that_was_hidden_for_long_is_estimated_anew():
@@ -70,7 +76,10 @@ def test_an_actor_that_was_hidden_for_long_is_estimated_anew():
 
 def test_without_moving_classes_actors_that_stay_where_they_are_get_zero():
     frames = range(15)
-    actors = {1: (POSS_CAR, (10, 0, 0), (5, 0, 0), frames), 2: (POSS_CAR, (10, 8, 0), (0, 0, 0), frames)}
+    actors = {
+        1: (POSS_CAR, (10, 0, 0), (5, 0, 0), frames),
+        2: (POSS_CAR, (10, 8, 0), (0, 0, 0), frames),
+    }
     velocities = estimate(frames, actors, SEMANTICPOSS)
     np.testing.assert_allclose(velocities[7][1], (5, 0, 0), atol=0.3)
     assert velocities[7][2] == (0.0, 0.0, 0.0)
@@ -79,7 +88,10 @@ def test_without_moving_classes_actors_that_stay_where_they_are_get_zero():
 @pytest.mark.parametrize("seconds", [0.5, 0.7, 2.0])
 def test_a_person_who_walks_moves_however_short_the_way_is(seconds):
     frames = range(round(10 * seconds) + 1)
-    walking = {1: (POSS_PERSON, (6, 2, 0), (1.4, 0, 0), frames), 2: (POSS_PERSON, (6, -3, 0), (0, 0, 0), frames)}
+    walking = {
+        1: (POSS_PERSON, (6, 2, 0), (1.4, 0, 0), frames),
+        2: (POSS_PERSON, (6, -3, 0), (0, 0, 0), frames),
+    }
     velocities = estimate(frames, walking, SEMANTICPOSS)
     np.testing.assert_allclose(velocities[len(frames) // 2][1], (1.4, 0, 0), atol=0.2)
     assert velocities[len(frames) // 2][2] == (0.0, 0.0, 0.0)
@@ -114,7 +126,9 @@ def test_long_observations_are_estimated_in_pieces_and_every_frame_has_a_velocit
     monkeypatch.setattr(
         actors,
         "estimate_path",
-        lambda points, *_, **__: lengths.append(len(points)) or (None, np.zeros((len(points), 3)), None),
+        lambda points, *_, **__: (
+            lengths.append(len(points)) or (None, np.zeros((len(points), 3)), None)
+        ),
     )
     velocities = estimate(range(900), {1: (MOVING_CAR, (10, 0, 0), (0, 0, 0), range(900))})
     assert sum(lengths) == len(velocities) == 900
@@ -122,12 +136,19 @@ def test_long_observations_are_estimated_in_pieces_and_every_frame_has_a_velocit
 
 
 def test_points_of_actors_that_left_are_not_kept():
-    """Paths are estimated as soon as a batch of actors was not seen for a while, so memory does not grow with the drive."""
+    """Paths are estimated as soon as a batch of actors was not seen for a while, so memory does not
+    grow with the drive.
+    """
     motion = ActorMotion(SEMANTICKITTI)
     held = []
     for number in range(600):
         actors = {number // 4 + 1: (MOVING_CAR, (10, 0, 0), (0, 0, 0), range(number, number + 1))}
-        motion.add(number, 0.1 * number, np.eye(4), find_actors(*scan_of(number, actors, np.eye(4)), SEMANTICKITTI))
+        motion.add(
+            number,
+            0.1 * number,
+            np.eye(4),
+            find_actors(*scan_of(number, actors, np.eye(4)), SEMANTICKITTI),
+        )
         held.append(len(motion._chains) + len(motion._ended))
     assert max(held) < 45
     assert len(motion.finish()) == 600

@@ -6,7 +6,14 @@ import pytest
 from carlasc_converters.argoverse2 import Argoverse2
 from carlasc_converters.argoverse2_classes import ARGOVERSE2, CATEGORIES, TO_CARLA
 from converters.formats import argoverse2 as av2
-from converters.formats.argoverse2 import CITY_T_WORLD, LOG, START_NS, read_table, write_argoverse2, write_table
+from converters.formats.argoverse2 import (
+    CITY_T_WORLD,
+    LOG,
+    START_NS,
+    read_table,
+    write_argoverse2,
+    write_table,
+)
 
 import carlasc
 from carlasc.converting import LayoutOptions, convert
@@ -88,7 +95,9 @@ def test_points_of_half_precision_are_read_as_they_are(tmp_path):
     folder = write_argoverse2(tmp_path, av2.drive(1), half=True)
     points, _, lasers = av2.sweep(av2.drive(1), 0)
     upper = recording(folder).frames[0].read()[0]
-    np.testing.assert_array_equal(upper.points[:, :3], points[lasers < 32, :3].astype(np.float16).astype(np.float32))
+    np.testing.assert_array_equal(
+        upper.points[:, :3], points[lasers < 32, :3].astype(np.float16).astype(np.float32)
+    )
 
 
 def test_sensors_are_where_the_calibration_says_and_points_are_in_the_frame_of_the_vehicle(root):
@@ -105,9 +114,13 @@ def test_poses_and_times_are_those_of_the_simulation(root):
     found = recording(root)
     trajectory, times = found.poses(), found.times()
     np.testing.assert_allclose(times, DRIVE.times, atol=1e-9)
-    np.testing.assert_allclose(trajectory.at(times), CITY_T_WORLD @ DRIVE.world_T_vehicle(DRIVE.times), atol=1e-6)
     np.testing.assert_allclose(
-        trajectory.world_T_vehicle, CITY_T_WORLD @ DRIVE.world_T_vehicle(trajectory.seconds), atol=1e-6
+        trajectory.at(times), CITY_T_WORLD @ DRIVE.world_T_vehicle(DRIVE.times), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        trajectory.world_T_vehicle,
+        CITY_T_WORLD @ DRIVE.world_T_vehicle(trajectory.seconds),
+        atol=1e-6,
     )
     assert trajectory.seconds[0] == pytest.approx(-0.05)
     assert len(trajectory.seconds) > 4 * len(times)
@@ -123,12 +136,16 @@ def test_boxes_keep_pose_size_class_and_their_track_throughout(root):
         boxes = boxes.select(nearest)
         np.testing.assert_allclose(boxes.sensor_T_box, truth.sensor_T_box, atol=1e-9)
         np.testing.assert_allclose(boxes.sizes, truth.sizes)
-        assert [ARGOVERSE2.names[label] for label in boxes.labels] == [av2.CATEGORIES[KINDS[k]] for k in truth.labels]
+        assert [ARGOVERSE2.names[label] for label in boxes.labels] == [
+            av2.CATEGORIES[KINDS[k]] for k in truth.labels
+        ]
         assert boxes.annotated.all()
         for track, number in zip(truth.tracks.tolist(), boxes.tracks.tolist(), strict=True):
             assert names.setdefault(track, number) == number
     order = sorted(names, key=av2.track_uuid)
-    assert {track: names[track] for track in order} == {track: number for number, track in enumerate(order, 1)}
+    assert {track: names[track] for track in order} == {
+        track: number for number, track in enumerate(order, 1)
+    }
 
 
 def test_each_category_has_a_class_and_a_class_of_carla():
@@ -136,13 +153,22 @@ def test_each_category_has_a_class_and_a_class_of_carla():
     assert CATEGORIES["REGULAR_VEHICLE"] == 19  # as in the data set's labels of scene flow
     assert list(CATEGORIES.values()) == list(range(1, 31))
     assert list(CATEGORIES) == sorted(CATEGORIES)
-    carla = {name: CARLA.names[TO_CARLA.mapping[ARGOVERSE2.id_of(name)]] for name in ARGOVERSE2.names.values()}
+    carla = {
+        name: CARLA.names[TO_CARLA.mapping[ARGOVERSE2.id_of(name)]]
+        for name in ARGOVERSE2.names.values()
+    }
     assert carla["BICYCLIST"] == carla["STROLLER"] == "Pedestrian"
     assert carla["TRUCK_CAB"] == "Vehicle"
     assert carla["GROUND"] == "Ground"
     assert carla["BACKGROUND"] == "Other"
-    assert CARLA.movable >= {TO_CARLA.mapping[CATEGORIES[name]] for name in ("BUS", "PEDESTRIAN", "WHEELED_RIDER")}
-    assert not ARGOVERSE2.movable & {CATEGORIES["BOLLARD"], CATEGORIES["STOP_SIGN"], *ARGOVERSE2.ground}
+    assert CARLA.movable >= {
+        TO_CARLA.mapping[CATEGORIES[name]] for name in ("BUS", "PEDESTRIAN", "WHEELED_RIDER")
+    }
+    assert not ARGOVERSE2.movable & {
+        CATEGORIES["BOLLARD"],
+        CATEGORIES["STOP_SIGN"],
+        *ARGOVERSE2.ground,
+    }
 
 
 def test_without_calibration_there_is_one_sensor_at_an_assumed_place(log):
@@ -170,7 +196,10 @@ def test_a_sweep_that_is_missing_between_others_is_named_and_other_frames_keep_t
     np.testing.assert_allclose(found.times(), DRIVE.times, atol=1e-9)
     ((number, message),) = found.problems()
     assert number == 2
-    assert f"{START_NS + 200_000_000}.feather: expected an annotated sweep, found no such file" in message
+    assert (
+        f"{START_NS + 200_000_000}.feather: expected an annotated sweep, found no such file"
+        in message
+    )
     assert 2 in found.boxes()
 
 
@@ -211,16 +240,21 @@ def test_an_unknown_category_is_named(log):
     categories[0] = "HOVERCRAFT"
     change(path, category=categories)
     with pytest.raises(
-        FormatError, match=r"annotations.feather: expected the 30 categories.*found HOVERCRAFT: .*version"
+        FormatError,
+        match=r"annotations.feather: expected the 30 categories.*found HOVERCRAFT: .*version",
     ):
         recording(log).boxes()
 
 
 def test_a_track_with_two_boxes_in_a_sweep_is_named(log):
     table = read_table(log / "annotations.feather")
-    write_table(log / "annotations.feather", {name: np.append(column, column[:1]) for name, column in table.items()})
+    write_table(
+        log / "annotations.feather",
+        {name: np.append(column, column[:1]) for name, column in table.items()},
+    )
     with pytest.raises(
-        FormatError, match=r"annotations.feather: timestamp \d+: boxes: tracks: expected one box per track"
+        FormatError,
+        match=r"annotations.feather: timestamp \d+: boxes: tracks: expected one box per track",
     ):
         recording(log).boxes()
 
@@ -230,7 +264,8 @@ def test_a_truncated_sweep_is_named(log):
     path.write_bytes(path.read_bytes()[:-200])
     frames = recording(log).frames
     with pytest.raises(
-        FormatError, match=rf"{path.name}: expected a Feather file, found something else .*copy it again"
+        FormatError,
+        match=rf"{path.name}: expected a Feather file, found something else .*copy it again",
     ):
         frames[1].read()
     assert len(frames[0].read()) == 2
@@ -239,16 +274,25 @@ def test_a_truncated_sweep_is_named(log):
 def test_a_sweep_that_vanishes_is_named(log):
     frames = recording(log).frames
     sweeps(log)[1].unlink()
-    with pytest.raises(MissingDataError, match=r"feather: expected a Feather file, found nothing: download it again"):
+    with pytest.raises(
+        MissingDataError,
+        match=r"feather: expected a Feather file, found nothing: download it again",
+    ):
         frames[1].read()
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"laser_number": None}, "expected the columns laser_number, found x, y, z, intensity, offset_ns"),
+        (
+            {"laser_number": None},
+            "expected the columns laser_number, found x, y, z, intensity, offset_ns",
+        ),
         ({"x": lambda x: x.astype(str)}, "expected numbers in the column x, found"),
-        ({"laser_number": lambda lasers: lasers + np.uint8(64)}, r"expected laser numbers 0\.\.63, found 127"),
+        (
+            {"laser_number": lambda lasers: lasers + np.uint8(64)},
+            r"expected laser numbers 0\.\.63, found 127",
+        ),
     ],
 )
 def test_a_sweep_of_another_kind_is_named(log, changes, message):
@@ -273,7 +317,8 @@ def test_a_missing_value_is_named(log):
     path = log / "city_SE3_egovehicle.feather"
     change(path, tx_m=[None, *read_table(path)["tx_m"][1:].tolist()])
     with pytest.raises(
-        FormatError, match=r"city_SE3_egovehicle.feather: expected numbers in the column tx_m, found 1 missing"
+        FormatError,
+        match=r"city_SE3_egovehicle.feather: expected numbers in the column tx_m, found 1 missing",
     ):
         recording(log).poses()
 
@@ -282,7 +327,8 @@ def test_a_calibration_without_a_lidar_is_named(log):
     path = log / "calibration" / "egovehicle_SE3_sensor.feather"
     change(path, sensor_name=["ring_front_center", "stereo_front_left", "up_lidar"])
     with pytest.raises(
-        FormatError, match=r"expected a row for each of up_lidar, down_lidar, found no down_lidar in ring_"
+        FormatError,
+        match=r"expected a row for each of up_lidar, down_lidar, found no down_lidar in ring_",
     ):
         list(recording(log).sensors)
 
@@ -290,18 +336,30 @@ def test_a_calibration_without_a_lidar_is_named(log):
 def test_poses_that_are_none_and_times_that_stand_still_are_named(log):
     path = log / "city_SE3_egovehicle.feather"
     table = read_table(path)
-    change(path, timestamp_ns=np.where(table["timestamp_ns"] == START_NS, START_NS - 10_000_000, table["timestamp_ns"]))
-    with pytest.raises(FormatError, match=r"city_SE3_egovehicle.feather: expected times that increase, found none at"):
+    change(
+        path,
+        timestamp_ns=np.where(
+            table["timestamp_ns"] == START_NS, START_NS - 10_000_000, table["timestamp_ns"]
+        ),
+    )
+    with pytest.raises(
+        FormatError,
+        match=r"city_SE3_egovehicle.feather: expected times that increase, found none at",
+    ):
         recording(log).poses()
     change(path, **(table | {"qw": table["qw"] * 2}))
     with pytest.raises(
-        FormatError, match=r"city_SE3_egovehicle.feather: expected a rotation: a quaternion .* in row 0"
+        FormatError,
+        match=r"city_SE3_egovehicle.feather: expected a rotation: a quaternion .* in row 0",
     ):
         recording(log).poses()
 
 
 def test_a_folder_without_logs_and_an_unknown_option_are_refused(tmp_path):
-    with pytest.raises(MissingDataError, match=r"expected logs: folders with sensors/lidar/ in them, found none: give"):
+    with pytest.raises(
+        MissingDataError,
+        match=r"expected logs: folders with sensors/lidar/ in them, found none: give",
+    ):
         Argoverse2(tmp_path).sequences()
     with pytest.raises(MissingDataError, match="found no such folder"):
         Argoverse2(tmp_path / "typo").sequences()
@@ -342,11 +400,15 @@ def test_lasers_of_the_real_sample_belong_to_the_sensors_that_they_are_given_to(
 
 
 def _disorder(points, origin):
-    """Return the entropy of elevations: the beams of a laser have one elevation, but only about the place of their own sensor."""
+    """Return the entropy of elevations: the beams of a laser have one elevation, but only about the
+    place of their own sensor.
+    """
     rays = points[:, :3] - origin
     distances = np.linalg.norm(rays, axis=1)
     near = (distances > 4) & (distances < 15)
-    counts = np.histogram(np.degrees(np.arcsin(rays[near, 2] / distances[near])), np.arange(-26, 16, 0.05))[0]
+    counts = np.histogram(
+        np.degrees(np.arcsin(rays[near, 2] / distances[near])), np.arange(-26, 16, 0.05)
+    )[0]
     shares = counts[counts > 0] / counts.sum()
     return float(-(shares * np.log(shares)).sum())
 
@@ -365,8 +427,16 @@ def test_boxes_of_the_real_sample_hold_the_points_that_the_annotators_counted(sa
 
 
 @pytest.mark.slow
-def test_the_road_of_the_real_sample_is_in_the_grid_and_each_lidar_casts_its_own_rays(sample, tmp_path):
-    result = convert("argoverse2", sample, tmp_path / "out", layout=LayoutOptions(axes="right"), run=Run(workers=1))
+def test_the_road_of_the_real_sample_is_in_the_grid_and_each_lidar_casts_its_own_rays(
+    sample, tmp_path
+):
+    result = convert(
+        "argoverse2",
+        sample,
+        tmp_path / "out",
+        layout=LayoutOptions(axes="right"),
+        run=Run(workers=1),
+    )
     assert result.failures == () and result.made == 3
     assert sum("both LiDARs count as one" in note for note in result.notes) == 1
     for sequence in carlasc.open(tmp_path / "out").sequences().values():
@@ -383,15 +453,21 @@ def test_the_road_of_the_real_sample_is_in_the_grid_and_each_lidar_casts_its_own
         assert ("origins" in sequence.fields()) == calibrated
 
 
-def test_points_of_the_real_sample_are_in_view_of_as_many_cameras_as_a_plain_projection_says(sample):
+def test_points_of_the_real_sample_are_in_view_of_as_many_cameras_as_a_plain_projection_says(
+    sample,
+):
     from carlasc_converters.feather import read_columns
 
     from carlasc.core.geometry import invert, transform_points
 
     recording, without = Argoverse2(sample).sequences()
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
-    table = read_columns(recording.folder / "calibration/intrinsics.feather", names, ("sensor_name",))
-    points = np.concatenate([cloud.points[:, :3] for cloud in recording.frames[0].read()]).astype(np.float64)
+    table = read_columns(
+        recording.folder / "calibration/intrinsics.feather", names, ("sensor_name",)
+    )
+    points = np.concatenate([cloud.points[:, :3] for cloud in recording.frames[0].read()]).astype(
+        np.float64
+    )
     cameras = recording.cameras()
     assert len(cameras) == 9 and not without.cameras()
     for row, camera in enumerate(cameras):
@@ -402,5 +478,7 @@ def test_points_of_the_real_sample_are_in_view_of_as_many_cameras_as_a_plain_pro
         factor = 1 + k1 * squared + k2 * squared**2 + k3 * squared**3
         u, v = fx * x * factor + cx, fy * y * factor + cy
         inside = ahead & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
-        found = camera.contains(camera.project(transform_points(invert(camera.sensor_T_camera), points)))
+        found = camera.contains(
+            camera.project(transform_points(invert(camera.sensor_T_camera), points))
+        )
         assert camera.name == table["sensor_name"][row] and inside.sum() == found.sum() > 10_000

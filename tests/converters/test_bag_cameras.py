@@ -18,7 +18,9 @@ pytest.importorskip("rosbags")
 DRIVE = SimulatedDrive(3, channels=4, columns=30)
 MATRIX = np.array([[60.0, 0, 31.5], [0, 60, 15.5], [0, 0, 1]])
 SIZE, LATER_NS = (64, 32), 12_000_000
-PLACE = translation((1.2, 0.1, 1.5)) @ np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+PLACE = translation((1.2, 0.1, 1.5)) @ np.array(
+    [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+)
 DISTORTION = (-0.1, 0.02, 0.001, -0.002, 0.003)
 
 
@@ -27,14 +29,23 @@ def pixels(frame):
 
 
 def write(folder, kind, model="plumb_bob", distortion=DISTORTION, encoding="bgr8"):
-    """Write a bag of three scans; a camera with images 12 ms later, and a camera without images that nothing places."""
+    """Write a bag of three scans; a camera with images 12 ms later, and a camera without images
+    that nothing places.
+    """
     store = Messages(kind)
-    messages = [*drive_messages(store, DRIVE), store.transform("/tf_static", START_NS, BASE, "eye", PLACE)]
+    messages = [
+        *drive_messages(store, DRIVE),
+        store.transform("/tf_static", START_NS, BASE, "eye", PLACE),
+    ]
     stamps = [START_NS + round(seconds * 1e9) + LATER_NS for seconds in DRIVE.times.tolist()]
-    messages.append(store.camera_info("/front/camera_info", stamps[0], "eye", SIZE, MATRIX, model, distortion))
+    messages.append(
+        store.camera_info("/front/camera_info", stamps[0], "eye", SIZE, MATRIX, model, distortion)
+    )
     messages.append(store.camera_info("/lost/camera_info", stamps[0], "nowhere", SIZE, MATRIX))
     for frame, stamp in enumerate(stamps):
-        messages.append(store.image("/front/image_raw", stamp, "eye", pixels(frame)[..., ::-1], encoding))
+        messages.append(
+            store.image("/front/image_raw", stamp, "eye", pixels(frame)[..., ::-1], encoding)
+        )
     return write_bag(folder, kind, sorted(messages, key=lambda one: one[2]), store=store), store
 
 
@@ -43,7 +54,11 @@ def test_cameras_have_their_model_place_times_and_images(tmp_path, kind):
     bag, _ = write(tmp_path, kind)
     (recording,) = Bag(bag).sequences()
     (camera,) = recording.cameras()
-    assert (camera.name, camera.width, camera.height, camera.model) == ("front", *SIZE, "radial-tangential")
+    assert (camera.name, camera.width, camera.height, camera.model) == (
+        "front",
+        *SIZE,
+        "radial-tangential",
+    )
     assert camera.distortion == DISTORTION and np.array_equal(camera.matrix, MATRIX)
     np.testing.assert_allclose(camera.sensor_T_camera, PLACE, atol=1e-12)
     np.testing.assert_allclose(camera.times - recording.times(), LATER_NS * 1e-9, atol=1e-9)
@@ -65,8 +80,13 @@ def test_images_are_copied_and_cannot_be_linked(tmp_path):
 
 def test_a_compressed_image_is_taken_as_it_is_and_a_rectified_one_has_no_distortion(tmp_path):
     store, jpeg = Messages("bag"), encode_image(pixels(1), "JPEG").tobytes()
-    messages = [*drive_messages(store, DRIVE), store.transform("/tf_static", START_NS, BASE, "eye", PLACE)]
-    messages.append(store.camera_info("/a/camera_info", START_NS, "eye", SIZE, MATRIX, "plumb_bob", DISTORTION))
+    messages = [
+        *drive_messages(store, DRIVE),
+        store.transform("/tf_static", START_NS, BASE, "eye", PLACE),
+    ]
+    messages.append(
+        store.camera_info("/a/camera_info", START_NS, "eye", SIZE, MATRIX, "plumb_bob", DISTORTION)
+    )
     messages.append(store.compressed("/a/image_rect/compressed", START_NS, "eye", jpeg))
     messages.append(store.image("/a/image_rect", START_NS, "eye", pixels(1)))
     bag = write_bag(tmp_path, "bag", sorted(messages, key=lambda one: one[2]), store=store)
@@ -81,7 +101,9 @@ def test_an_unknown_model_and_an_unknown_encoding_are_one_line(tmp_path):
         (tmp_path / str(number)).mkdir()
         bag, _ = write(tmp_path / str(number), "bag", model, distortion)
         (recording,) = Bag(bag).sequences()
-        with pytest.raises(FormatError, match=f"one of the models plumb_bob .*found '{model}' with") as error:
+        with pytest.raises(
+            FormatError, match=f"one of the models plumb_bob .*found '{model}' with"
+        ) as error:
             recording.cameras()
         assert "\n" not in str(error.value)
     bag, _ = write(tmp_path, "bag", encoding="bayer_rggb8")

@@ -26,7 +26,13 @@ class RandomDrive(SimulatedDrive):
 
 
 DRIVE = RandomDrive(24, rolling=True)
-CODECS = [("bag", "bz2"), ("bag", "lz4"), ("db3", "message"), ("mcap", "message"), ("mcap", "storage")]
+CODECS = [
+    ("bag", "bz2"),
+    ("bag", "lz4"),
+    ("db3", "message"),
+    ("mcap", "message"),
+    ("mcap", "storage"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +43,9 @@ def bags(tmp_path_factory):
         store = Messages(kind)
         folder = tmp_path_factory.mktemp(f"{kind}{codec}")
         found[kind, codec] = file_of(
-            write_bag(folder, kind, drive_messages(store, DRIVE, "tf"), store=store, compressed=codec)
+            write_bag(
+                folder, kind, drive_messages(store, DRIVE, "tf"), store=store, compressed=codec
+            )
         )
     return found
 
@@ -84,7 +92,9 @@ def test_a_bag_that_is_cut_short_gives_what_is_whole(bags, kind, share, least, t
 
 @pytest.mark.parametrize(("kind", "codec"), CODECS)
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
-def test_a_compressed_bag_that_is_cut_short_gives_what_is_whole_or_says_why_not(bags, kind, codec, share, tmp_path):
+def test_a_compressed_bag_that_is_cut_short_gives_what_is_whole_or_says_why_not(
+    bags, kind, codec, share, tmp_path
+):
     path = cut(bags[kind, codec], share, tmp_path)
     try:
         (recording,) = Bag(path).sequences()
@@ -150,11 +160,15 @@ def test_a_damaged_chunk_costs_its_frames_only(bags, kind, codec, place, tmp_pat
             assert cloud.points.tobytes() == DRIVE.scan(frame.number).points.tobytes()
     assert 1 <= failed <= DRIVE.frames // 4
     assert 0 < DRIVE.times[-1] - recording.times()[-1] + 1e-9 < 0.1 * failed + 1e-6
-    if place < 0.2:  # with the only message of /tf_static, so nobody knows where the LiDAR is on the vehicle
+    # with the only message of /tf_static, so nobody knows where the LiDAR is on the vehicle
+    if place < 0.2:
         assert recording.poses() is None
     else:
         truth = DRIVE.world_T_vehicle(recording.times())
-        assert np.abs(recording.poses().at(recording.times()) - truth)[: DRIVE.frames // 3].max() < 1e-9
+        assert (
+            np.abs(recording.poses().at(recording.times()) - truth)[: DRIVE.frames // 3].max()
+            < 1e-9
+        )
     assert any("messages are left out" in note for note in recording.notes())
 
 
@@ -191,8 +205,14 @@ def test_a_chunk_that_does_not_fit_its_checksum_is_named(tmp_path):
     ("kind", "codec"), [("bag", ""), ("bag", "lz4"), ("db3", ""), ("mcap", ""), ("mcap", "storage")]
 )
 def test_damage_anywhere_is_an_error_of_one_line_or_harmless(kind, codec, tmp_path):
-    store, random, drive = Messages(kind), np.random.default_rng(7), SimulatedDrive(4, channels=6, columns=40)
-    path = file_of(write_bag(tmp_path, kind, drive_messages(store, drive, "tf"), store=store, compressed=codec))
+    store, random, drive = (
+        Messages(kind),
+        np.random.default_rng(7),
+        SimulatedDrive(4, channels=6, columns=40),
+    )
+    path = file_of(
+        write_bag(tmp_path, kind, drive_messages(store, drive, "tf"), store=store, compressed=codec)
+    )
     whole = path.read_bytes()
     harmless = 0
     for _ in range(60):
@@ -210,7 +230,10 @@ def test_damage_anywhere_is_an_error_of_one_line_or_harmless(kind, codec, tmp_pa
 
 
 def test_a_codec_that_nobody_knows_is_named():
-    with pytest.raises(FormatError, match="drive.bag: expected chunks that are not compressed, or .*, found 'snappy'"):
+    with pytest.raises(
+        FormatError,
+        match="drive.bag: expected chunks that are not compressed, or .*, found 'snappy'",
+    ):
         decompressed(b"", "snappy", "drive.bag")
 
 

@@ -1,4 +1,6 @@
-"""Points as the common drivers publish them: Velodyne, Ouster, Hesai and Livox, with the times of points in their units."""
+"""Points as the common drivers publish them: Velodyne, Ouster, Hesai and Livox, with the times of
+points in their units.
+"""
 
 import numpy as np
 import pytest
@@ -57,17 +59,26 @@ def clouds(store, driver):
         elif driver == "ouster":
             yield store.cloud("/points", stamp, packed(OUSTER, frame, "t", np.round(SECONDS * 1e9)))
         elif driver == "hesai":
-            yield store.cloud("/points", stamp, packed(HESAI, frame, "timestamp", stamp * 1e-9 + SECONDS))
+            yield store.cloud(
+                "/points", stamp, packed(HESAI, frame, "timestamp", stamp * 1e-9 + SECONDS)
+            )
         elif driver == "livox":
-            yield store.cloud("/points", stamp, packed(LIVOX, frame, "timestamp", stamp + SECONDS * 1e9))
+            yield store.cloud(
+                "/points", stamp, packed(LIVOX, frame, "timestamp", stamp + SECONDS * 1e9)
+            )
         else:
             points, offsets = xyz_of(frame), np.round(SECONDS * 1e9).astype(int).tolist()
-            rows = [(at, *row[:3], int(row[3]), 16, 2) for at, row in zip(offsets, points.tolist(), strict=True)]
+            rows = [
+                (at, *row[:3], int(row[3]), 16, 2)
+                for at, row in zip(offsets, points.tolist(), strict=True)
+            ]
             yield store.livox("/livox/lidar", stamp, rows, driver)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("driver", ["velodyne", "ouster", "hesai", "livox", "livox_ros_driver", "livox_ros_driver2"])
+@pytest.mark.parametrize(
+    "driver", ["velodyne", "ouster", "hesai", "livox", "livox_ros_driver", "livox_ros_driver2"]
+)
 def test_points_and_their_times_are_those_of_the_driver(kind, driver, tmp_path):
     store = Messages(kind)
     (recording,) = Bag(write_bag(tmp_path, kind, clouds(store, driver), store=store)).sequences()
@@ -75,14 +86,18 @@ def test_points_and_their_times_are_those_of_the_driver(kind, driver, tmp_path):
     for frame in recording.frames:
         (cloud,) = frame.read()
         expected = xyz_of(frame.number)
-        expected[:, 3] = expected[:, 3].astype(int) if driver.startswith("livox_") else expected[:, 3]
+        expected[:, 3] = (
+            expected[:, 3].astype(int) if driver.startswith("livox_") else expected[:, 3]
+        )
         assert cloud.points.tobytes() == expected.tobytes()
         assert np.abs(cloud.seconds - SECONDS).max() < 1e-6
 
 
 def test_times_of_another_clock_count_from_the_first_point(tmp_path):
     store = Messages("db3")
-    since_boot = store.cloud("/points", START_NS, packed(LIVOX, 0, "timestamp", 5e15 + SECONDS * 1e9))
+    since_boot = store.cloud(
+        "/points", START_NS, packed(LIVOX, 0, "timestamp", 5e15 + SECONDS * 1e9)
+    )
     (recording,) = Bag(write_bag(tmp_path, "db3", [since_boot], store=store)).sequences()
     (cloud,) = recording.frames[0].read()
     assert np.abs(cloud.seconds - SECONDS).max() < 1e-6
@@ -97,7 +112,9 @@ def test_an_mcap_of_ros_1_is_read(tmp_path):
         schema = writer.register_schema("sensor_msgs/PointCloud2", "ros1msg", b"")
         channel = writer.register_channel("/velodyne_points", "ros1", schema)
         for _, kind, stamp, message in clouds(store, "velodyne"):
-            writer.add_message(channel, stamp, bytes(store.store.serialize_ros1(message, kind)), stamp)
+            writer.add_message(
+                channel, stamp, bytes(store.store.serialize_ros1(message, kind)), stamp
+            )
         writer.finish()
     (recording,) = Bag(tmp_path / "drive.mcap").sequences()
     assert [frame.read()[0].points.tobytes() for frame in recording.frames] == [
@@ -122,7 +139,9 @@ def test_points_without_a_return_are_left_out(tmp_path):
     points["x"][3], points["y"][5] = np.nan, np.inf
     for axis in "xyz":
         points[axis][7] = 0
-    (recording,) = Bag(write_bag(tmp_path, "mcap", [store.cloud("/points", START_NS, points)], store=store)).sequences()
+    (recording,) = Bag(
+        write_bag(tmp_path, "mcap", [store.cloud("/points", START_NS, points)], store=store)
+    ).sequences()
     (cloud,) = recording.frames[0].read()
     kept = np.delete(np.arange(COUNT), [3, 5, 7])
     assert cloud.points.tobytes() == xyz_of(0)[kept].tobytes()

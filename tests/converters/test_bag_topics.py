@@ -1,10 +1,20 @@
-"""Which topics of a bag are used, which files belong together, and what is said where that is not clear."""
+"""Which topics of a bag are used, which files belong together, and what is said where that is not
+clear.
+"""
 
 import numpy as np
 import pytest
 from carlasc_converters.bag import Bag
 from carlasc_converters.bag_topics import find_bags
-from helpers.converters.bags import KINDS, START_NS, Messages, file_of, velodyne, write_bag, write_one_message
+from helpers.converters.bags import (
+    KINDS,
+    START_NS,
+    Messages,
+    file_of,
+    velodyne,
+    write_bag,
+    write_one_message,
+)
 
 from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError
 
@@ -38,7 +48,10 @@ def refused(error, call):
 def test_several_topics_of_points_are_listed_with_counts_and_rates(tmp_path, kind):
     bag = bag_of(tmp_path, kind, "/front", "/rear", "/odom")
     message = refused(ArgumentError, lambda: Bag(bag).sequences())
-    assert "topics: expected one or several of /front (PointCloud2, 3 messages, 10 Hz), /rear (PointCloud2" in message
+    assert (
+        "topics: expected one or several of /front (PointCloud2, 3 messages, 10 Hz), /rear "
+        "(PointCloud2" in message
+    )
     (recording,) = Bag(bag, topics="/rear").sequences()
     assert [sensor.name for sensor in recording.sensors] == ["/rear"]
 
@@ -54,7 +67,10 @@ def test_a_bag_without_points_is_named_with_what_it_has(tmp_path, kind):
 def test_a_topic_that_does_not_exist_or_has_another_type_is_named(tmp_path):
     bag = bag_of(tmp_path, "bag", "/points", "/chatter", "/odom")
     message = refused(ArgumentError, lambda: Bag(bag, topics="/lidar").sequences())
-    assert "topics: expected one of /points (PointCloud2, 3 messages, 10 Hz) in" in message and "'/lidar'" in message
+    assert (
+        "topics: expected one of /points (PointCloud2, 3 messages, 10 Hz) in" in message
+        and "'/lidar'" in message
+    )
     message = refused(ArgumentError, lambda: Bag(bag, topics="/chatter").sequences())
     assert "found /chatter (String, 3 messages, 10 Hz), which is not read" in message
     (recording,) = Bag(bag, pose_topic="/chatter").sequences()
@@ -66,7 +82,10 @@ def test_points_in_an_encoding_that_is_not_read_are_named(tmp_path):
     pytest.importorskip("mcap.writer")
     write_one_message(tmp_path / "drive.mcap", "flatbuffer", b"")
     for options in ({}, {"topics": "/points"}):
-        message = refused(CarlascError, lambda options=options: Bag(tmp_path / "drive.mcap", **options).sequences())
+        message = refused(
+            CarlascError,
+            lambda options=options: Bag(tmp_path / "drive.mcap", **options).sequences(),
+        )
         assert "found /points (foxglove.PointCloud as flatbuffer, 1 messages)" in message
 
 
@@ -74,7 +93,10 @@ def test_several_topics_of_poses_are_listed(tmp_path):
     bag = bag_of(tmp_path, "db3", "/points", "/wheel_odom", "/visual_odom")
     (recording,) = Bag(bag).sequences()
     message = refused(ArgumentError, recording.poses)
-    assert "pose_topic: expected one of /visual_odom (Odometry, 3 messages, 10 Hz), /wheel_odom" in message
+    assert (
+        "pose_topic: expected one of /visual_odom (Odometry, 3 messages, 10 Hz), /wheel_odom"
+        in message
+    )
     (recording,) = Bag(bag, pose_topic="/wheel_odom", pose_frame="lidar").sequences()
     assert recording.poses().where.endswith("/wheel_odom")
 
@@ -83,7 +105,10 @@ def test_several_topics_of_poses_are_listed(tmp_path):
 def test_messages_of_a_packet_each_are_refused_with_what_to_do(tmp_path, kind):
     bag = bag_of(tmp_path, kind, "/packets", frames=20, period_ns=1_327_000)
     message = refused(FormatError, lambda: Bag(bag).sequences())
-    assert "/packets: expected a message for each turn of the LiDAR, found 20 messages, 754 per second" in message
+    assert (
+        "/packets: expected a message for each turn of the LiDAR, found 20 messages, 754 per second"
+        in message
+    )
     assert "set the driver to publish full turns" in message
 
 
@@ -92,7 +117,9 @@ def test_parts_of_a_recording_are_one_and_other_bags_are_others(tmp_path, kind):
     ending = f".{kind}"
     for number, name in enumerate(("drive_0", "drive_1", "drive_2", "other", "run_4", "run_5")):
         (tmp_path / name).mkdir()
-        file = file_of(bag_of(tmp_path / name, kind, "/points", start_ns=START_NS + number * 300_000_000))
+        file = file_of(
+            bag_of(tmp_path / name, kind, "/points", start_ns=START_NS + number * 300_000_000)
+        )
         file.rename(tmp_path / f"{name}{ending}")
     found = [[path.name.removesuffix(ending) for path in paths] for paths in find_bags(tmp_path)]
     assert found == [["drive_0", "drive_1", "drive_2"], ["other"], ["run_4"], ["run_5"]]
@@ -110,7 +137,9 @@ def test_a_folder_without_bags_a_packed_bag_and_another_file_are_named(tmp_path)
     packed = tmp_path / "drive_0.db3.zstd"
     packed.write_bytes(b"\x28\xb5\x2f\xfd")
     for source in (tmp_path, packed):
-        message = refused((MissingDataError, FormatError), lambda source=source: Bag(source).sequences())
+        message = refused(
+            (MissingDataError, FormatError), lambda source=source: Bag(source).sequences()
+        )
         assert "unpack it with `zstd -d drive_0.db3.zstd`" in message
     (tmp_path / "drive.bag").write_text("#ROSBAG V1.2\n")
     message = refused(FormatError, lambda: Bag(tmp_path / "drive.bag").sequences())

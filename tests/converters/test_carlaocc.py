@@ -54,11 +54,13 @@ def test_scans_hold_the_points_the_tags_and_the_actors_that_may_move(root: Path)
     for frame in found.frames:
         truth = DRIVE.scan(frame.number)
         (cloud,) = frame.read()
-        np.testing.assert_allclose(cloud.points[:, :3], truth.points[:, :3], rtol=2e-7, atol=5.1e-5)  # four decimals
+        # four decimals
+        np.testing.assert_allclose(cloud.points[:, :3], truth.points[:, :3], rtol=2e-7, atol=5.1e-5)
         assert cloud.points.dtype == np.float32
         np.testing.assert_array_equal(cloud.labels, TAG_OF_KIND[truth.kinds])
         expected = np.where(truth.instances > 0, truth.instances + FIRST_ACTOR, 0)
-        np.testing.assert_array_equal(cloud.instances, expected)  # none of poles, which have an ObjIdx too
+        # none of poles, which have an ObjIdx too
+        np.testing.assert_array_equal(cloud.instances, expected)
         assert expected.any()
 
 
@@ -69,12 +71,16 @@ def test_poses_and_times_are_those_of_the_simulation(root: Path) -> None:
     assert trajectory is not None
     np.testing.assert_allclose(times, DRIVE.times, atol=1e-12)
     for frame in range(DRIVE.frames):
-        np.testing.assert_allclose(trajectory.at(times)[frame], world_T_sensor(DRIVE, frame), atol=1e-6)
+        np.testing.assert_allclose(
+            trajectory.at(times)[frame], world_T_sensor(DRIVE, frame), atol=1e-6
+        )
     assert found.sensors[0].height_m == pytest.approx(1.73)
 
 
 @pytest.mark.parametrize("factor", [1000, 2048])
-def test_grids_of_meshes_are_read_whichever_way_their_labels_are_written(tmp_path: Path, factor: int) -> None:
+def test_grids_of_meshes_are_read_whichever_way_their_labels_are_written(
+    tmp_path: Path, factor: int
+) -> None:
     write_carlaocc(tmp_path, DRIVE, factor=factor)
     found = recording(tmp_path)
     assert found.voxels == SURROUND
@@ -106,7 +112,9 @@ def test_an_option_names_the_grid(tmp_path: Path) -> None:
     write_carlaocc(tmp_path, DRIVE, grids={"vs_0_2_forward_view": forward, "own": SURROUND})
     assert recording(tmp_path).voxels == forward
     assert recording(tmp_path, voxels="own").voxels == SURROUND
-    with pytest.raises(ArgumentError, match="voxels: expected one of own, vs_0_2_forward_view, found vs_9"):
+    with pytest.raises(
+        ArgumentError, match="voxels: expected one of own, vs_0_2_forward_view, found vs_9"
+    ):
         CarlaOcc(tmp_path, voxels="vs_9").sequences()
 
 
@@ -139,10 +147,15 @@ def test_every_tag_has_the_class_of_carlasc_with_the_same_role() -> None:
     remap = CarlaOcc.to_carla
     assert set(remap.mapping) == set(CARLAOCC.names)
     for role in ("movable", "ground"):
-        assert {tag for tag in CARLAOCC.names if remap.mapping[tag] in getattr(CARLA, role)} - {29} == getattr(
-            CARLAOCC, role
-        )
-    for kind, name in (("car", "Vehicle"), ("van", "Vehicle"), ("pedestrian", "Pedestrian"), ("road", "Road")):
+        assert {tag for tag in CARLAOCC.names if remap.mapping[tag] in getattr(CARLA, role)} - {
+            29
+        } == getattr(CARLAOCC, role)
+    for kind, name in (
+        ("car", "Vehicle"),
+        ("van", "Vehicle"),
+        ("pedestrian", "Pedestrian"),
+        ("road", "Road"),
+    ):
         assert CARLA.names[remap.mapping[int(TAG_OF_KIND[KINDS.index(kind)])]] == name
     assert CARLA.names[remap.mapping[29]] == "Terrain"
 
@@ -182,7 +195,9 @@ def repeat_pose(folder: Path) -> None:
 
 def shorten_pose(folder: Path) -> None:
     path = folder / "poses" / "lidar.txt"
-    path.write_text("".join(" ".join(line.split()[1:]) + "\n" for line in path.read_text().splitlines()))
+    path.write_text(
+        "".join(" ".join(line.split()[1:]) + "\n" for line in path.read_text().splitlines())
+    )
 
 
 def change_grid(folder: Path, **changes: object) -> None:
@@ -211,9 +226,13 @@ def move_rows(folder: Path) -> None:
         (shorten_pose, "lidar.txt: expected 17 numbers per line: frame and 4 x 4 pose, found 16"),
         (
             cut_grid,
-            "0002.npz: expected an .npz file, found something else (File is not a zip file): the file is incomplete",
+            "0002.npz: expected an .npz file, found something else (File is not a zip file): the "
+            "file is incomplete",
         ),
-        (move_rows, "0002.npz: expected voxels inside of cartesian 128 x 128 x 16, found 1 voxels outside"),
+        (
+            move_rows,
+            "0002.npz: expected voxels inside of cartesian 128 x 128 x 16, found 1 voxels outside",
+        ),
         (
             lambda folder: change_grid(folder, voxel_size=None),
             "0002.npz: expected an array voxel_size, found occupancy, voxel_origin, volume_size",
@@ -223,12 +242,18 @@ def move_rows(folder: Path) -> None:
             lambda folder: change_grid(folder, volume_size=np.array([65408, 128, 255])),
             "0002.npz: expected at most 268435456 bytes, found uint8 of shape",
         ),
-        (lambda folder: change_grid(folder, volume_size=np.array([1, 2])), "0002.npz: expected voxel_size, and 3"),
+        (
+            lambda folder: change_grid(folder, volume_size=np.array([1, 2])),
+            "0002.npz: expected voxel_size, and 3",
+        ),
         (
             lambda folder: change_grid(folder, occupancy=np.zeros((4, 3), np.uint16)),
             "0002.npz: occupancy: expected an array of N x 4 values, found 4 x 3",
         ),
-        (lambda folder: change_grid(folder, occupancy=np.array([{}])), "0002.npz: occupancy: expected uint16"),
+        (
+            lambda folder: change_grid(folder, occupancy=np.array([{}])),
+            "0002.npz: occupancy: expected uint16",
+        ),
     ],
 )
 def test_a_wrong_file_is_named_in_one_line(sequence: Path, spoil: object, message: str) -> None:
@@ -247,7 +272,9 @@ def test_a_wrong_file_is_named_in_one_line(sequence: Path, spoil: object, messag
 
 def test_a_folder_without_sequences_says_what_was_looked_for(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(MissingDataError, match="folders such as Town01_Opt_Seq07 with semantic_lidar/ in them"):
+        with pytest.raises(
+            MissingDataError, match="folders such as Town01_Opt_Seq07 with semantic_lidar/ in them"
+        ):
             CarlaOcc(folder).sequences()
 
 
@@ -266,7 +293,10 @@ def test_meshes_are_a_truth_for_the_grids_that_scans_give(tmp_path: Path) -> Non
     drive = SimulatedDrive(frames=3, channels=24, columns=180)
     write_carlaocc(tmp_path / "source", drive)
     grids = {}
-    for kind, how in (("scans", GridOptions(SURROUND, FromScans(window=(-2, 0)))), ("voxels", "voxels")):
+    for kind, how in (
+        ("scans", GridOptions(SURROUND, FromScans(window=(-2, 0)))),
+        ("voxels", "voxels"),
+    ):
         out = tmp_path / kind
         result = convert("carlaocc", tmp_path / "source", out, grids=how, run=Run(workers=1))
         assert result.failures == ()
@@ -274,7 +304,8 @@ def test_meshes_are_a_truth_for_the_grids_that_scans_give(tmp_path: Path) -> Non
         grids[kind] = sequence.grid(layout.grid_folder(SURROUND), 2)
     scans, meshes = grids["scans"], grids["voxels"]
     tags, _ = mesh_voxels(drive, 2, SURROUND)
-    np.testing.assert_array_equal(meshes.labels, CarlaOcc.to_carla(tags)[:, ::-1])  # left-handed axes
+    # left-handed axes
+    np.testing.assert_array_equal(meshes.labels, CarlaOcc.to_carla(tags)[:, ::-1])
     assert meshes.known.all()
     seen = scans.known & (scans.labels > 0)
     free = scans.known & (scans.labels == 0)

@@ -69,7 +69,9 @@ class TestTwoSensorsThatTurn(InMemory):
         scans = [self.drive.scan(3, sensor) for sensor in range(2)]
         sensor, seconds = sequence.read("sensor", 3), sequence.read("seconds", 3)
         assert sensor.tolist() == [0] * len(scans[0].points) + [1] * len(scans[1].points)
-        np.testing.assert_allclose(seconds, np.concatenate([scan.seconds for scan in scans]), atol=1e-6)
+        np.testing.assert_allclose(
+            seconds, np.concatenate([scan.seconds for scan in scans]), atol=1e-6
+        )
         origins = sequence.read("origins", 3)
         upper, lower = origins[sensor == 0], origins[sensor == 1]
         # 10 m/s: half a metre before and after the time of the frame, in steps

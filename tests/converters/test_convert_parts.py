@@ -28,7 +28,10 @@ def kitti(tmp_path):
 def test_parts_make_the_files_of_one_conversion(kitti, tmp_path, order):
     how = {"grids": GridOptions(SPEC, follow_ground=False), "poses": PoseOptions(force=True)}
     whole = convert("kitti", kitti, tmp_path / "whole", run=Run(1), **how)
-    parts = [convert("kitti", kitti, tmp_path / "parts", run=Run(1, part=Part(n, 3)), **how) for n in order]
+    parts = [
+        convert("kitti", kitti, tmp_path / "parts", run=Run(1, part=Part(n, 3)), **how)
+        for n in order
+    ]
     assert sum(part.made for part in parts) == whole.made == 12
     assert sorted(path for part in parts for path in part.sequences) == sorted(
         path.replace("whole", "parts") for path in whole.sequences
@@ -56,7 +59,9 @@ def test_long_recordings_weigh_more(kitti, tmp_path):
 def test_grids_do_not_follow_a_ground_that_a_part_does_not_see(kitti, tmp_path):
     with pytest.raises(ArgumentError, match="ground of all recordings"):
         convert("kitti", kitti, tmp_path / "out", run=Run(part=Part(1, 2)))
-    ran = CliRunner().invoke(app, ["convert", "kitti", str(kitti), str(tmp_path / "out"), "--part", "1/2"])
+    ran = CliRunner().invoke(
+        app, ["convert", "kitti", str(kitti), str(tmp_path / "out"), "--part", "1/2"]
+    )
     assert ran.exit_code == 2
     assert ran.stderr.startswith("carlasc: --part: expected --bounds or --grids none")
     assert not (tmp_path / "out").exists()

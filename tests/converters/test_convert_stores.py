@@ -14,7 +14,10 @@ from carlasc.motion import PoseOptions
 
 pytest.importorskip("numcodecs")
 
-HOW = {"grids": GridOptions(GridSpec.published().with_size((16, 16, 4))), "poses": PoseOptions(force=True)}
+HOW = {
+    "grids": GridOptions(GridSpec.published().with_size((16, 16, 4))),
+    "poses": PoseOptions(force=True),
+}
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +55,10 @@ def test_a_frame_that_fails_is_added_when_it_is_corrected(kitti, tmp_path):
     (sequence,) = carlasc.open(tmp_path / "x.zarr").sequences().values()
     assert 17 not in sequence.frames("points") and len(sequence.frames("points")) == 19
     scan.write_bytes(good)
-    assert convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", run=Run(workers=1), **HOW).made == 1
+    assert (
+        convert("kitti", tmp_path / "kitti", tmp_path / "x.zarr", run=Run(workers=1), **HOW).made
+        == 1
+    )
     (sequence,) = carlasc.open(tmp_path / "x.zarr").sequences().values()
     assert len(sequence.frames("points")) == len(sequence.frames("flow")) == 20
 

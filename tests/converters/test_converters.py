@@ -84,9 +84,12 @@ def installed(tmp_path, monkeypatch):
     site = tmp_path / "site"
     (site / "lab-1.0.dist-info").mkdir(parents=True)
     (site / "lab_converter.py").write_text(THIRD_PARTY)
-    (site / "lab-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n")
+    (site / "lab-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n"
+    )
     (site / "lab-1.0.dist-info" / "entry_points.txt").write_text(
-        "[carlasc.converters]\nlab = lab_converter:Lab\nbroken = lab_converter:Nothing\nwrong = lab_converter:Handle\n"
+        "[carlasc.converters]\nlab = lab_converter:Lab\nbroken = lab_converter:Nothing\nwrong = "
+        "lab_converter:Handle\n"
         "failing = lab_converter:Failing\n"
     )
     monkeypatch.syspath_prepend(str(site))
@@ -113,16 +116,29 @@ def test_a_third_partys_converter_is_found_and_used(installed, tmp_path):
     ("how", "cause"),
     [
         ("torn", "lab 0: expected a scan, found half of one"),
-        ("faulty", "lab 0: the converter failed: KeyError: 'points': check the file, or report the error"),
+        (
+            "faulty",
+            "lab 0: the converter failed: KeyError: 'points': check the file, or report the error",
+        ),
     ],
 )
-def test_where_every_frame_fails_the_first_cause_is_the_message(installed, tmp_path, how, cause, posed):
-    result = convert("failing", installed, tmp_path / "out", options={"how": how, "posed": posed}, run=Run(workers=1))
+def test_where_every_frame_fails_the_first_cause_is_the_message(
+    installed, tmp_path, how, cause, posed
+):
+    result = convert(
+        "failing",
+        installed,
+        tmp_path / "out",
+        options={"how": how, "posed": posed},
+        run=Run(workers=1),
+    )
     assert [failure.frame for failure in result.failures] == [0, 1]
     assert result.failures[0].message == cause
     assert (result.made, result.grids) == (0, ())
     options = ["--how", how, "--posed" if posed else "--no-posed", "--workers", "1"]
-    ran = CliRunner().invoke(app, ["convert", "failing", str(installed), str(tmp_path / "cli"), *options])
+    ran = CliRunner().invoke(
+        app, ["convert", "failing", str(installed), str(tmp_path / "cli"), *options]
+    )
     assert ran.exit_code == 1
     assert cause in ran.stderr.splitlines()[0]
     assert "velodyne" not in ran.output
@@ -156,27 +172,37 @@ def test_options_that_are_declared_badly_are_named():
 
     with pytest.raises(DependencyError, match="NoDefault: count: expected a default, found none"):
         option_declarations(NoDefault)
-    with pytest.raises(DependencyError, match="NoType: names: expected an option of the type str, int, float, bool"):
+    with pytest.raises(
+        DependencyError, match="NoType: names: expected an option of the type str, int, float, bool"
+    ):
         option_declarations(NoType)
 
 
 def test_a_converter_that_does_not_load_is_named(installed):
-    with pytest.raises(DependencyError, match=r"converter broken \(lab_converter:Nothing\): cannot be loaded"):
+    with pytest.raises(
+        DependencyError, match=r"converter broken \(lab_converter:Nothing\): cannot be loaded"
+    ):
         load_converter("broken")
-    with pytest.raises(DependencyError, match=r"expected a class that inherits carlasc.converting.Converter"):
+    with pytest.raises(
+        DependencyError, match=r"expected a class that inherits carlasc.converting.Converter"
+    ):
         load_converter("wrong")
 
 
 def test_what_a_converter_lacks_is_an_argument_error(installed, tmp_path):
     with pytest.raises(MissingDataError, match="lab: expected voxel grids, found none"):
         convert("lab", installed, tmp_path / "out", poses=PoseOptions(force=True), grids="voxels")
-    with pytest.raises(ArgumentError, match="options: expected no options for this data set, found color"):
+    with pytest.raises(
+        ArgumentError, match="options: expected no options for this data set, found color"
+    ):
         convert("lab", installed, tmp_path / "out", options={"color": "red"})
 
 
 def test_a_source_that_does_not_exist_is_named(tmp_path):
     for name in ("synthcity", "kitti-raw"):
-        with pytest.raises(MissingDataError, match="typo: expected a folder, found nothing: check the path"):
+        with pytest.raises(
+            MissingDataError, match="typo: expected a folder, found nothing: check the path"
+        ):
             convert(name, tmp_path / "typo", tmp_path / "out")
 
 
@@ -202,11 +228,20 @@ def test_actors_of_semanticposs_that_go_nowhere_have_no_flow(tmp_path):
     for frame in range(20):
         walls = np.concatenate([box + (10 + 0.8 * frame, 3, -1.7), box + (10, -6, -1.7)])
         walls = walls + rng.uniform(-0.02, 0.02, walls.shape)
-        np.column_stack([walls, np.zeros(400)]).astype("<f4").tofile(folder / "velodyne" / f"{frame:06d}.bin")
+        np.column_stack([walls, np.zeros(400)]).astype("<f4").tofile(
+            folder / "velodyne" / f"{frame:06d}.bin"
+        )
         write_labels(folder, frame, np.repeat([7 | 1 << 16, 7 | 2 << 16], 200))
     np.savetxt(folder / "poses.txt", np.tile(np.eye(4)[:3].ravel(), (20, 1)))
     (folder / "calib.txt").unlink()
-    convert("poss", tmp_path / "in", tmp_path / "out", poses=PoseOptions(force=True), grids=None, run=Run(workers=1))
+    convert(
+        "poss",
+        tmp_path / "in",
+        tmp_path / "out",
+        poses=PoseOptions(force=True),
+        grids=None,
+        run=Run(workers=1),
+    )
     flow = carlasc.open(tmp_path / "out").sequences()["Train/POSS_00/cartesian"].read("flow", 10)
     assert np.abs(flow[:200] - [8, 0, 0]).max() < 0.3
     assert not flow[200:].any()
@@ -257,14 +292,26 @@ def test_any_sink_will_do(tmp_path):
 
 
 def files_of(root):
-    return {path.relative_to(root): path.read_bytes() for path in sorted(Path(root).rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(root): path.read_bytes()
+        for path in sorted(Path(root).rglob("*"))
+        if path.is_file()
+    }
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
 def test_an_interrupted_run_leaves_whole_files_and_the_next_one_goes_on(tmp_path, name):
     write_tiny_kitti(tmp_path / "in", frames=60)
     convert("kitti", tmp_path / "in", tmp_path / "whole", grids=None, run=Run(workers=1))
-    arguments = ["kitti", str(tmp_path / "in"), str(tmp_path / "out"), "--grids", "none", "--workers", "1"]
+    arguments = [
+        "kitti",
+        str(tmp_path / "in"),
+        str(tmp_path / "out"),
+        "--grids",
+        "none",
+        "--workers",
+        "1",
+    ]
     helper = Path(__file__).parents[1] / "helpers" / "processes" / "interrupted.py"
     done = subprocess.run(
         [sys.executable, helper, name, "100", "convert", *arguments],

@@ -14,13 +14,19 @@ def write(path):
 
 
 def test_arrays_are_read_in_the_order_of_their_names(tmp_path):
-    other, data = read_arrays(write(tmp_path / "a.npz"), {"other": OTHER, "data": DATA}, "copy it again")
+    other, data = read_arrays(
+        write(tmp_path / "a.npz"), {"other": OTHER, "data": DATA}, "copy it again"
+    )
     assert other.tolist() == [0, 0, 0]
     np.testing.assert_array_equal(data, np.arange(500, dtype=np.uint16) ** 2)
 
 
 def test_a_missing_file_and_a_missing_array_are_named_with_advice(tmp_path):
-    with pytest.raises(MissingDataError, match=r"b\.npz: expected a file, found nothing: unpack it again"):
+    with pytest.raises(
+        MissingDataError, match=r"b\.npz: expected a file, found nothing: unpack it again"
+    ):
         read_arrays(tmp_path / "b.npz", {"data": DATA}, "unpack it again")
-    with pytest.raises(FormatError, match=r"a\.npz: expected an array labels, found data, other: copy it again"):
+    with pytest.raises(
+        FormatError, match=r"a\.npz: expected an array labels, found data, other: copy it again"
+    ):
         read_arrays(write(tmp_path / "a.npz"), {"data": DATA, "labels": DATA}, "copy it again")

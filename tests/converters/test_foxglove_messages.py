@@ -15,20 +15,28 @@ from carlasc.errors import FormatError
 from carlasc.storage import FolderSink, layout
 from carlasc.viewing import Scene, view
 
-FRAMES, POSES = 3, np.stack([translation((2.0 * i, 1.0 * i, 0.0)) @ rotation_z(0.1 * i) for i in range(3)])
+FRAMES, POSES = (
+    3,
+    np.stack([translation((2.0 * i, 1.0 * i, 0.0)) @ rotation_z(0.1 * i) for i in range(3)]),
+)
 
 
 @pytest.mark.needs("foxglove")
 def test_the_points_and_poses_of_a_recording_that_view_writes_come_back(tmp_path):
     folder = write_blocks(tmp_path / "Train" / "Town01_Light" / "cartesian")
-    FolderSink(folder.parent).sequence(folder.name).write_document(layout.POSES, layout.encode_poses(POSES))
+    FolderSink(folder.parent).sequence(folder.name).write_document(
+        layout.POSES, layout.encode_poses(POSES)
+    )
     view(folder, tmp_path / "scene.mcap", full_points=True)
     (recording,) = Bag(tmp_path / "scene.mcap").sequences()
     assert recording.name == "scene" and len(recording.frames) == FRAMES and recording.notes() == []
     reader = Scene(folder).open().right_handed()
     for frame in recording.frames:
         (cloud,) = frame.read()
-        assert cloud.points[:, :3].tobytes() == np.ascontiguousarray(reader.read(frame.number).scan.points).tobytes()
+        assert (
+            cloud.points[:, :3].tobytes()
+            == np.ascontiguousarray(reader.read(frame.number).scan.points).tobytes()
+        )
         assert cloud.seconds is None
     np.testing.assert_allclose(recording.times(), [0.0, 0.1, 0.2], atol=1e-9)
     expected = np.stack([reader.read(frame).pose for frame in range(FRAMES)])
@@ -57,8 +65,14 @@ def write_json(path, poses_topic, points, cloud_pose, **options):
             channels[topic] = writer.register_channel(topic, "json", schema)
         for frame, pose in enumerate(POSES):
             stamp = 5 * 10**9 + frame * 10**8
-            head = {"timestamp": {"sec": stamp // 10**9, "nsec": stamp % 10**9}, "frame_id": "lidar"}
-            fields = [{"name": name, "offset": 4 * i, "type": 7} for i, name in enumerate(("x", "y", "z", "intensity"))]
+            head = {
+                "timestamp": {"sec": stamp // 10**9, "nsec": stamp % 10**9},
+                "frame_id": "lidar",
+            }
+            fields = [
+                {"name": name, "offset": 4 * i, "type": 7}
+                for i, name in enumerate(("x", "y", "z", "intensity"))
+            ]
             data = base64.b64encode(points.tobytes()).decode()
             cloud = head | {"pose": cloud_pose, "point_stride": 16, "fields": fields, "data": data}
             for topic, message in (
@@ -97,7 +111,9 @@ def test_files_of_any_structure_hold_the_same(tmp_path, options):
     points = np.random.default_rng(0).uniform(-20, 20, (100, 4)).astype(np.float32)
     write_json(tmp_path / "drive.mcap", "/pose", points, pose_json(np.eye(4)), **options)
     (recording,) = Bag(tmp_path / "drive.mcap").sequences()
-    assert [frame.read()[0].points.tobytes() for frame in recording.frames] == [points.tobytes()] * FRAMES
+    assert [frame.read()[0].points.tobytes() for frame in recording.frames] == [
+        points.tobytes()
+    ] * FRAMES
     np.testing.assert_allclose(recording.poses().world_T_vehicle, POSES, atol=1e-12)
     assert not any("cut short" in note or "finished" in note for note in recording.notes())
 
@@ -113,6 +129,7 @@ def test_a_message_that_is_none_is_named(tmp_path):
     pytest.importorskip("mcap.writer")
     write_one_message(tmp_path / "drive.mcap", "protobuf", b"\x0a\xff")
     with pytest.raises(
-        FormatError, match="/points: expected a message of type foxglove.PointCloud, found something else"
+        FormatError,
+        match="/points: expected a message of type foxglove.PointCloud, found something else",
     ):
         _ = Bag(tmp_path / "drive.mcap").sequences()[0].frames

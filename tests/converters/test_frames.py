@@ -28,7 +28,9 @@ RIG = Rig((Sensor(),), np.eye(4))
 
 def frame_of(labels, instances=None, number=0):
     points = np.arange(4 * len(labels), dtype=np.float32).reshape(-1, 4) + 1
-    instances = np.zeros(len(labels), np.uint32) if instances is None else np.array(instances, np.uint32)
+    instances = (
+        np.zeros(len(labels), np.uint32) if instances is None else np.array(instances, np.uint32)
+    )
     return MemoryFrame(number, Cloud(points, np.array(labels, np.uint16), instances))
 
 
@@ -48,13 +50,20 @@ def test_mirrored_poses_move_mirrored_points_to_the_mirrored_place():
 
 
 def some_boxes():
-    poses = np.stack([translation((10, 3, -1)) @ rotation_z(0.4), translation((5, -2, 0)) @ rotation_z(-3)])
+    poses = np.stack(
+        [translation((10, 3, -1)) @ rotation_z(0.4), translation((5, -2, 0)) @ rotation_z(-3)]
+    )
     tracks, labels = np.array([2, 9], np.uint32), np.array([10, 30], np.uint32)
-    return Boxes.from_poses(tracks, labels, poses, np.array([[4, 2, 1.5], [0.5, 0.6, 1.8]]), np.array([True, False]))
+    return Boxes.from_poses(
+        tracks, labels, poses, np.array([[4, 2, 1.5], [0.5, 0.6, 1.8]]), np.array([True, False])
+    )
 
 
 def test_mirrored_boxes_hold_the_mirrored_points():
-    boxes, points = some_boxes(), np.random.default_rng(0).uniform((4, -4, -2), (13, 6, 1), (5000, 3))
+    boxes, points = (
+        some_boxes(),
+        np.random.default_rng(0).uniform((4, -4, -2), (13, 6, 1), (5000, 3)),
+    )
     mirrored = mirror_boxes(boxes)
     assert boxes.contains(points).sum(axis=1).min() > 0
     np.testing.assert_array_equal(mirrored.contains(points * [1, -1, 1]), boxes.contains(points))
@@ -84,17 +93,23 @@ def test_a_scan_is_mirrored_and_mapped_and_its_points_come_last():
 
 
 def test_ids_beyond_16_bits_are_unknown_ids_and_not_wrapped():
-    with pytest.raises(FormatError, match=r"scan: expected class ids of semantickitti, found 65546 \(2 times\)"):
+    with pytest.raises(
+        FormatError, match=r"scan: expected class ids of semantickitti, found 65546 \(2 times\)"
+    ):
         RIGHT.map_labels(np.array([10, 65546, 65546], np.uint32), "scan")
 
 
 def test_only_the_first_unknown_ids_are_listed():
-    with pytest.raises(FormatError, match=r"found 300 \(1 times\), .*307 \(1 times\) and 2 more: treat"):
+    with pytest.raises(
+        FormatError, match=r"found 300 \(1 times\), .*307 \(1 times\) and 2 more: treat"
+    ):
         RIGHT.map_labels(np.arange(300, 310, dtype=np.uint16), "scan")
 
 
 def voxels_of(labels, known=None):
-    return VoxelContent(labels, np.ones(VOXELS.size, bool) if known is None else known, {"000000.label": b"kept"})
+    return VoxelContent(
+        labels, np.ones(VOXELS.size, bool) if known is None else known, {"000000.label": b"kept"}
+    )
 
 
 def convert_voxels(target, voxels, writer):
@@ -104,7 +119,12 @@ def convert_voxels(target, voxels, writer):
 
 def test_own_voxels_are_mapped_mirrored_and_kept():
     labels = np.zeros(VOXELS.size, np.uint16)
-    labels[0, 0, 0], labels[1, 0, 0], labels[2, 3, 1] = 40, 1, 252  # road, outlier (no target), moving car
+    # road, outlier (no target), moving car
+    labels[0, 0, 0], labels[1, 0, 0], labels[2, 3, 1] = (
+        40,
+        1,
+        252,
+    )
     known = np.ones(VOXELS.size, bool)
     known[2, 3, 1] = False
     writer = MemoryWriter()
@@ -154,7 +174,9 @@ def times_of(recording):
 
 
 def test_poses_are_relative_to_the_first_frame_and_in_the_frame_of_the_first_sensor():
-    world = np.stack([translation((5, 0, 0)) @ rotation_z(1.0), translation((6, 1, 0)) @ rotation_z(1.2)])
+    world = np.stack(
+        [translation((5, 0, 0)) @ rotation_z(1.0), translation((6, 1, 0)) @ rotation_z(1.2)]
+    )
     recording = recording_of(world)
     recording.sensors = (Sensor("roof", translation((1.0, 0.0, 1.5)) @ rotation_z(0.5)),)
     times = times_of(recording)
@@ -175,7 +197,9 @@ def test_times_are_those_of_the_recording_or_a_tenth_of_a_second_apart():
 @pytest.mark.parametrize("wrong", [1.7e18, -1e308, np.inf, np.nan])
 def test_times_that_are_no_seconds_are_refused(wrong):
     poses = np.tile(np.eye(4), (2, 1, 1))
-    with pytest.raises(FormatError, match=r"memory: expected times in seconds, below 1e\+11, found .* at row 1"):
+    with pytest.raises(
+        FormatError, match=r"memory: expected times in seconds, below 1e\+11, found .* at row 1"
+    ):
         times_of(recording_of(poses, np.array([0.0, wrong])))
     with pytest.raises(FormatError, match="poses: expected times"):
         Trajectory(poses, np.array([0.0, abs(wrong)]))
@@ -184,7 +208,9 @@ def test_times_that_are_no_seconds_are_refused(wrong):
 def test_one_pose_with_a_time_is_not_that_of_many_scans():
     recording = recording_of(None)
     recording.poses = lambda *, force=False: Trajectory(np.eye(4)[None], np.array([0.0]))
-    with pytest.raises(FormatError, match="memory: expected poses over the time of 2 scans, found one pose: copy"):
+    with pytest.raises(
+        FormatError, match="memory: expected poses over the time of 2 scans, found one pose: copy"
+    ):
         read_trajectory(recording, times_of(recording), PoseOptions("auto"))
 
 
@@ -234,7 +260,8 @@ def test_points_are_moved_to_the_time_of_the_frame_and_keep_the_place_of_their_r
     rolling = Rig((Sensor("turns", deskewed=False),), np.eye(4))
     scan = assemble([cloud], rolling, driving(2.0, 1.0), "scan")
     np.testing.assert_allclose(scan.points, [[9, 0, 0, 1], [10, 0, 0, 2], [11, 0, 0, 3]], atol=1e-6)
-    assert np.abs(scan.fields["origins"][:, 0] - [-1, 0, 1]).max() <= 0.13  # neighbouring places count as one
+    # neighbouring places count as one
+    assert np.abs(scan.fields["origins"][:, 0] - [-1, 0, 1]).max() <= 0.13
     corrected = assemble([cloud], Rig((Sensor("corrected"),), np.eye(4)), driving(2.0, 1.0), "scan")
     assert corrected.points is points
     np.testing.assert_array_equal(corrected.fields["origins"], scan.fields["origins"])
@@ -244,7 +271,10 @@ def test_points_are_moved_to_the_time_of_the_frame_and_keep_the_place_of_their_r
 
 
 def test_clouds_of_several_sensors_are_put_together_in_the_axes_of_the_vehicle():
-    sensors = (Sensor("roof", translation((0, 0, 2)) @ rotation_z(np.pi / 2)), Sensor("front", translation((3, 0, 1))))
+    sensors = (
+        Sensor("roof", translation((0, 0, 2)) @ rotation_z(np.pi / 2)),
+        Sensor("front", translation((3, 0, 1))),
+    )
     vehicle_T_scan = translation((0, 0, 2))
     ahead = np.array([[5, 0, 0, 1]], np.float32)
     clouds = [Cloud(ahead, np.array([10], np.uint8)), Cloud(ahead, sensor=1)]
@@ -259,7 +289,10 @@ def test_clouds_of_several_sensors_are_put_together_in_the_axes_of_the_vehicle()
     ("cloud", "problem"),
     [
         (Cloud(np.zeros((2, 5), np.float32)), r"scan: points: expected shape \(N, 4\) float32"),
-        (Cloud(np.zeros((2, 4), np.float32), np.zeros(3, np.uint8)), "scan: labels: expected one for each of 2 points"),
+        (
+            Cloud(np.zeros((2, 4), np.float32), np.zeros(3, np.uint8)),
+            "scan: labels: expected one for each of 2 points",
+        ),
         (Cloud(np.zeros((2, 4), np.float32), sensor=1), "scan: expected a sensor 0..0, found 1"),
     ],
 )
@@ -289,11 +322,19 @@ def test_estimated_poses_of_an_earlier_run_are_used_in_right_handed_axes():
     writer.write_document(layout.POSES, layout.encode_poses(stored))
     writer.write_document(layout.METADATA, Metadata(extra={"poses": "kiss-icp"}).to_json())
     plan = plan_recording(
-        recording_of(None), Lab, MemorySink(writer), LEFT, PoseOptions("kiss-icp"), flow=False, voxels=False
+        recording_of(None),
+        Lab,
+        MemorySink(writer),
+        LEFT,
+        PoseOptions("kiss-icp"),
+        flow=False,
+        voxels=False,
     )
     begin(plan, LEFT, Metadata())
     np.testing.assert_allclose(plan.poses, mirror_poses(stored), atol=1e-9)
-    np.testing.assert_allclose(layout.decode_poses(writer.texts[layout.POSES], "poses"), stored, atol=1e-9)
+    np.testing.assert_allclose(
+        layout.decode_poses(writer.texts[layout.POSES], "poses"), stored, atol=1e-9
+    )
 
 
 def test_poses_of_another_origin_are_a_conflict():
@@ -301,7 +342,13 @@ def test_poses_of_another_origin_are_a_conflict():
     writer.write_document(layout.METADATA, Metadata(extra={"poses": "kiss-icp"}).to_json())
     poses = np.tile(np.eye(4), (2, 1, 1))
     plan = plan_recording(
-        recording_of(poses), Lab, MemorySink(writer), LEFT, PoseOptions("file", force=True), flow=False, voxels=False
+        recording_of(poses),
+        Lab,
+        MemorySink(writer),
+        LEFT,
+        PoseOptions("file", force=True),
+        flow=False,
+        voxels=False,
     )
     with pytest.raises(ConflictError, match="expected poses from file, found kiss-icp"):
         begin(plan, LEFT, Metadata())

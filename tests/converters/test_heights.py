@@ -1,4 +1,6 @@
-"""Sensors that are higher or lower than CarlaSC's: grids follow the ground, or a note says what is below them."""
+"""Sensors that are higher or lower than CarlaSC's: grids follow the ground, or a note says what is
+below them.
+"""
 
 import numpy as np
 import pytest
@@ -36,7 +38,11 @@ def converted(height_m, tmp_path, follow_ground=True):
     )
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
     (name,) = sequence.grids
-    return sequence, name, [note for note in result.notes if "below the grid" in note or "grids reach" in note]
+    return (
+        sequence,
+        name,
+        [note for note in result.notes if "below the grid" in note or "grids reach" in note],
+    )
 
 
 @pytest.mark.parametrize("height_m", [1.5, 1.73, 1.8])
@@ -86,7 +92,10 @@ def test_all_recordings_of_a_run_get_the_same_grid(tmp_path):
 def test_bounds_that_are_given_are_kept_and_a_note_says_what_is_below(tmp_path):
     sequence, name, notes = converted(2.6, tmp_path, follow_ground=False)
     assert name == "evaluation"
-    assert len(notes) == 1 and "100% of the points on the ground are below the grid, which begins at -2 m" in notes[0]
+    assert (
+        len(notes) == 1
+        and "100% of the points on the ground are below the grid, which begins at -2 m" in notes[0]
+    )
     assert not (sequence.grid(name, 1).labels == 7).any()
 
 
@@ -95,7 +104,9 @@ def test_a_note_says_what_share_of_the_points_is_above_the_grid(up, said, tmp_pa
     (tmp_path / "drive").mkdir()
     spec = GridSpec("cartesian", (16, 16, 8), (-25.6, -25.6, -2.0), (25.6, 25.6, up))
     grids = GridOptions(spec, observe=ALONE, follow_ground=False)
-    result = convert(drive_at(1.8), tmp_path / "drive", tmp_path / "out", grids=grids, run=Run(workers=1))
+    result = convert(
+        drive_at(1.8), tmp_path / "drive", tmp_path / "out", grids=grids, run=Run(workers=1)
+    )
     notes = [note for note in result.notes if "above it" in note]
     assert len(notes) == said
     if said:
@@ -104,16 +115,23 @@ def test_a_note_says_what_share_of_the_points_is_above_the_grid(up, said, tmp_pa
         heights = points[(np.abs(points[:, :2]) < 25.6).all(axis=1), 2]
         share = f"{100 * np.mean(heights >= up):.0f}%"
         assert notes[0].startswith(
-            f"{tmp_path / 'out'}: {share} of the points between the sides of the grid are above it (z > 1 m)"
+            f"{tmp_path / 'out'}: {share} of the points between the sides of the grid are above "
+            f"it (z > 1 m)"
         )
 
 
 def test_a_regrid_says_what_is_below_its_grid(tmp_path):
     sequence, _, _ = converted(2.6, tmp_path)
-    result = carlasc.regrid(sequence.location, COARSE, tmp_path / "more", observe=ALONE, run=Run(workers=1))
-    assert any("100% of the points on the ground are below the grid" in note for note in result.notes)
+    result = carlasc.regrid(
+        sequence.location, COARSE, tmp_path / "more", observe=ALONE, run=Run(workers=1)
+    )
+    assert any(
+        "100% of the points on the ground are below the grid" in note for note in result.notes
+    )
     lower = GridSpec("cartesian", COARSE.size, (-25.6, -25.6, -2.75), (25.6, 25.6, 0.25))
-    result = carlasc.regrid(sequence.location, lower, tmp_path / "lower", observe=ALONE, run=Run(workers=1))
+    result = carlasc.regrid(
+        sequence.location, lower, tmp_path / "lower", observe=ALONE, run=Run(workers=1)
+    )
     assert not any("below the grid" in note for note in result.notes)
 
 

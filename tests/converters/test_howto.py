@@ -1,4 +1,6 @@
-"""The converter of the documentation keeps what the contract says, with the test that the documentation gives."""
+"""The converter of the documentation keeps what the contract says, with the test that the
+documentation gives.
+"""
 
 import re
 import subprocess
@@ -37,8 +39,18 @@ def modules(tmp_path_factory):
 
 @pytest.mark.slow
 def test_its_own_test_passes(modules):
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_lab_converter.py"]
-    done = subprocess.run(command, cwd=modules, capture_output=True, text=True, timeout=300, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "test_lab_converter.py",
+    ]
+    done = subprocess.run(
+        command, cwd=modules, capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"\b[5-9]\d* passed|\b1\d passed", done.stdout)
 
@@ -59,9 +71,21 @@ def test_it_converts_with_everything(modules, source, tmp_path):
     assert result.failures == ()
     assert any("persons are blurred" in note for note in result.notes)
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
-    assert sequence.fields() == {"points", "labels", "instances", "boxes", "flow", "seconds", "sensor", "origins"}
+    assert sequence.fields() == {
+        "points",
+        "labels",
+        "instances",
+        "boxes",
+        "flow",
+        "seconds",
+        "sensor",
+        "origins",
+    }
     sensors = sequence.metadata.extra["sensors"]
-    assert [(sensor["name"], round(sensor["height_m"], 2)) for sensor in sensors] == [("upper", 1.9), ("lower", 0.9)]
+    assert [(sensor["name"], round(sensor["height_m"], 2)) for sensor in sensors] == [
+        ("upper", 1.9),
+        ("lower", 0.9),
+    ]
     assert np.abs(sequence.read("flow", 4)).max() > 5
 
 
@@ -69,10 +93,15 @@ def test_it_converts_with_everything(modules, source, tmp_path):
     ("damage", "problem"),
     [
         (lambda path: path.unlink(), "lower/000003.npz: expected a scan, found nothing"),
-        (lambda path: path.write_bytes(b"PK"), "lower/000003.npz: expected points, labels and seconds"),
+        (
+            lambda path: path.write_bytes(b"PK"),
+            "lower/000003.npz: expected points, labels and seconds",
+        ),
     ],
 )
-def test_a_damaged_scan_is_reported_and_the_others_are_converted(modules, tmp_path, damage, problem):
+def test_a_damaged_scan_is_reported_and_the_others_are_converted(
+    modules, tmp_path, damage, problem
+):
     import lab_converter
     import test_lab_converter
 
@@ -81,7 +110,12 @@ def test_a_damaged_scan_is_reported_and_the_others_are_converted(modules, tmp_pa
     test_lab_converter.TestLab().write(source)
     damage(source / "drive_0" / "lower" / "000003.npz")
     result = convert(
-        lab_converter.Lab, source, tmp_path / "out", poses=PoseOptions(force=True), grids=None, run=Run(workers=1)
+        lab_converter.Lab,
+        source,
+        tmp_path / "out",
+        poses=PoseOptions(force=True),
+        grids=None,
+        run=Run(workers=1),
     )
     assert [failure.frame for failure in result.failures] == [3]
     assert problem in result.failures[0].message

@@ -24,7 +24,12 @@ def converted(simulated, tmp_path_factory):
     """The simulated sequence in CarlaSC's frame and classes, with SemanticKITTI's voxels."""
     out = tmp_path_factory.mktemp("converted")
     result = convert(
-        "kitti", simulated[0], out, layout=LayoutOptions("carla", flow="none"), grids="voxels", run=Run(workers=2)
+        "kitti",
+        simulated[0],
+        out,
+        layout=LayoutOptions("carla", flow="none"),
+        grids="voxels",
+        run=Run(workers=2),
     )
     assert (result.made, result.skipped, result.failures) == (24, 0, ())
     return out
@@ -42,7 +47,9 @@ def raw(folder, frame):
 def test_points_keep_their_number_order_and_remission_and_are_mirrored(simulated, converted):
     for frame in (0, 7):
         points, _ = raw(simulated[1].folder, frame)
-        assert np.array_equal(sequence_of(converted).read("points", frame), points * np.float32([1, -1, 1, 1]))
+        assert np.array_equal(
+            sequence_of(converted).read("points", frame), points * np.float32([1, -1, 1, 1])
+        )
 
 
 def test_labels_become_carlas(simulated, converted):
@@ -88,7 +95,12 @@ def test_own_voxels_become_a_grid_whose_invalid_ones_are_unknown(simulated, conv
     grid = sequence.grid("evaluation_256x256x32", 5)
     voxels = simulated[1].folder / "voxels"
     labels = np.fromfile(voxels / "000005.label", "<u2").reshape(256, 256, 32)[:, ::-1]
-    invalid = np.unpackbits(np.fromfile(voxels / "000005.invalid", np.uint8)).reshape(256, 256, 32)[:, ::-1] > 0
+    invalid = (
+        np.unpackbits(np.fromfile(voxels / "000005.invalid", np.uint8)).reshape(256, 256, 32)[
+            :, ::-1
+        ]
+        > 0
+    )
     assert np.array_equal(grid.known, ~invalid)
     assert np.array_equal(grid.labels[~invalid], REMAPS["semantickitti_to_carla"](labels)[~invalid])
     assert sequence.frames("evaluation_256x256x32/labels").tolist() == [0, 5, 10, 15, 20]
@@ -116,7 +128,9 @@ def test_validate_points_out_a_faulty_copy(simulated, converted, tmp_path, fault
     else:
         poses[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
     (folder / "poses.txt").write_bytes(carlasc.storage.layout.encode_poses(poses))
-    errors = [finding for finding in validate(tmp_path / "out").findings if finding.severity == "error"]
+    errors = [
+        finding for finding in validate(tmp_path / "out").findings if finding.severity == "error"
+    ]
     assert errors
     word = {"mirrored": "mirrored", "camera": "camera", "transposed": "transposed"}[fault]
     assert any(word in finding.found for finding in errors)
@@ -142,7 +156,10 @@ def test_splits_are_those_of_the_benchmark_and_can_be_chosen(tmp_path):
         "Val/KITTI_08/cartesian",
         "Test/KITTI_11/cartesian",
     ]
-    assert len(convert("kitti", tmp_path / "in", tmp_path / "val", split="val", **PLAIN).sequences) == 1
+    assert (
+        len(convert("kitti", tmp_path / "in", tmp_path / "val", split="val", **PLAIN).sequences)
+        == 1
+    )
     some = convert("kitti", tmp_path / "in", tmp_path / "some", sequences=["00", "11"], **PLAIN)
     assert [path.split("some/")[1][:4] for path in some.sequences] == ["Trai", "Test"]
 

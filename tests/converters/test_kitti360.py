@@ -70,7 +70,8 @@ def test_points_are_kept_and_their_times_are_those_of_the_sweep(root):
 def test_labels_and_instances_are_those_of_the_clouds(root):
     recording = recording_of(root)
     assert recording.has_labels and recording.has_instances
-    for frame in recording.frames[1:-1]:  # beyond the first and the last pose, the motion is a guess
+    # beyond the first and the last pose, the motion is a guess
+    for frame in recording.frames[1:-1]:
         (cloud,) = frame.read()
         scan = TRUTH.scan(frame.number)
         assert np.array_equal(cloud.labels, CLASS_OF[scan.kinds])
@@ -80,14 +81,22 @@ def test_labels_and_instances_are_those_of_the_clouds(root):
 
 def test_labels_become_carlas(root):
     (cloud,) = recording_of(root).frames[2].read()
-    expected = {"road": "Road", "building": "Building", "vegetation": "Vegetation", "pole": "Pole", "car": "Vehicle"}
+    expected = {
+        "road": "Road",
+        "building": "Building",
+        "vegetation": "Vegetation",
+        "pole": "Pole",
+        "car": "Vehicle",
+    }
     expected |= {"van": "Vehicle", "pedestrian": "Pedestrian", "cyclist": "Pedestrian"}
     truth = np.array([CARLA.id_of(expected[kind]) if kind in expected else 0 for kind in KINDS])
     assert np.array_equal(KITTI360_TO_CARLA(cloud.labels), truth[TRUTH.scan(2).kinds])
 
 
 def test_what_moves_is_labelled_in_its_own_frame_only(root, copy):
-    """A car drives over road that other frames saw: without time stamps, the road there would be part of the car."""
+    """A car drives over road that other frames saw: without time stamps, the road there would be
+    part of the car.
+    """
     path = copy / LABELS / "dynamic/0000000000_0000000004.ply"
     recording = recording_of(copy)
     (before,) = recording.frames[1].read()
@@ -130,7 +139,14 @@ def test_the_window_in_which_a_frame_is_farthest_from_the_ends_is_taken(root):
     windows = windows_of(root / LABELS / "static")
     assert list(windows.values()) == list(WINDOWS)
     first, second = windows
-    assert [window_at(windows, frame) for frame in (0, 2, 3, 4, 8, 9)] == [first, first, first, second, second, None]
+    assert [window_at(windows, frame) for frame in (0, 2, 3, 4, 8, 9)] == [
+        first,
+        first,
+        first,
+        second,
+        second,
+        None,
+    ]
     assert window_at({}, 3) is None
     assert windows_of(root / "nothing") == {}
 
@@ -163,7 +179,12 @@ def test_frames_without_a_pose_are_between_their_neighbours(tmp_path):
     write_kitti360(tmp_path, TRUTH, without_pose=(3, 4))
     trajectory = recording_of(tmp_path).poses()
     assert np.abs(trajectory.seconds - np.delete(TRUTH.times, (3, 4))).max() < 1e-8
-    assert np.abs(trajectory.at(TRUTH.times)[:, :3, 3] - TRUTH.world_T_lidar(TRUTH.times)[:, :3, 3]).max() < 0.01
+    assert (
+        np.abs(
+            trajectory.at(TRUTH.times)[:, :3, 3] - TRUTH.world_T_lidar(TRUTH.times)[:, :3, 3]
+        ).max()
+        < 0.01
+    )
 
 
 def test_the_car_stands_before_the_first_pose_and_after_the_last(tmp_path):
@@ -215,7 +236,15 @@ def test_handles_are_light_and_can_be_sent_to_workers(root):
 
 
 def test_the_table_has_the_ids_of_kitti_360():
-    expected = {0: "unlabeled", 7: "road", 11: "building", 21: "vegetation", 24: "person", 26: "car", 33: "bicycle"}
+    expected = {
+        0: "unlabeled",
+        7: "road",
+        11: "building",
+        21: "vegetation",
+        24: "person",
+        26: "car",
+        33: "bicycle",
+    }
     assert expected.items() <= KITTI360.names.items()
     assert (len(KITTI360.names), KITTI360.names[44]) == (45, "unknown object")
     assert set(KITTI360_TO_CARLA.mapping) == set(KITTI360.names)
@@ -234,7 +263,9 @@ def fails(folder, read, error=FormatError):
 def test_a_scan_that_is_cut_short_is_named(copy):
     path = copy / f"data_3d_raw/{DRIVE}/velodyne_points/data/0000000001.bin"
     path.write_bytes(path.read_bytes()[:-4])
-    assert "0000000001.bin: expected a multiple of 16 bytes" in fails(copy, lambda r: r.frames[1].read())
+    assert "0000000001.bin: expected a multiple of 16 bytes" in fails(
+        copy, lambda r: r.frames[1].read()
+    )
 
 
 @pytest.mark.parametrize("kind", ["static", "dynamic"])
@@ -242,7 +273,9 @@ def test_a_damaged_cloud_is_named(copy, kind):
     path = copy / LABELS / kind / "0000000000_0000000004.ply"
     data = path.read_bytes()
     path.write_bytes(data[:-50])
-    assert f"{kind}/0000000000_0000000004.ply: expected" in fails(copy, lambda r: r.frames[1].read())
+    assert f"{kind}/0000000000_0000000004.ply: expected" in fails(
+        copy, lambda r: r.frames[1].read()
+    )
     path.write_bytes(data.replace(b"semantic", b"semantik"))
     assert "expected vertices with semantic" in fails(copy, lambda r: r.frames[1].read())
 
@@ -269,9 +302,21 @@ def test_a_missing_calibration_is_named_and_force_does_without(copy, name):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("calib_cam_to_pose.txt", "image_01: 1 0 0 0 0 1 0 0 0 0 1 0\n", "expected image_00, found only image_01"),
-        ("calib_cam_to_velo.txt", "hello\n", "calib_cam_to_velo.txt: expected a line of 12 numbers, found only"),
-        ("calib_cam_to_velo.txt", "1 0 0 0\n", "calib_cam_to_velo.txt: expected 12 numbers in a line, found 4"),
+        (
+            "calib_cam_to_pose.txt",
+            "image_01: 1 0 0 0 0 1 0 0 0 0 1 0\n",
+            "expected image_00, found only image_01",
+        ),
+        (
+            "calib_cam_to_velo.txt",
+            "hello\n",
+            "calib_cam_to_velo.txt: expected a line of 12 numbers, found only",
+        ),
+        (
+            "calib_cam_to_velo.txt",
+            "1 0 0 0\n",
+            "calib_cam_to_velo.txt: expected 12 numbers in a line, found 4",
+        ),
         ("calib_cam_to_velo.txt", "2 0 0 0 0 1 0 0 0 0 1 0\n", "calib_cam_to_velo.txt: "),
     ],
 )
@@ -300,9 +345,14 @@ def test_wrong_poses_are_named(copy, text, message):
 
 def test_missing_time_stamps_are_named(copy):
     (copy / f"data_3d_raw/{DRIVE}/velodyne_points/timestamps.txt").unlink()
-    assert "timestamps.txt: expected a time per frame" in fails(copy, lambda r: r.frames, MissingDataError)
+    assert "timestamps.txt: expected a time per frame" in fails(
+        copy, lambda r: r.frames, MissingDataError
+    )
 
 
 def test_a_folder_without_drives_is_named(tmp_path):
-    with pytest.raises(MissingDataError, match="expected data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/data/"):
+    with pytest.raises(
+        MissingDataError,
+        match="expected data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/data/",
+    ):
         Kitti360(tmp_path).sequences()

@@ -1,4 +1,6 @@
-"""What convert says of data that are not as they should be, and that the rest is converted all the same."""
+"""What convert says of data that are not as they should be, and that the rest is converted all the
+same.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +22,17 @@ def folder(tmp_path):
     return write_tiny_kitti(tmp_path / "in", frames=4)
 
 
-def run(tmp_path, *, poses="auto", force=False, grids=None, sequences=None, split="all", flow="none", **layout):
+def run(
+    tmp_path,
+    *,
+    poses="auto",
+    force=False,
+    grids=None,
+    sequences=None,
+    split="all",
+    flow="none",
+    **layout,
+):
     return convert(
         "kitti",
         tmp_path / "in",
@@ -38,9 +50,14 @@ def written(tmp_path, field="points"):
     return carlasc.open(tmp_path / "out").sequences()[SEQUENCE].frames(field).tolist()
 
 
-def test_a_calibration_without_tr_is_refused_and_force_takes_the_poses_as_they_are(tmp_path, folder):
+def test_a_calibration_without_tr_is_refused_and_force_takes_the_poses_as_they_are(
+    tmp_path, folder
+):
     (folder / "calib.txt").write_text("P0: " + " ".join("0" * 12) + "\n")
-    with pytest.raises(FormatError, match=r"calib.txt: expected Tr.*found only P0.*`poses=\"kiss-icp\"`.*`force=True`"):
+    with pytest.raises(
+        FormatError,
+        match=r"calib.txt: expected Tr.*found only P0.*`poses=\"kiss-icp\"`.*`force=True`",
+    ):
         run(tmp_path)
     assert not (tmp_path / "out").exists()
     run(tmp_path, force=True)
@@ -50,7 +67,10 @@ def test_a_calibration_without_tr_is_refused_and_force_takes_the_poses_as_they_a
 
 
 def test_a_calibration_with_extra_keys_is_read(tmp_path, folder):
-    write_calibration(folder / "calib.txt", ["R0_rect: 1 0 0", "corner_dist: 9.95e-02", "calib_time: 09-Jan-2012", ""])
+    write_calibration(
+        folder / "calib.txt",
+        ["R0_rect: 1 0 0", "corner_dist: 9.95e-02", "calib_time: 09-Jan-2012", ""],
+    )
     assert run(tmp_path).made == 4
 
 
@@ -85,11 +105,16 @@ def test_labels_longer_than_points_fail_that_frame_only(tmp_path, folder):
     write_labels(folder, 1, np.zeros(61, np.uint32))
     result = run(tmp_path)
     assert [(failure.frame, result.made) for failure in result.failures] == [(1, 3)]
-    assert "labels/000001.label: expected a label for each of 60 points, found 61" in result.failures[0].message
+    assert (
+        "labels/000001.label: expected a label for each of 60 points, found 61"
+        in result.failures[0].message
+    )
     assert written(tmp_path) == [0, 2, 3]
 
 
-def test_unknown_classes_are_named_with_their_count_and_unlabelled_only_if_allowed(tmp_path, folder):
+def test_unknown_classes_are_named_with_their_count_and_unlabelled_only_if_allowed(
+    tmp_path, folder
+):
     labels = np.full(60, 40, np.uint32)
     labels[:7] = 77
     labels[7] = 65535
@@ -110,7 +135,9 @@ def test_own_classes_are_checked_too(tmp_path, folder):
     assert "200 (60 times)" in result.failures[0].message
 
 
-def test_a_missing_scan_in_the_middle_is_a_failure_and_the_others_keep_their_numbers(tmp_path, folder):
+def test_a_missing_scan_in_the_middle_is_a_failure_and_the_others_keep_their_numbers(
+    tmp_path, folder
+):
     (folder / "velodyne" / "000001.bin").unlink()
     result = run(tmp_path)
     assert [failure.frame for failure in result.failures] == [1]
@@ -159,12 +186,15 @@ def test_a_second_run_goes_on_where_the_first_stopped(tmp_path, folder):
     run(tmp_path)
     target = tmp_path / "out" / SEQUENCE
     whole = {path: path.read_bytes() for path in sorted(target.rglob("*")) if path.is_file()}
-    (target / "velodyne" / "000002.bin").unlink()  # written last: a frame without points is not complete
+    # written last: a frame without points is not complete
+    (target / "velodyne" / "000002.bin").unlink()
     for path in ("velodyne/000003.bin", "labels/000003.label"):
         (target / path).unlink()
     again = run(tmp_path)
     assert (again.made, again.skipped) == (2, 2)
-    assert {path: path.read_bytes() for path in sorted(target.rglob("*")) if path.is_file()} == whole
+    assert {
+        path: path.read_bytes() for path in sorted(target.rglob("*")) if path.is_file()
+    } == whole
 
 
 def test_a_second_run_of_other_settings_stops(tmp_path, folder):
@@ -213,10 +243,12 @@ def test_camera_poses_without_their_calibration_are_refused(simulated, tmp_path)
 
     copy = tmp_path / "in"
     copytree(simulated[0], copy)
-    (copy / "sequences" / "00" / "calib.txt").write_text(
-        "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n"
-    )  # what somebody may write when the file is missing
-    with pytest.raises(FormatError, match=r"the likely cause is camera-frame poses.*inv\(Tr\) @ P @ Tr.*`force=True`"):
+    # what somebody may write when the file is missing
+    (copy / "sequences" / "00" / "calib.txt").write_text("Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(
+        FormatError,
+        match=r"the likely cause is camera-frame poses.*inv\(Tr\) @ P @ Tr.*`force=True`",
+    ):
         run(tmp_path)
     assert not (tmp_path / "out").exists()
     assert run(tmp_path, force=True).made == 24

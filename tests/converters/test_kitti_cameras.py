@@ -1,4 +1,6 @@
-"""The cameras of KITTI's three layouts are the same ones: points have the pixels that the projection says."""
+"""The cameras of KITTI's three layouts are the same ones: points have the pixels that the
+projection says.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from carlasc.core.geometry import invert, transform_points
 ROWS = np.array([[721.5, 0, 609.6, -339.5], [0, 721.5, 172.9, 2.2], [0, 0, 1, 0.003]])
 TO_CAMERA = np.array([[0.0, -1, 0, 0.02], [0, 0, -1, -0.06], [1, 0, 0, -0.33]])
 ANGLE = 0.01
-RECTIFY = np.array([[np.cos(ANGLE), 0, np.sin(ANGLE)], [0, 1, 0], [-np.sin(ANGLE), 0, np.cos(ANGLE)]])
+RECTIFY = np.array(
+    [[np.cos(ANGLE), 0, np.sin(ANGLE)], [0, 1, 0], [-np.sin(ANGLE), 0, np.cos(ANGLE)]]
+)
 
 
 def line(name, values):
@@ -36,7 +40,9 @@ def raw(root):
     (root / "calib_cam_to_cam.txt").write_text(
         "calib_time: 09-Jan-2012 13:57:47\n" + line("R_rect_00", RECTIFY) + line("P_rect_03", ROWS)
     )
-    (root / "calib_velo_to_cam.txt").write_text(line("R", TO_CAMERA[:, :3]) + line("T", TO_CAMERA[:, 3]))
+    (root / "calib_velo_to_cam.txt").write_text(
+        line("R", TO_CAMERA[:, :3]) + line("T", TO_CAMERA[:, 3])
+    )
     return RawDrive(root / "drive"), "image_03"
 
 

@@ -17,7 +17,12 @@ from carlasc.testing import ConverterContract, SimulatedDrive
 DRIVE = SimulatedDrive(8, PERIOD_S, rolling=True, clockwise=True)
 BOXES = {
     kind: KITTI.id_of(name)
-    for kind, name in (("car", "Car"), ("van", "Van"), ("pedestrian", "Pedestrian"), ("cyclist", "Cyclist"))
+    for kind, name in (
+        ("car", "Car"),
+        ("van", "Van"),
+        ("pedestrian", "Pedestrian"),
+        ("cyclist", "Cyclist"),
+    )
 }
 
 
@@ -37,7 +42,9 @@ class TestKittiRaw(OnlyInView):
     def write(self, folder):
         write_raw(folder, KittiDrive(self.drive), BOXES)
 
-    def test_a_missing_scan_is_no_failure_and_the_other_frames_keep_numbers_poses_and_times(self, sequence, tmp_path):
+    def test_a_missing_scan_is_no_failure_and_the_other_frames_keep_numbers_poses_and_times(
+        self, sequence, tmp_path
+    ):
         folder = write_raw(tmp_path / "raw", KittiDrive(self.drive), BOXES)
         (folder / "velodyne_points/data/0000000003.bin").unlink()
         result = convert(
@@ -49,7 +56,9 @@ class TestKittiRaw(OnlyInView):
             run=Run(workers=1),
         )
         assert (result.made, result.failures) == (7, ())
-        assert any(note.endswith("1 of the 8 frames from 0 to 7 have no scan") for note in result.notes)
+        assert any(
+            note.endswith("1 of the 8 frames from 0 to 7 have no scan") for note in result.notes
+        )
         (found,) = carlasc.open(tmp_path / "out").sequences().values()
         assert found.frames("points").tolist() == [0, 1, 2, 4, 5, 6, 7]
         np.testing.assert_array_equal(found.poses, sequence.poses)
@@ -76,7 +85,8 @@ class TestKitti360(ConverterContract):
         write_kitti360(folder, KittiDrive(self.drive), windows=((0, 8),))
 
     def labelled(self, sequence):
-        return list(range(1, self.drive.frames - 1))  # beyond the first and the last pose, the motion is a guess
+        # beyond the first and the last pose, the motion is a guess
+        return list(range(1, self.drive.frames - 1))
 
 
 class TestSemanticKitti(ConverterContract):

@@ -34,7 +34,8 @@ def there_and_back(simulated, tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("name", "suffix"), [("velodyne", ".bin"), *(("voxels", s) for s in (".bin", ".label", ".invalid", ".occluded"))]
+    ("name", "suffix"),
+    [("velodyne", ".bin"), *(("voxels", s) for s in (".bin", ".label", ".invalid", ".occluded"))],
 )
 def test_scans_and_voxels_come_back_as_they_were(there_and_back, name, suffix):
     before, after = (frame_files(folder, name, suffix) for folder in there_and_back)
@@ -49,7 +50,9 @@ def test_classes_and_instances_come_back_as_they_were(there_and_back):
 
 
 def test_poses_come_back(there_and_back):
-    before, after = (SemanticKitti(folder).sequences()[0].poses().world_T_vehicle for folder in there_and_back)
+    before, after = (
+        SemanticKitti(folder).sequences()[0].poses().world_T_vehicle for folder in there_and_back
+    )
     assert np.abs(np.linalg.inv(before[0]) @ before - after).max() < 1e-9
 
 
@@ -85,10 +88,14 @@ def test_tiny_round_trip_of_several_sequences(tmp_path):
     for number in ("00", "08"):
         for name, suffix in (("velodyne", ".bin"), ("voxels", ".occluded")):
             before, after = (
-                frame_files(tmp_path / side / "sequences" / number, name, suffix) for side in ("in", "out")
+                frame_files(tmp_path / side / "sequences" / number, name, suffix)
+                for side in ("in", "out")
             )
             assert before == after
-    assert carlasc.open(tmp_path / "middle").sequences().keys() == {SEQUENCE, "Val/KITTI_08/cartesian"}
+    assert carlasc.open(tmp_path / "middle").sequences().keys() == {
+        SEQUENCE,
+        "Val/KITTI_08/cartesian",
+    }
 
 
 def test_a_grid_that_is_named_is_exported_instead_of_the_original_voxels(tmp_path):
@@ -100,7 +107,11 @@ def test_a_grid_that_is_named_is_exported_instead_of_the_original_voxels(tmp_pat
     }
     convert("kitti", tmp_path / "in", tmp_path / "middle", **options)
     export(
-        "kitti", tmp_path / "middle", tmp_path / "out", options={"grid": "evaluation_256x256x32"}, run=Run(workers=1)
+        "kitti",
+        tmp_path / "middle",
+        tmp_path / "out",
+        options={"grid": "evaluation_256x256x32"},
+        run=Run(workers=1),
     )
     before, after = (tmp_path / side / "sequences" / "00" / "voxels" for side in ("in", "out"))
     size = (256, 256, 32)

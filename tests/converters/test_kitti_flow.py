@@ -50,7 +50,9 @@ def test_flow_is_in_the_sensors_frame_with_ego_motion_removed(tmp_path):
     car = rng.uniform(-0.5, 0.5, (300, 3)) * (4.4, 1.8, 1.5)
     for frame in range(30):
         points = transform_points(invert(poses[frame]) @ world_T_car[frame], car)
-        np.column_stack([points, np.zeros(300)]).astype("<f4").tofile(folder / "velodyne" / f"{frame:06d}.bin")
+        np.column_stack([points, np.zeros(300)]).astype("<f4").tofile(
+            folder / "velodyne" / f"{frame:06d}.bin"
+        )
         write_labels(folder, frame, np.full(300, 252 | 9 << 16))
     write_poses(folder / "poses.txt", np.stack(poses))
     convert(

@@ -19,14 +19,25 @@ SEQUENCE = "Train/KITTI_00/cartesian"
 
 @pytest.mark.slow
 def test_kiss_icp_drifts_less_than_1_percent_over_100_m_of_a_drive_from_rest(tmp_path):
-    """A town with cross streets and trees, no deskewing; every other scan, which is harder and takes half the time."""
+    """A town with cross streets and trees, no deskewing; every other scan, which is harder and
+    takes half the time.
+    """
     truth = write_kitti(
-        tmp_path / "in", TownDrive(3, "light", Lidar(channels=32, points=20_000)), range(0, 190, 2), voxels_every=0
+        tmp_path / "in",
+        TownDrive(3, "light", Lidar(channels=32, points=20_000)),
+        range(0, 190, 2),
+        voxels_every=0,
     )
     (truth.folder / "poses.txt").unlink()
     seen = []
     options = {"grids": None, "layout": LayoutOptions(axes="right", flow="none")}
-    convert("kitti", tmp_path / "in", tmp_path / "out", run=Run(1, progress=lambda *step: seen.append(step)), **options)
+    convert(
+        "kitti",
+        tmp_path / "in",
+        tmp_path / "out",
+        run=Run(1, progress=lambda *step: seen.append(step)),
+        **options,
+    )
     folder = tmp_path / "out" / SEQUENCE
     poses = layout.decode_poses((folder / "poses.txt").read_bytes(), "poses")
     steps = np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1)
@@ -40,7 +51,8 @@ def test_kiss_icp_drifts_less_than_1_percent_over_100_m_of_a_drive_from_rest(tmp
 def test_estimated_poses_are_estimated_once(tmp_path):
     folder = write_tiny_kitti(tmp_path / "in", points=200)
     (folder / "poses.txt").unlink()
-    (folder / "velodyne" / "000001.bin").write_bytes(b"")  # cannot be read: it gets the pose of the one before
+    # cannot be read: it gets the pose of the one before
+    (folder / "velodyne" / "000001.bin").write_bytes(b"")
     options = {"grids": None, "layout": LayoutOptions(flow="none")}
     first = convert("kitti", tmp_path / "in", tmp_path / "out", run=Run(1), **options)
     assert [failure.frame for failure in first.failures] == [1]
@@ -49,6 +61,10 @@ def test_estimated_poses_are_estimated_once(tmp_path):
     assert np.array_equal(poses[0], poses[1])
     steps = []
     convert(
-        "kitti", tmp_path / "in", tmp_path / "out", run=Run(1, progress=lambda *step: steps.append(step)), **options
+        "kitti",
+        tmp_path / "in",
+        tmp_path / "out",
+        run=Run(1, progress=lambda *step: steps.append(step)),
+        **options,
     )
     assert steps[-1] == (3, 3)  # no odometry this time

@@ -1,4 +1,6 @@
-"""KITTI's raw data: what is read of a simulated drive in its format, and what is said of wrong files."""
+"""KITTI's raw data: what is read of a simulated drive in its format, and what is said of wrong
+files.
+"""
 
 import pickle
 import re
@@ -13,7 +15,10 @@ from converters.formats.kitti_raw import DRIVE, tracklets_of, write_raw
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 
-LABELS = {kind: KITTI.id_of(name) for kind, name in (("car", "Car"), ("van", "Van"), ("pedestrian", "Pedestrian"))}
+LABELS = {
+    kind: KITTI.id_of(name)
+    for kind, name in (("car", "Car"), ("van", "Van"), ("pedestrian", "Pedestrian"))
+}
 LABELS |= {"cyclist": KITTI.id_of("Cyclist")}
 TRUTH = small_drive()
 
@@ -67,7 +72,8 @@ def test_poses_are_those_of_the_lidar_at_the_times_of_the_packets(root):
     truth = TRUTH.world_T_lidar(trajectory.seconds)
     assert (
         np.abs(
-            np.linalg.inv(trajectory.world_T_vehicle[0]) @ trajectory.world_T_vehicle - np.linalg.inv(truth[0]) @ truth
+            np.linalg.inv(trajectory.world_T_vehicle[0]) @ trajectory.world_T_vehicle
+            - np.linalg.inv(truth[0]) @ truth
         ).max()
         < 1e-6
     )
@@ -121,7 +127,11 @@ def test_boxes_that_were_filled_in_are_not_annotated(tmp_path):
 @pytest.mark.parametrize("below", ["", "2011_09_26", DRIVE])
 def test_the_root_a_date_and_a_drive_are_sources(root, below):
     recording = recording_of(root / below)
-    assert (recording.name, recording.split, len(recording.frames)) == ("KITTI_2011_09_26_0005", "Train", TRUTH.frames)
+    assert (recording.name, recording.split, len(recording.frames)) == (
+        "KITTI_2011_09_26_0005",
+        "Train",
+        TRUTH.frames,
+    )
 
 
 def test_drives_of_several_dates_are_found(tmp_path):
@@ -199,9 +209,13 @@ def fails(folder, read, error=FormatError):
 def test_a_scan_that_is_cut_short_or_empty_is_named(copy):
     path = copy / "velodyne_points/data/0000000001.bin"
     path.write_bytes(path.read_bytes()[:-7])
-    assert "0000000001.bin: expected a multiple of 16 bytes" in fails(copy, lambda r: r.frames[1].read())
+    assert "0000000001.bin: expected a multiple of 16 bytes" in fails(
+        copy, lambda r: r.frames[1].read()
+    )
     path.write_bytes(b"")
-    assert "0000000001.bin: expected points, found an empty file" in fails(copy, lambda r: r.frames[1].read())
+    assert "0000000001.bin: expected points, found an empty file" in fails(
+        copy, lambda r: r.frames[1].read()
+    )
 
 
 def test_a_missing_calibration_is_named_and_force_does_without(copy):
@@ -228,7 +242,11 @@ def test_a_wrong_calibration_is_named(copy, text, message):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("velodyne_points", lambda lines: lines[:-1], "expected a time for each frame up to 5, found none for frame 5"),
+        (
+            "velodyne_points",
+            lambda lines: lines[:-1],
+            "expected a time for each frame up to 5, found none for frame 5",
+        ),
         ("velodyne_points", lambda lines: ["", *lines[1:]], "found none for frame 0"),
         (
             "velodyne_points",
@@ -251,7 +269,9 @@ def test_wrong_time_stamps_are_named(copy, name, change, message):
 
 def test_missing_time_stamps_are_named(copy):
     (copy / "velodyne_points/timestamps.txt").unlink()
-    assert "timestamps.txt: expected a time per frame" in fails(copy, lambda r: r.frames, MissingDataError)
+    assert "timestamps.txt: expected a time per frame" in fails(
+        copy, lambda r: r.frames, MissingDataError
+    )
 
 
 @pytest.mark.parametrize(
@@ -281,11 +301,19 @@ def test_packets_may_have_the_numbers_of_doubles(tmp_path):
     ("old", "new", "message"),
     [
         ("</tracklets>", "", "tracklet_labels.xml: expected XML, found damage"),
-        ("<objectType>Car", "<objectType>Horse", r"tracklet 1: expected a type of object: one of Car, .*found 'Horse'"),
+        (
+            "<objectType>Car",
+            "<objectType>Horse",
+            r"tracklet 1: expected a type of object: one of Car, .*found 'Horse'",
+        ),
         ("<objectType>Car</objectType>", "", "tracklet 1: expected objectType, found none"),
         ("<tz>", "<tz>deep", "expected a number for tz, found 'deep"),
         ("<count>5</count>", "<count>7</count>", "expected 7 tracklets, found 5"),
-        ("tracklets", "labels", "expected tracklets in boost_serialization, found <boost_serialization> without them"),
+        (
+            "tracklets",
+            "labels",
+            "expected tracklets in boost_serialization, found <boost_serialization> without them",
+        ),
         ("<poses>", "<nothing>", "expected XML, found damage"),
         ("<w>1.8</w>", "<w>0</w>", "tracklet_labels.xml: frame 0: boxes: sizes: expected positive"),
         (
@@ -293,7 +321,11 @@ def test_packets_may_have_the_numbers_of_doubles(tmp_path):
             '<!DOCTYPE a [<!ENTITY b "c">]>',
             "expected XML in UTF-8 without entities, found an entity",
         ),
-        ("<first_frame>0", "<first_frame>inf", "expected a frame number for first_frame, found 'inf'"),
+        (
+            "<first_frame>0",
+            "<first_frame>inf",
+            "expected a frame number for first_frame, found 'inf'",
+        ),
     ],
 )
 def test_wrong_tracklets_are_named(copy, old, new, message):
@@ -307,7 +339,9 @@ def test_wrong_tracklets_are_named(copy, old, new, message):
 def test_tracklets_in_another_encoding_are_refused(copy):
     path = copy / "tracklet_labels.xml"
     path.write_text(path.read_text().replace("UTF-8", "UTF-16"), "utf-16")
-    assert "expected XML in UTF-8 without entities, found another encoding" in fails(copy, lambda r: r.boxes())
+    assert "expected XML in UTF-8 without entities, found another encoding" in fails(
+        copy, lambda r: r.boxes()
+    )
 
 
 def test_a_file_of_tracklets_that_is_too_large_is_not_read(copy, monkeypatch):
@@ -317,5 +351,8 @@ def test_a_file_of_tracklets_that_is_too_large_is_not_read(copy, monkeypatch):
 
 def test_a_folder_without_drives_is_named(tmp_path):
     for folder in (tmp_path, tmp_path / "nothing"):
-        with pytest.raises(CarlascError, match="expected 2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/"):
+        with pytest.raises(
+            CarlascError,
+            match="expected 2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/",
+        ):
             KittiRaw(folder).sequences()

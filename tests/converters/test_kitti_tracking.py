@@ -1,4 +1,6 @@
-"""KITTI's tracking benchmark: what is read of a simulated drive in its layout, what is said of wrong files, and the real sample."""
+"""KITTI's tracking benchmark: what is read of a simulated drive in its layout, what is said of
+wrong files, and the real sample.
+"""
 
 import re
 import shutil
@@ -21,7 +23,12 @@ from carlasc.running import Run
 
 LABELS = {
     kind: KITTI.id_of(name)
-    for kind, name in (("car", "Car"), ("van", "Van"), ("pedestrian", "Pedestrian"), ("cyclist", "Cyclist"))
+    for kind, name in (
+        ("car", "Car"),
+        ("van", "Van"),
+        ("pedestrian", "Pedestrian"),
+        ("cyclist", "Cyclist"),
+    )
 }
 TRUTH = small_drive()
 FIRST = 20
@@ -87,7 +94,10 @@ def test_without_oxts_there_are_no_poses_and_times_are_assumed_in_either_case(co
     assert recording.poses() is None
     assert np.allclose(np.diff(recording.times()), PERIOD_S)
     assert len(recording.times()) == FIRST + TRUTH.frames
-    assert any("the benchmark has no times: 0.1033 s between frames is assumed" in note for note in recording.notes())
+    assert any(
+        "the benchmark has no times: 0.1033 s between frames is assumed" in note
+        for note in recording.notes()
+    )
 
 
 @pytest.mark.parametrize("names", [OFFICIAL, OTHER])
@@ -103,7 +113,12 @@ def test_boxes_are_in_the_frame_of_the_lidar_and_tracks_count_from_1(tmp_path, n
         assert found.labels.tolist() == truth.labels.tolist()
         assert np.abs(found.sensor_T_box - truth.sensor_T_box).max() < 1e-6
         assert np.abs(found.sizes - truth.sizes).max() < 1e-9
-    assert np.abs(recording.poses().world_T_vehicle[0, :3, :3] - TRUTH.world_T_lidar(0.0)[:3, :3]).max() < 1e-6
+    assert (
+        np.abs(
+            recording.poses().world_T_vehicle[0, :3, :3] - TRUTH.world_T_lidar(0.0)[:3, :3]
+        ).max()
+        < 1e-6
+    )
 
 
 def test_a_frame_without_boxes_has_an_empty_entry_and_track_0_is_track_1(copy):
@@ -117,7 +132,10 @@ def test_a_frame_without_boxes_has_an_empty_entry_and_track_0_is_track_1(copy):
 
 
 def test_the_names_of_people_who_sit(copy):
-    rows = [f"20 {track} {kind} 0 0 0 0 0 0 0 1 1 1 0 1 9 0" for track, kind in enumerate(("Person", "Person_sitting"))]
+    rows = [
+        f"20 {track} {kind} 0 0 0 0 0 0 0 1 1 1 0 1 9 0"
+        for track, kind in enumerate(("Person", "Person_sitting"))
+    ]
     (copy / "label_02/0000.txt").write_text("\n".join(rows) + "\n")
     assert recording_of(copy).boxes()[20].labels.tolist() == [KITTI.id_of("Person_sitting")] * 2
 
@@ -152,7 +170,9 @@ def fails(folder, read, error=FormatError):
 
 def test_a_scan_that_is_cut_short_is_named(copy):
     (copy / "velodyne/0000/000021.bin").write_bytes(b"0" * 30)
-    assert "000021.bin: expected a multiple of 16 bytes, found 30" in fails(copy, lambda r: r.frames[1].read())
+    assert "000021.bin: expected a multiple of 16 bytes, found 30" in fails(
+        copy, lambda r: r.frames[1].read()
+    )
 
 
 def test_a_missing_line_of_oxts_is_named(copy):
@@ -165,8 +185,12 @@ def test_a_missing_line_of_oxts_is_named(copy):
 
 def test_a_missing_calibration_is_named(copy):
     (copy / "calib/0000.txt").unlink()
-    assert "calib/0000.txt: expected R0_rect and Tr_velo_to_cam" in fails(copy, lambda r: r.boxes(), MissingDataError)
-    assert "calib/0000.txt: expected Tr_imu_to_velo" in fails(copy, lambda r: r.poses(), MissingDataError)
+    assert "calib/0000.txt: expected R0_rect and Tr_velo_to_cam" in fails(
+        copy, lambda r: r.boxes(), MissingDataError
+    )
+    assert "calib/0000.txt: expected Tr_imu_to_velo" in fails(
+        copy, lambda r: r.poses(), MissingDataError
+    )
     assert len(recording_of(copy).poses(force=True).world_T_vehicle) == FIRST + TRUTH.frames
 
 
@@ -178,7 +202,11 @@ def test_a_missing_calibration_is_named(copy):
             "Tr_other",
             r"calib/0000.txt: expected Tr_velo_to_cam or Tr_velo_cam, found only P2, R0_rect",
         ),
-        ("R0_rect: ", "R0_rect: 1 ", r"calib/0000.txt: expected 9 numbers after R0_rect:, found 10"),
+        (
+            "R0_rect: ",
+            "R0_rect: 1 ",
+            r"calib/0000.txt: expected 9 numbers after R0_rect:, found 10",
+        ),
         ("Tr_velo_to_cam: 0.0", "Tr_velo_to_cam: 0.5", r"calib/0000.txt: Tr_velo_to_cam: "),
     ],
 )
@@ -194,12 +222,27 @@ def test_a_wrong_calibration_is_named(copy, old, new, message):
     [
         ("20 0 Horse 0 0 0 0 0 0 0 1 1 1 0 1 9 0", "line 1: expected a type of object: one of Car"),
         ("20 0 Car 0 0 0 0 0 0 0 1 1 1 0 1 9", "line 1: expected 17 columns, found 16"),
-        ("20 0 Car 0 0 0 0 0 0 0 1 1 1 0 one 9 0", "line 1: expected numbers but in column 3, found could not convert"),
-        ("20 -1 Car 0 0 0 0 0 0 0 1 1 1 0 1 9 0", "line 1: expected a track 0..4294967294, found -1"),
-        ("20 4294967295 Car 0 0 0 0 0 0 0 1 1 1 0 1 9 0", "expected a track 0..4294967294, found 4294967295"),
+        (
+            "20 0 Car 0 0 0 0 0 0 0 1 1 1 0 one 9 0",
+            "line 1: expected numbers but in column 3, found could not convert",
+        ),
+        (
+            "20 -1 Car 0 0 0 0 0 0 0 1 1 1 0 1 9 0",
+            "line 1: expected a track 0..4294967294, found -1",
+        ),
+        (
+            "20 4294967295 Car 0 0 0 0 0 0 0 1 1 1 0 1 9 0",
+            "expected a track 0..4294967294, found 4294967295",
+        ),
         ("20 0 Car 0 0 0 0 0 0 0 -1 1 1 0 1 9 0", "frame 20: boxes: sizes: expected positive"),
-        ("20 0 Car 0 0 0 0 0 0 0 1 1 1 nan 1 9 0", "frame 20: boxes: centers: expected finite numbers"),
-        ("20 0 Car 0 0 0 0 0 0 0 1 1 1 0 1 9 0\n20 0 Car 0 0 0 0 0 0 0 1 1 1 4 1 9 0", "one box per track in a frame"),
+        (
+            "20 0 Car 0 0 0 0 0 0 0 1 1 1 nan 1 9 0",
+            "frame 20: boxes: centers: expected finite numbers",
+        ),
+        (
+            "20 0 Car 0 0 0 0 0 0 0 1 1 1 0 1 9 0\n20 0 Car 0 0 0 0 0 0 0 1 1 1 4 1 9 0",
+            "one box per track in a frame",
+        ),
     ],
 )
 def test_wrong_boxes_are_named(copy, row, message):
@@ -229,7 +272,9 @@ def sample(real, tmp_path_factory):
 def corners_in(camera, sensor_T_box, size):
     """Return the (8, 2) pixels of the corners of a box."""
     corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
-    return camera.project(transform_points(invert(camera.sensor_T_camera) @ sensor_T_box, corners * size))
+    return camera.project(
+        transform_points(invert(camera.sensor_T_camera) @ sensor_T_box, corners * size)
+    )
 
 
 @pytest.mark.parametrize("images", ["none", "link", "copy"])
@@ -244,7 +289,13 @@ def test_cameras_are_those_of_the_projections(copy, tmp_path, images):
     for axes in ("left", "right"):
         options, poses = LayoutOptions(axes=axes, images=images), PoseOptions("file", force=True)
         result = convert(
-            "kitti-tracking", copy, tmp_path / axes, grids=None, layout=options, poses=poses, run=Run(workers=1)
+            "kitti-tracking",
+            copy,
+            tmp_path / axes,
+            grids=None,
+            layout=options,
+            poses=poses,
+            run=Run(workers=1),
         )
         (sequence,) = carlasc.open(tmp_path / axes).values()
         (camera,) = cameras_of(sequence).values()
@@ -254,17 +305,22 @@ def test_cameras_are_those_of_the_projections(copy, tmp_path, images):
         lidar = points * ((1, -1, 1) if axes == "left" else (1, 1, 1))
         rows = np.array([[721.5, 0, 609.6, 44.9], [0, 721.5, 172.9, 0.2], [0, 0, 1, 0.003]])
         calibration = recording_of(copy)._calibration("")
-        to_camera = calibration.rotation("R0_rect", "R_rect") @ calibration.transform("Tr_velo_to_cam", "Tr_velo_cam")
+        to_camera = calibration.rotation("R0_rect", "R_rect") @ calibration.transform(
+            "Tr_velo_to_cam", "Tr_velo_cam"
+        )
         u, v, depth = rows @ np.vstack([transform_points(to_camera, lidar).T, np.ones(len(lidar))])
         ahead = depth > 0.1
         assert (
             ahead.sum() > 100
-            and np.abs(found[ahead] - np.stack([u, v], axis=1)[ahead] / depth[ahead, None]).max() < 1e-6
+            and np.abs(found[ahead] - np.stack([u, v], axis=1)[ahead] / depth[ahead, None]).max()
+            < 1e-6
         )
         if images != "none":
             assert np.array_equal(read_image(sequence, camera, FIRST + 1), pixels)
         assert bool(list((tmp_path / axes).rglob("*.png"))) == (images == "copy")
-        assert any("images of cameras do not exist" in note for note in result.notes) == (images == "copy")
+        assert any("images of cameras do not exist" in note for note in result.notes) == (
+            images == "copy"
+        )
         with pytest.raises(MissingDataError, match=f"images/image_02/{FIRST:06d}.jpg or .png"):
             read_image(sequence, camera, FIRST)
 
@@ -278,7 +334,10 @@ def test_a_projection_that_is_none_is_refused_in_one_line(copy, tmp_path):
 
 @pytest.mark.slow
 def test_boxes_of_the_real_sample_are_where_the_image_says(sample):
-    """The van's edges fit to 2 pixels, all right edges to hundredths. The left edge of who rides differs by up to 2.6 from the box in space."""
+    """The van's edges fit to 2 pixels, all right edges to hundredths.
+
+    The left edge of who rides differs by up to 2.6 from the box in space.
+    """
     recording, errors, of_van = recording_of(sample), [], []
     camera = {one.name: one for one in recording.cameras()}["image_02"]
     boxes = recording.boxes()
@@ -299,9 +358,9 @@ def test_boxes_of_the_real_sample_are_where_the_image_says(sample):
     assert np.median(errors.max(axis=1)) < 2 and errors.max() < 2.7
     points = recording.frames[0].read()[0].points[:, :3].astype(np.float64)
     rows = np.reshape(recording._calibration("").values["P2"], (3, 4))
-    to_camera = recording._calibration("").rotation("R0_rect", "R_rect") @ recording._calibration("").transform(
-        "Tr_velo_to_cam", "Tr_velo_cam"
-    )
+    to_camera = recording._calibration("").rotation("R0_rect", "R_rect") @ recording._calibration(
+        ""
+    ).transform("Tr_velo_to_cam", "Tr_velo_cam")
     u, v, depth = rows @ np.vstack([transform_points(to_camera, points).T, np.ones(len(points))])
     inside = (depth > 0) & (np.abs(u / depth - 620.5) < 621) & (np.abs(v / depth - 187) < 187.5)
     pixels = camera.project(transform_points(invert(camera.sensor_T_camera), points))
@@ -315,16 +374,20 @@ def test_the_real_sample_is_read(sample):
     assert recording.poses() is None
     boxes = recording.boxes()
     assert {track for found in boxes.values() for track in found.tracks.tolist()} == {1, 2, 4}
-    assert {KITTI.names[int(label)] for found in boxes.values() for label in found.labels} == {"Van", "Cyclist"}
+    assert {KITTI.names[int(label)] for found in boxes.values() for label in found.labels} == {
+        "Van",
+        "Cyclist",
+    }
     for number in (20, 60, 104):
         (cloud,) = recording.frames[number - 20].read()
         assert (cloud.points[:, :3] == 0).all(axis=1).sum() == 1
         assert np.abs(cloud.seconds).max() <= PERIOD_S / 2 + 1e-6
         found = boxes[number]
-        for row, pose in enumerate(
-            found.sensor_T_box
-        ):  # most points in a box are on its surface, and it stands on the road
-            body = transform_points(invert(pose), cloud.points[found.contains(cloud.points[:, :3])[row], :3])
+        # most points in a box are on its surface, and it stands on the road
+        for row, pose in enumerate(found.sensor_T_box):
+            body = transform_points(
+                invert(pose), cloud.points[found.contains(cloud.points[:, :3])[row], :3]
+            )
             body = body[body[:, 2] > 0.15 - found.sizes[row, 2] / 2]
             assert len(body) > 50
             assert np.median((found.sizes[row] / 2 - np.abs(body)).min(axis=1)) < 0.4
@@ -333,25 +396,40 @@ def test_the_real_sample_is_read(sample):
 @pytest.mark.slow
 @pytest.mark.needs("kiss_icp")
 def test_scans_of_the_real_sample_fit_best_with_the_times_of_their_points(sample):
-    """Structure that many scans saw takes the fewest voxels if each point is put where the scanner was at its time."""
+    """Structure that many scans saw takes the fewest voxels if each point is put where the scanner
+    was at its time.
+    """
     from carlasc.core.geometry import slerp
     from carlasc.motion.odometry import estimate_poses
 
     clouds = [frame.read()[0] for frame in recording_of(sample).frames[:24]]
-    first = estimate_poses((cloud.points[:, :3] for cloud in clouds), max_range_m=50, min_range_m=2.5)
+    first = estimate_poses(
+        (cloud.points[:, :3] for cloud in clouds), max_range_m=50, min_range_m=2.5
+    )
     times = np.arange(len(clouds)) * PERIOD_S
 
     def voxels(direction):
-        """Correct scans by the motion, estimate poses again, and count the voxels that all scans fill."""
+        """Correct scans by the motion, estimate poses again, and count the voxels that all scans
+        fill.
+        """
         placed = []
         for number, cloud in enumerate(clouds):
-            then = invert(first[number]) @ slerp(first, times, times[number] + direction * cloud.seconds)
-            placed.append(np.einsum("nij,nj->ni", then[:, :3, :3], cloud.points[:, :3]) + then[:, :3, 3])
+            then = invert(first[number]) @ slerp(
+                first, times, times[number] + direction * cloud.seconds
+            )
+            placed.append(
+                np.einsum("nij,nj->ni", then[:, :3, :3], cloud.points[:, :3]) + then[:, :3, 3]
+            )
         poses = estimate_poses(iter(placed), max_range_m=50, min_range_m=2.5)
         world = []
         for pose, points in zip(poses, placed, strict=True):
             distance = np.linalg.norm(points, axis=1)
-            used = (distance > 4) & (distance < 30) & (points[:, 2] > -1.2) & (np.abs(points[:, 1]) > 4)
+            used = (
+                (distance > 4)
+                & (distance < 30)
+                & (points[:, 2] > -1.2)
+                & (np.abs(points[:, 1]) > 4)
+            )
             world.append(transform_points(pose, points[used]))
         return len(np.unique(np.floor(np.concatenate(world) / 0.1).astype(np.int32), axis=0))
 
@@ -364,7 +442,14 @@ def test_scans_of_the_real_sample_fit_best_with_the_times_of_their_points(sample
 def converted(sample, tmp_path_factory):
     """The real sample in one command, without grids."""
     out = tmp_path_factory.mktemp("converted")
-    result = convert("kitti-tracking", sample, out, layout=LayoutOptions(axes="right"), grids=None, run=Run(workers=2))
+    result = convert(
+        "kitti-tracking",
+        sample,
+        out,
+        layout=LayoutOptions(axes="right"),
+        grids=None,
+        run=Run(workers=2),
+    )
     assert (result.made, result.failures) == (85, ())
     return out
 
@@ -372,7 +457,9 @@ def converted(sample, tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.needs("kiss_icp")
 def test_flow_of_the_real_sample_is_that_of_its_boxes_and_zero_on_the_parked_van(converted):
-    """The boxes of an object move as fast as it does; over a second, their jitter of some centimetres does not matter."""
+    """The boxes of an object move as fast as it does; over a second, their jitter of some
+    centimetres does not matter.
+    """
     (sequence,) = carlasc.open(converted).sequences().values()
     frames = sequence.frames("points").tolist()
     centers, speeds = {}, {}
@@ -380,13 +467,16 @@ def test_flow_of_the_real_sample_is_that_of_its_boxes_and_zero_on_the_parked_van
         boxes, pose = sequence.boxes(frame), sequence.read_pose(frame)
         instances, flow = sequence.read("instances", frame), sequence.read("flow", frame)
         assert not flow[instances == 4].any() and not flow[instances == 0].any()
-        for track, center in zip(boxes.tracks.tolist(), transform_points(pose, boxes.centers), strict=True):
+        for track, center in zip(
+            boxes.tracks.tolist(), transform_points(pose, boxes.centers), strict=True
+        ):
             centers[track, frame] = center
             if (instances == track).any():
                 speeds[track, frame] = np.linalg.norm(flow[instances == track].mean(axis=0))
     for track in (1, 2):
         expected = {
-            frame: np.linalg.norm(centers[track, frame + 5] - centers[track, frame - 5]) / (10 * PERIOD_S)
+            frame: np.linalg.norm(centers[track, frame + 5] - centers[track, frame - 5])
+            / (10 * PERIOD_S)
             for frame in frames[5:-5]
         }
         errors = np.abs([speeds[track, frame] - speed for frame, speed in expected.items()])
@@ -410,7 +500,12 @@ def test_movers_of_the_real_sample_leave_no_trail_in_a_grid(converted, monkeypat
     spec = GridSpec.published().with_resolution(0.2)
     frames = (frame, frame + 1)
     result = carlasc.regrid(
-        converted, spec, name="fine", frames=frames, observe=FromScans(window=window), run=Run(workers=1)
+        converted,
+        spec,
+        name="fine",
+        frames=frames,
+        observe=FromScans(window=window),
+        run=Run(workers=1),
     )
     assert not result.failures
     (sequence,) = carlasc.open(converted).sequences().values()

@@ -21,7 +21,10 @@ def drive(tmp_path: Path) -> Path:
     for number in range(FRAMES):
         points = rng.uniform(-20, 20, (300, 4)).astype(np.float32)
         np.savez(
-            folder / f"{number}.npz", points=points, labels=np.full(300, 3, np.uint32), actors=np.zeros(300, np.uint32)
+            folder / f"{number}.npz",
+            points=points,
+            labels=np.full(300, 3, np.uint32),
+            actors=np.zeros(300, np.uint32),
         )
     np.save(folder / "poses.npy", np.tile(np.eye(4), (FRAMES, 1, 1)))
     return tmp_path / "lab"
@@ -29,17 +32,30 @@ def drive(tmp_path: Path) -> Path:
 
 def check(drive: Path, out: Path, executor=None) -> None:
     result = convert(
-        Deadly, drive, out, layout=LayoutOptions(flow="none"), grids=None, run=Run(workers=2, executor=executor)
+        Deadly,
+        drive,
+        out,
+        layout=LayoutOptions(flow="none"),
+        grids=None,
+        run=Run(workers=2, executor=executor),
     )
     assert [(failure.frame, failure.message[:38]) for failure in result.failures] == [
         (3, "a task: 3 worker processes died while ")
     ]
     assert result.made == FRAMES - 1
+    # the library was mended
     result = convert(
         Lab, drive, out, layout=LayoutOptions(flow="none"), grids=None, run=Run(workers=1)
-    )  # the library was mended
+    )
     assert (result.made, result.skipped, result.failures) == (1, FRAMES - 1, ())
-    convert(Lab, drive, out.with_name("whole"), layout=LayoutOptions(flow="none"), grids=None, run=Run(workers=1))
+    convert(
+        Lab,
+        drive,
+        out.with_name("whole"),
+        layout=LayoutOptions(flow="none"),
+        grids=None,
+        run=Run(workers=1),
+    )
     left_out = "carlasc.json"  # it names the converter
     assert read_tree(out, left_out) == read_tree(out.with_name("whole"), left_out)
 

@@ -40,7 +40,9 @@ class TestNcore(ConverterContract):
         write_store(folder, self.drive)
 
     def _points(self, frame):
-        """Every fifth ray has a second return, one metre behind the first; all first returns come before all second ones."""
+        """Every fifth ray has a second return, one metre behind the first; all first returns come
+        before all second ones.
+        """
         for points in super()._points(frame):
             sensor = self.drive.sensors[0].vehicle_T_sensor
             own = self.drive.scan(frame).deskewed[::5, :3].astype(np.float64)
@@ -52,17 +54,22 @@ class TestNcore(ConverterContract):
 
 
 def check_against(recording, library):
-    """Compare a recording with what NCore's library read of the same store, or with what was written."""
+    """Compare a recording with what NCore's library read of the same store, or with what was
+    written.
+    """
     spans = library[f"{SENSORS[0].name}/spans"].astype(np.int64)
     np.testing.assert_allclose(recording.times(), (spans[:, 1] - spans[0, 1]) / 1e6, atol=1e-9)
     for index, sensor in enumerate(recording.sensors):
-        np.testing.assert_allclose(sensor.vehicle_T_sensor, library[f"{sensor.name}/mount"], atol=1e-6)
+        np.testing.assert_allclose(
+            sensor.vehicle_T_sensor, library[f"{sensor.name}/mount"], atol=1e-6
+        )
         for number, frame in enumerate(recording.frames):
             cloud = frame.read()[index]
             both = [library[f"{sensor.name}/{number}/points{which}"] for which in range(2)]
             valid = [np.isfinite(points).all(axis=1) for points in both]
             np.testing.assert_array_equal(
-                cloud.points[:, :3], np.concatenate([points[keep] for points, keep in zip(both, valid, strict=True)])
+                cloud.points[:, :3],
+                np.concatenate([points[keep] for points, keep in zip(both, valid, strict=True)]),
             )
             stamps = library[f"{sensor.name}/{number}/stamps"].astype(np.int64)
             expected = np.concatenate([stamps[keep] for keep in valid]) - spans[number, 1]
@@ -84,7 +91,9 @@ def test_two_lidars_are_read_as_they_were_written(tmp_path):
     assert recording.name == "drive_1"
     content = contents(DRIVE)
     for index, sensor in enumerate(recording.sensors):
-        np.testing.assert_allclose(sensor.vehicle_T_sensor, SENSORS[index].vehicle_T_sensor, atol=1e-12)
+        np.testing.assert_allclose(
+            sensor.vehicle_T_sensor, SENSORS[index].vehicle_T_sensor, atol=1e-12
+        )
         for number, frame in enumerate(recording.frames):
             given, cloud = content["frames"][sensor.name, number], frame.read()[index]
             first = len(given["direction"])
@@ -93,7 +102,9 @@ def test_two_lidars_are_read_as_they_were_written(tmp_path):
             )
             assert cloud.seconds.max() <= 0 and cloud.seconds.min() >= -DRIVE.period_s
     ends = recording.times() + DRIVE.period_s / 2
-    np.testing.assert_allclose(recording.poses().at(recording.times()), DRIVE.world_T_vehicle(ends), atol=2e-3)
+    np.testing.assert_allclose(
+        recording.poses().at(recording.times()), DRIVE.world_T_vehicle(ends), atol=2e-3
+    )
 
 
 def test_damage_is_one_line(tmp_path):
@@ -101,7 +112,9 @@ def test_damage_is_one_line(tmp_path):
     good = path.read_bytes()
     for share in (0.3, 0.7, 0.99):
         path.write_bytes(good[: int(len(good) * share)])
-        with pytest.raises(FormatError, match=r"itar: expected an (index at the end|indexed tar)") as found:
+        with pytest.raises(
+            FormatError, match=r"itar: expected an (index at the end|indexed tar)"
+        ) as found:
             Ncore(Path(path)).sequences()
         assert "\n" not in str(found.value)
     other = tmp_path / "other"
@@ -109,15 +122,25 @@ def test_damage_is_one_line(tmp_path):
     with pytest.raises(FormatError, match="expected NCore v4, found v9"):
         Ncore(write_store(other, DRIVE, version="v9")).sequences()
     (tmp_path / "none").mkdir()
-    with pytest.raises(MissingDataError, match=r"expected stores of NCore: \*.zarr.itar or \*.zarr, found none"):
+    with pytest.raises(
+        MissingDataError, match=r"expected stores of NCore: \*.zarr.itar or \*.zarr, found none"
+    ):
         Ncore(tmp_path / "none").sequences()
 
 
 def test_names_of_classes_belong_to_classes_and_unknown_ones_are_said(tmp_path):
-    named = {"automobile": "Vehicle", "BICYCLIST": "Rider", "MOBILE_PEDESTRIAN_CROSSING_SIGN": "Sign", "dog": "Animal"}
+    named = {
+        "automobile": "Vehicle",
+        "BICYCLIST": "Rider",
+        "MOBILE_PEDESTRIAN_CROSSING_SIGN": "Sign",
+        "dog": "Animal",
+    }
     assert {name: NCORE.names[class_of_name(name)] for name in named} == named
     assert class_of_name("scarecrow") is None
-    assert NCORE_TO_CARLA.target.names[NCORE_TO_CARLA.mapping[class_of_name("cyclist")]] == "Pedestrian"
+    assert (
+        NCORE_TO_CARLA.target.names[NCORE_TO_CARLA.mapping[class_of_name("cyclist")]]
+        == "Pedestrian"
+    )
 
     def rename(content):
         for entry in content["observations"]:
@@ -131,7 +154,9 @@ def test_names_of_classes_belong_to_classes_and_unknown_ones_are_said(tmp_path):
 def test_frames_that_nobody_annotated_have_no_entry_and_far_observations_are_left_out(tmp_path):
     def thin(content):
         first, last = START_US + 50_000, START_US + 350_000
-        kept = [entry for entry in content["observations"] if entry["timestamp_us"] in (first, last)]
+        kept = [
+            entry for entry in content["observations"] if entry["timestamp_us"] in (first, last)
+        ]
         far = {**kept[0], "timestamp_us": last + 14_000_000}
         content["observations"] = [*kept, far]
 
@@ -146,18 +171,28 @@ def test_a_lidar_that_starts_late_gives_each_frame_once(tmp_path):
             del content["frames"]["lidar_rear", number]
 
     (recording,) = Ncore(write_store(tmp_path, DRIVE, edit=start_late)).sequences()
-    assert [[cloud.sensor for cloud in frame.read()] for frame in recording.frames] == [[0], [0], [0, 1], [0, 1]]
+    assert [[cloud.sensor for cloud in frame.read()] for frame in recording.frames] == [
+        [0],
+        [0],
+        [0, 1],
+        [0, 1],
+    ]
 
 
 def test_lidars_without_frames_are_left_out(tmp_path):
     def empty(content, names):
-        content["frames"] = {key: frame for key, frame in content["frames"].items() if key[0] not in names}
+        content["frames"] = {
+            key: frame for key, frame in content["frames"].items() if key[0] not in names
+        }
 
-    (recording,) = Ncore(write_store(tmp_path, DRIVE, edit=lambda content: empty(content, ["lidar_front"]))).sequences()
+    (recording,) = Ncore(
+        write_store(tmp_path, DRIVE, edit=lambda content: empty(content, ["lidar_front"]))
+    ).sequences()
     assert [sensor.name for sensor in recording.sensors] == ["lidar_rear"]
     assert recording.notes() == ["LiDARs without frames were left out: lidar_front"]
     both = ["lidar_front", "lidar_rear"]
-    path = write_store(tmp_path, DRIVE, edit=lambda content: empty(content, both))  # the same file, written again
+    # the same file, written again
+    path = write_store(tmp_path, DRIVE, edit=lambda content: empty(content, both))
     with pytest.raises(MissingDataError, match="expected a LiDAR with frames, found none"):
         Ncore(path).sequences()
 
@@ -185,7 +220,12 @@ def test_what_the_library_writes_is_read_as_the_library_reads_it(tmp_path, libra
     script = Path(__file__).with_name("ncore_library.py")
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
-        [library, script, tmp_path], check=False, capture_output=True, text=True, timeout=300, env=environment
+        [library, script, tmp_path],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=environment,
     )
     assert done.returncode == 0, done.stderr
     (recording,) = Ncore(tmp_path).sequences()
@@ -209,7 +249,8 @@ def photographed(drive):
     """Return what adds cameras to a store: two that can be projected, and three that cannot."""
     image = encode_image(np.full((48, 64, 3), 80, np.uint8), "PNG").tobytes()
     spans = [(START_US + round(1e6 * t), START_US + round(1e6 * t) + 2000) for t in drive.times]
-    images = dict.fromkeys(spans[:-1], (image + b"\x00\x00", "png"))  # what follows the image is not lost
+    # what follows the image is not lost
+    images = dict.fromkeys(spans[:-1], (image + b"\x00\x00", "png"))
     ahead = np.eye(4)
     ahead[:3, :3], ahead[:3, 3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], (1.5, 0, 1.4)
     prism = {**CAMERA, "thin_prism_coeffs": [0.1, 0, 0, 0]}
@@ -227,7 +268,9 @@ def photographed(drive):
         }
         for name, (kind, given) in kinds.items()
     }
-    found["nowhere"] = {key: value for key, value in found["front"].items() if key != "rig_T_camera"}
+    found["nowhere"] = {
+        key: value for key, value in found["front"].items() if key != "rig_T_camera"
+    }
     return lambda content: content.update(cameras=found)
 
 
@@ -235,11 +278,15 @@ def test_cameras_are_where_the_rig_has_them_with_the_image_nearest_to_each_frame
     write_store(tmp_path, DRIVE, edit=photographed(DRIVE))
     (recording,) = Ncore(tmp_path).sequences()
     front, wide = recording.cameras()
-    assert (front.name, front.width, front.height, front.model) == ("front", 64, 48, "radial-tangential")
+    assert (front.name, front.width, front.height, front.model) == (
+        "front",
+        64,
+        48,
+        "radial-tangential",
+    )
     assert front.distortion == (0.1, 0.02, 0.001, -0.002, 0.003, 0, 0, 0)
-    np.testing.assert_allclose(
-        front.matrix, [[60, 0, 32], [0, 61, 24], [0, 0, 1]]
-    )  # centres of pixels are whole numbers
+    # centres of pixels are whole numbers
+    np.testing.assert_allclose(front.matrix, [[60, 0, 32], [0, 61, 24], [0, 0, 1]])
     np.testing.assert_allclose(front.sensor_T_camera[:3, 3], (1.5, 0, 1.4))
     np.testing.assert_allclose(front.sensor_T_camera[:3, 2], (1, 0, 0), atol=1e-9)  # it looks ahead
     assert (wide.model, len(wide.distortion), wide.times) == ("fisheye", 4, None)
@@ -254,7 +301,11 @@ def test_cameras_of_other_models_are_left_out_and_named(tmp_path):
     write_store(tmp_path, DRIVE, edit=photographed(DRIVE))
     (recording,) = Ncore(tmp_path).sequences()
     notes = "\n".join(recording.notes())
-    for name, why in (("theta", "the model ftheta"), ("prism", "thin prisms"), ("nowhere", "no poses lead to rig")):
+    for name, why in (
+        ("theta", "the model ftheta"),
+        ("prism", "thin prisms"),
+        ("nowhere", "no poses lead to rig"),
+    ):
         assert f"the camera {name} was left out: {why}" in notes
 
 

@@ -10,7 +10,10 @@ ROAD, BUILDING, POLE, VEHICLE, PERSON, SIDEWALK = 7, 1, 5, 10, 4, 8
 def near(points, labelled, ground=None):
     points = np.array(points, np.float64).reshape(-1, 3)
     ground = np.zeros(len(points), np.bool_) if ground is None else np.array(ground)
-    scans = [(np.array(places, np.float64).reshape(-1, 3), np.array(labels, np.uint8)) for places, labels in labelled]
+    scans = [
+        (np.array(places, np.float64).reshape(-1, 3), np.array(labels, np.uint8))
+        for places, labels in labelled
+    ]
     return labels_nearby(points, ground, scans, CARLA).tolist()
 
 
@@ -52,7 +55,9 @@ def test_the_order_of_points_and_the_place_of_the_world_do_not_matter():
     first = near(points, [(places, labels)], ground)
     order = random.permutation(900)
     assert near(points, [(places[order], labels[order])], ground) == first
-    assert near(points, [(places[:500], labels[:500]), (places[500:], labels[500:])], ground) == first
+    assert (
+        near(points, [(places[:500], labels[:500]), (places[500:], labels[500:])], ground) == first
+    )
     assert np.count_nonzero(first) > 0
     assert set(np.array(first)[ground]) <= {0, ROAD, SIDEWALK}
     assert set(np.array(first)[~ground]) <= {0, BUILDING, POLE}

@@ -60,7 +60,9 @@ def recording(folder, name="scene-0103", **options):
 
 def scan_file(tables, frame):
     folder = "samples" if frame in KEYS else "sweeps"
-    return tables.parent / folder / "LIDAR_TOP" / f"scene-0103__{microseconds(DRIVE, frame)}.pcd.bin"
+    return (
+        tables.parent / folder / "LIDAR_TOP" / f"scene-0103__{microseconds(DRIVE, frame)}.pcd.bin"
+    )
 
 
 class TestContract(ConverterContract):
@@ -109,7 +111,9 @@ def test_scans_hold_the_points_in_the_frame_of_the_sensor(root):
 
 
 def test_a_point_ahead_of_the_vehicle_has_a_positive_y_in_the_file(root):
-    """The axes of the LiDAR are not those of the vehicle, so that a reader that takes them as they are would fail."""
+    """The axes of the LiDAR are not those of the vehicle, so that a reader that takes them as they
+    are would fail.
+    """
     vehicle = transform_points(
         recording(root).sensors[0].vehicle_T_sensor, np.array([[0.0, 10.0, 0.0], [2.0, 0.0, 0.0]])
     )
@@ -152,7 +156,9 @@ def test_an_object_takes_the_box_of_its_class_with_most_of_its_points_and_keeps_
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[1, 0, 3] = poses[2, 0, 3] = 1.0
     sizes = np.array([[2.0, 2.0, 2.0], [4.0, 4.0, 4.0], [2.0, 2.0, 2.0]])
-    boxes = Boxes.from_poses(np.array([7, 8, 9], np.uint32), np.array([2, 17, 2], np.uint32), poses, sizes)
+    boxes = Boxes.from_poses(
+        np.array([7, 8, 9], np.uint32), np.array([2, 17, 2], np.uint32), poses, sizes
+    )
     points = np.zeros((6, 4), np.float32)
     points[:, 0] = [-0.9, 0.5, -0.5, 1.9, 30.0, 30.0]
     panoptic = np.array([2001, 2001, 2001, 2005, 17003, 0], np.uint16)
@@ -179,11 +185,20 @@ def test_boxes_are_in_the_frame_of_the_vehicle_at_their_scan(root):
 def test_cameras_have_the_image_nearest_to_each_scan(root):
     recording = next(one for one in NuScenes(root).sequences() if len(one.frames) > 1)
     (camera,) = recording.cameras()
-    assert (camera.name, camera.width, camera.height, camera.model) == ("CAM_FRONT", 1600, 900, "pinhole")
-    assert np.allclose(camera.matrix, nusc.MATRIX) and np.allclose(camera.sensor_T_camera, nusc.VEHICLE_T_CAMERA)
+    assert (camera.name, camera.width, camera.height, camera.model) == (
+        "CAM_FRONT",
+        1600,
+        900,
+        "pinhole",
+    )
+    assert np.allclose(camera.matrix, nusc.MATRIX) and np.allclose(
+        camera.sensor_T_camera, nusc.VEHICLE_T_CAMERA
+    )
     later = camera.times - recording.times()
     assert later == pytest.approx(np.full(len(later), nusc.IMAGE_LATER_US * 1e-6))
-    assert all(name.endswith(".jpg") and f"{root}/samples/CAM_FRONT/" in name for name in camera.images)
+    assert all(
+        name.endswith(".jpg") and f"{root}/samples/CAM_FRONT/" in name for name in camera.images
+    )
 
 
 def test_poses_and_times_are_those_of_the_simulation(root):
@@ -191,7 +206,9 @@ def test_poses_and_times_are_those_of_the_simulation(root):
     trajectory, times = found.poses(), found.times()
     np.testing.assert_allclose(times, DRIVE.times, atol=1e-9)
     np.testing.assert_allclose(trajectory.seconds, DRIVE.times, atol=1e-9)
-    np.testing.assert_allclose(trajectory.at(times), GLOBAL_T_WORLD @ DRIVE.world_T_vehicle(DRIVE.times), atol=1e-6)
+    np.testing.assert_allclose(
+        trajectory.at(times), GLOBAL_T_WORLD @ DRIVE.world_T_vehicle(DRIVE.times), atol=1e-6
+    )
 
 
 def test_only_key_frames_are_frames_if_sweeps_are_not_wanted(root):
@@ -200,7 +217,9 @@ def test_only_key_frames_are_frames_if_sweeps_are_not_wanted(root):
     np.testing.assert_allclose(found.times(), DRIVE.times[list(KEYS)], atol=1e-9)
     assert sorted(found.boxes()) == [0, 1, 2]
     np.testing.assert_allclose(found.poses().seconds, DRIVE.times, atol=1e-9)
-    np.testing.assert_array_equal(found.frames[2].read()[0].points[:, :3], rows_of(DRIVE.scan(6))[:, :3])
+    np.testing.assert_array_equal(
+        found.frames[2].read()[0].points[:, :3], rows_of(DRIVE.scan(6))[:, :3]
+    )
     assert found.notes() == []
     with pytest.raises(ArgumentError, match="sweeps: expected true or false, found 'maybe'"):
         convert("nuscenes", root, root.parent / "out", options={"sweeps": "maybe"})
@@ -230,13 +249,18 @@ def test_a_missing_scan_is_named_and_other_frames_keep_their_numbers(tables):
     np.testing.assert_allclose(found.times(), DRIVE.times, atol=1e-9)
     ((number, message),) = found.problems()
     assert number == 4
-    assert f"{scan_file(tables, 4).name}: expected a LiDAR scan that the tables list, found no such file" in message
+    assert (
+        f"{scan_file(tables, 4).name}: expected a LiDAR scan that the tables list, found no such "
+        f"file" in message
+    )
 
 
 def test_labels_come_from_panoptic_files_where_there_are_no_others(tmp_path):
     write_nuscenes(tmp_path, {"scene-0103": DRIVE}, lidarseg=False)
     found = recording(tmp_path)
-    np.testing.assert_array_equal(found.frames[3].read()[0].labels, CLASS_OF_KIND[DRIVE.scan(3).kinds])
+    np.testing.assert_array_equal(
+        found.frames[3].read()[0].labels, CLASS_OF_KIND[DRIVE.scan(3).kinds]
+    )
 
 
 def test_without_point_labels_there_are_boxes_only(tmp_path):
@@ -250,7 +274,12 @@ def test_without_point_labels_there_are_boxes_only(tmp_path):
 
 def test_the_test_set_has_neither_boxes_nor_labels(tmp_path):
     write_nuscenes(
-        tmp_path, {"scene-0077": DRIVE}, version="v1.0-test", lidarseg=False, panoptic=False, annotated=False
+        tmp_path,
+        {"scene-0077": DRIVE},
+        version="v1.0-test",
+        lidarseg=False,
+        panoptic=False,
+        annotated=False,
     )
     found = recording(tmp_path, "scene-0077")
     assert found.split == "Test"
@@ -270,12 +299,22 @@ def test_a_key_frame_without_boxes_is_annotated_nevertheless(tables):
 
 def test_the_version_is_chosen_where_there_are_several(tmp_path):
     write_nuscenes(tmp_path, {"scene-0553": nusc.drive(1)})
-    write_nuscenes(tmp_path, {"scene-0553": nusc.drive(1), "scene-1110": nusc.drive(1)}, version="v1.0-trainval")
-    with pytest.raises(ArgumentError, match=r"version: expected one of v1.0-mini, v1.0-trainval, found no choice"):
+    write_nuscenes(
+        tmp_path,
+        {"scene-0553": nusc.drive(1), "scene-1110": nusc.drive(1)},
+        version="v1.0-trainval",
+    )
+    with pytest.raises(
+        ArgumentError, match=r"version: expected one of v1.0-mini, v1.0-trainval, found no choice"
+    ):
         NuScenes(tmp_path).sequences()
-    with pytest.raises(ArgumentError, match=r"version: expected one of v1.0-mini, v1.0-trainval, found 'v1.0-test'"):
+    with pytest.raises(
+        ArgumentError, match=r"version: expected one of v1.0-mini, v1.0-trainval, found 'v1.0-test'"
+    ):
         NuScenes(tmp_path, version="v1.0-test").sequences()
-    splits = {scene.name: scene.split for scene in NuScenes(tmp_path, version="v1.0-trainval").sequences()}
+    splits = {
+        scene.name: scene.split for scene in NuScenes(tmp_path, version="v1.0-trainval").sequences()
+    }
     assert splits == {"NUSC_scene-0553": "Val", "NUSC_scene-1110": "Train"}
     assert recording(tmp_path, "scene-0553", version="v1.0-mini").split == "Train"
     assert len(VALIDATION) == 150
@@ -288,7 +327,9 @@ def test_each_category_has_a_class_and_a_class_of_carla():
     assert carla["human.pedestrian.child"] == "Pedestrian"
     assert carla["flat.driveable_surface"] == "Road"
     assert carla["noise"] == carla["vehicle.ego"] == "Free"
-    assert {carla[NUSCENES.names[index]] for index in NUSCENES.ground} <= {CARLA.names[index] for index in CARLA.ground}
+    assert {carla[NUSCENES.names[index]] for index in NUSCENES.ground} <= {
+        CARLA.names[index] for index in CARLA.ground
+    }
     assert (CLASS_IDS["static.other"], CLASS_IDS["static.vegetation"]) == (29, 30)
     assert NUSCENES.names[NUSCENES.geometry_id] == "static.other"
     assert NUSCENES.names[NUSCENES.ground_id] == "flat.other"
@@ -296,13 +337,17 @@ def test_each_category_has_a_class_and_a_class_of_carla():
 
 @pytest.mark.parametrize(
     ("values", "found"),
-    [({"name": "vehicle.tram"}, "'vehicle.tram'"), ({"index": 30}, "30 for vehicle.ego, which is 31")],
+    [
+        ({"name": "vehicle.tram"}, "'vehicle.tram'"),
+        ({"index": 30}, "30 for vehicle.ego, which is 31"),
+    ],
 )
 def test_tables_of_another_version_are_named(tables, values, found):
     change_table(tables / "category.json", **values)
     with pytest.raises(
         FormatError,
-        match=rf"category.json: expected the 32 categories of nuScenes v1.0.*found {found}: use the tables of nuScenes",
+        match=rf"category.json: expected the 32 categories of nuScenes v1.0.*found {found}: use "
+        rf"the tables of nuScenes",
     ):
         NuScenes(tables).sequences()
 
@@ -310,13 +355,24 @@ def test_tables_of_another_version_are_named(tables, values, found):
 def test_an_object_of_an_unknown_category_is_named(tables):
     change_table(tables / "instance.json", category_token="nothing")
     with pytest.raises(
-        FormatError, match=r"instance.json: expected a category_token of category.json, found nothing for"
+        FormatError,
+        match=r"instance.json: expected a category_token of category.json, found nothing for",
     ):
         recording(tables).boxes()
 
 
 @pytest.mark.parametrize(
-    "table", ["scene", "sample", "sample_data", "ego_pose", "calibrated_sensor", "sensor", "category", "instance"]
+    "table",
+    [
+        "scene",
+        "sample",
+        "sample_data",
+        "ego_pose",
+        "calibrated_sensor",
+        "sensor",
+        "category",
+        "instance",
+    ],
 )
 def test_a_table_that_is_missing_or_cut_short_or_lacks_a_key_is_named(tables, table):
     def read():
@@ -327,19 +383,23 @@ def test_a_table_that_is_missing_or_cut_short_or_lacks_a_key_is_named(tables, ta
     rows = json.loads(path.read_text())
     write_table(path, [*rows, {"other": 1}])
     with pytest.raises(
-        FormatError, match=rf"{table}.json: expected the key '(token|name)'.* found other in row {len(rows)}: "
+        FormatError,
+        match=rf"{table}.json: expected the key '(token|name)'.* found other in row {len(rows)}: ",
     ):
         read()
     write_table(path, rows)
     path.write_bytes(path.read_bytes()[:-9])
     count = len(rows) - 1
     with pytest.raises(
-        FormatError, match=rf"{table}.json: expected a JSON list.*ends or is damaged after {count} rows"
+        FormatError,
+        match=rf"{table}.json: expected a JSON list.*ends or is damaged after {count} rows",
     ):
         read()
     path.unlink()
     found = "none" if table == "scene" else "nothing"
-    with pytest.raises(MissingDataError, match=rf"{'scene' if table == 'scene' else table}.json.*found {found}"):
+    with pytest.raises(
+        MissingDataError, match=rf"{'scene' if table == 'scene' else table}.json.*found {found}"
+    ):
         read()
 
 
@@ -347,12 +407,14 @@ def test_a_scan_of_an_unknown_sample_and_one_without_a_pose_are_named(tables):
     rows = json.loads((tables / "ego_pose.json").read_text())
     write_table(tables / "ego_pose.json", rows[:-1])
     with pytest.raises(
-        FormatError, match=r"ego_pose.json: expected the pose scene-0103-scan-0-pose of a LiDAR scan, found no"
+        FormatError,
+        match=r"ego_pose.json: expected the pose scene-0103-scan-0-pose of a LiDAR scan, found no",
     ):
         recording(tables).poses()
     write_table(tables / "sample.json", json.loads((tables / "sample.json").read_text())[1:])
     with pytest.raises(
-        FormatError, match=r"sample_data.json: expected a sample_token of sample.json, found scene-0103-sample-2"
+        FormatError,
+        match=r"sample_data.json: expected a sample_token of sample.json, found scene-0103-sample-2",
     ):
         recording(tables)
 
@@ -362,18 +424,23 @@ def test_a_box_of_an_unknown_object_and_one_without_a_rotation_are_named(tables)
     text = path.read_text()
     change_table(path, instance_token="nobody")
     with pytest.raises(
-        FormatError, match=r"sample_annotation.json: expected a known sample and instance.*nobody in row 0"
+        FormatError,
+        match=r"sample_annotation.json: expected a known sample and instance.*nobody in row 0",
     ):
         recording(tables).boxes()
     path.write_text(text)
     change_table(path, size=[1.0, 2.0])
     with pytest.raises(
-        FormatError, match=r"sample_annotation.json: expected a list of 3 numbers under .size., found .* in row 0"
+        FormatError,
+        match=r"sample_annotation.json: expected a list of 3 numbers under .size., found .* in "
+        r"row 0",
     ):
         recording(tables).boxes()
     path.write_text(text)
     change_table(path, rotation=[0, 0, 0, 0])
-    with pytest.raises(FormatError, match=r"sample_annotation.json: samples/.*boxes: expected a rotation"):
+    with pytest.raises(
+        FormatError, match=r"sample_annotation.json: samples/.*boxes: expected a rotation"
+    ):
         recording(tables).boxes()
 
 
@@ -382,7 +449,8 @@ def test_a_pose_of_too_few_numbers_is_named(tables, table):
     rows = json.loads((tables / f"{table}.json").read_text())
     write_table(tables / f"{table}.json", [row | {"rotation": [1.0, 0.0]} for row in rows])
     with pytest.raises(
-        FormatError, match=rf"{table}.json: expected a list of 4 numbers under 'rotation', found .* in row 0"
+        FormatError,
+        match=rf"{table}.json: expected a list of 4 numbers under 'rotation', found .* in row 0",
     ):
         recording(tables).poses()
 
@@ -401,7 +469,8 @@ def test_a_value_of_another_type_is_named(tables, table, key, value, expected):
     rows = json.loads((tables / f"{table}.json").read_text())
     write_table(tables / f"{table}.json", [*rows[:-1], rows[-1] | {key: value}])
     with pytest.raises(
-        FormatError, match=rf"{table}.json: expected {expected} under '{key}', found .* in row {len(rows) - 1}"
+        FormatError,
+        match=rf"{table}.json: expected {expected} under '{key}', found .* in row {len(rows) - 1}",
     ):
         recording(tables).boxes()
 
@@ -409,7 +478,9 @@ def test_a_value_of_another_type_is_named(tables, table, key, value, expected):
 def test_poses_whose_times_stand_still_are_named(tables):
     rows = json.loads((tables / "ego_pose.json").read_text())
     write_table(tables / "ego_pose.json", [row | {"timestamp": nusc.START_US} for row in rows])
-    with pytest.raises(FormatError, match=r"ego_pose.json: scene-0103: expected times that increase, found none at"):
+    with pytest.raises(
+        FormatError, match=r"ego_pose.json: scene-0103: expected times that increase, found none at"
+    ):
         recording(tables).poses()
 
 
@@ -418,8 +489,12 @@ def test_two_calibrations_in_a_scene_are_refused(tables):
     moved = rows[0] | {"token": "moved", "translation": [0.0, 0.0, 0.0]}
     write_table(tables / "calibrated_sensor.json", [*rows, moved])
     data = json.loads((tables / "sample_data.json").read_text())
-    write_table(tables / "sample_data.json", [*data[:-1], data[-1] | {"calibrated_sensor_token": "moved"}])
-    with pytest.raises(FormatError, match=r"scene-0103: expected one calibration of LIDAR_TOP in a scene, found 2"):
+    write_table(
+        tables / "sample_data.json", [*data[:-1], data[-1] | {"calibrated_sensor_token": "moved"}]
+    )
+    with pytest.raises(
+        FormatError, match=r"scene-0103: expected one calibration of LIDAR_TOP in a scene, found 2"
+    ):
         list(recording(tables).sensors)
 
 
@@ -432,47 +507,63 @@ def test_files_that_do_not_fit_are_named(tables):
     for broken in (data[:-1], b""):
         points.write_bytes(broken)
         with pytest.raises(
-            FormatError, match=rf"pcd.bin: expected a multiple of 20 bytes .*found {len(broken)}: .*incomplete"
+            FormatError,
+            match=rf"pcd.bin: expected a multiple of 20 bytes .*found {len(broken)}: .*incomplete",
         ):
             frame.read()
     points.write_bytes(data[:-20])
     with pytest.raises(
-        FormatError, match=rf"scan-3_lidarseg.bin: expected a label for each of {len(data) // 20 - 1} points"
+        FormatError,
+        match=rf"scan-3_lidarseg.bin: expected a label for each of {len(data) // 20 - 1} points",
     ):
         frame.read()
     points.write_bytes(data)
     good = labels.read_bytes()
     labels.write_bytes(b"\xff" + good[1:])
-    with pytest.raises(FormatError, match=r"lidarseg.bin: expected class ids 0\.\.31 .*found 255 in 1 of"):
+    with pytest.raises(
+        FormatError, match=r"lidarseg.bin: expected class ids 0\.\.31 .*found 255 in 1 of"
+    ):
         frame.read()
     labels.unlink()
-    with pytest.raises(MissingDataError, match=r"lidarseg.bin: expected a file that the tables list, found nothing"):
+    with pytest.raises(
+        MissingDataError, match=r"lidarseg.bin: expected a file that the tables list, found nothing"
+    ):
         frame.read()
     labels.write_bytes(good)
     np.savez(panoptic, data=np.zeros(5, np.uint16))
-    with pytest.raises(FormatError, match=r"panoptic.npz: expected a label for each of \d+ points, found 5"):
+    with pytest.raises(
+        FormatError, match=r"panoptic.npz: expected a label for each of \d+ points, found 5"
+    ):
         frame.read()
     np.savez(panoptic, other=np.zeros(5, np.uint16))
     with pytest.raises(FormatError, match=r"panoptic.npz: expected an array data, found other"):
         frame.read()
     np.savez(panoptic, data=np.array([{"a": 1}], object))
     with pytest.raises(
-        FormatError, match=r"panoptic.npz: data: expected uint8 or uint16 or uint32 values, found object"
+        FormatError,
+        match=r"panoptic.npz: data: expected uint8 or uint16 or uint32 values, found object",
     ):
         frame.read()
     panoptic.write_bytes(b"PK\x03\x04")
     with pytest.raises(FormatError, match=r"panoptic.npz: expected an .npz file"):
         frame.read()
     panoptic.unlink()
-    with pytest.raises(MissingDataError, match=r"panoptic.npz: expected a file, found nothing: unpack it again"):
+    with pytest.raises(
+        MissingDataError, match=r"panoptic.npz: expected a file, found nothing: unpack it again"
+    ):
         frame.read()
     points.unlink()
-    with pytest.raises(MissingDataError, match=r"pcd.bin: expected a file that the tables list, found nothing"):
+    with pytest.raises(
+        MissingDataError, match=r"pcd.bin: expected a file that the tables list, found nothing"
+    ):
         frame.read()
 
 
 def test_a_folder_without_tables_and_tables_without_files_are_refused(tmp_path):
-    with pytest.raises(MissingDataError, match=r"expected v1.0-mini/scene.json, or another version, found none: give"):
+    with pytest.raises(
+        MissingDataError,
+        match=r"expected v1.0-mini/scene.json, or another version, found none: give",
+    ):
         NuScenes(tmp_path).sequences()
     with pytest.raises(MissingDataError, match="found no such folder"):
         NuScenes(tmp_path / "typo").sequences()
@@ -480,7 +571,8 @@ def test_a_folder_without_tables_and_tables_without_files_are_refused(tmp_path):
     for path in (tmp_path / "samples" / "LIDAR_TOP").iterdir():
         path.unlink()
     with pytest.raises(
-        MissingDataError, match=r"expected the LiDAR scans that v1.0-mini lists.*found none of them: unpack"
+        MissingDataError,
+        match=r"expected the LiDAR scans that v1.0-mini lists.*found none of them: unpack",
     ):
         NuScenes(tmp_path).sequences()
 
@@ -505,18 +597,26 @@ def test_text_that_is_no_table_is_named(tmp_path, text, message):
 def test_text_of_another_encoding_is_named(tmp_path):
     path = tmp_path / "table.json"
     path.write_bytes(b'[{"token": "\xff"}]')
-    with pytest.raises(FormatError, match=r"table.json: expected a JSON list of objects, found something else .*utf-8"):
+    with pytest.raises(
+        FormatError,
+        match=r"table.json: expected a JSON list of objects, found something else .*utf-8",
+    ):
         list(read_rows(path, ("token",)))
 
 
-def test_rows_of_a_large_table_need_little_memory_and_damage_in_it_is_found_at_once(tmp_path, monkeypatch):
+def test_rows_of_a_large_table_need_little_memory_and_damage_in_it_is_found_at_once(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr("carlasc_converters.json_rows._CHUNK", 1 << 12)
     monkeypatch.setattr("carlasc_converters.json_rows._LONGEST_ROW", 1 << 14)
     path = tmp_path / "table.json"
     rows = [{"token": f"{number:032x}", "other": [number, "text" * 10]} for number in range(20_000)]
     write_table(path, rows)
     tracemalloc.start()
-    count = sum(token == row["token"] for (token,), row in zip(read_rows(path, ("token",)), rows, strict=True))
+    count = sum(
+        token == row["token"]
+        for (token,), row in zip(read_rows(path, ("token",)), rows, strict=True)
+    )
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert count == len(rows)

@@ -17,7 +17,9 @@ ON_ITS_TRAILER = (
 
 
 class Overlapping(DriveConverter):
-    drive: ClassVar[SimulatedDrive] = SimulatedDrive(things=(*SimulatedDrive().things, *ON_ITS_TRAILER))
+    drive: ClassVar[SimulatedDrive] = SimulatedDrive(
+        things=(*SimulatedDrive().things, *ON_ITS_TRAILER)
+    )
     gives = frozenset({"boxes", "poses", "times"})
 
 
@@ -35,10 +37,15 @@ def test_what_an_interrupted_run_made_from_boxes_does_not_change_what_is_added_l
 
     (tmp_path / "drive").mkdir()
     sequence = run()
-    whole = {name: [sequence.read(name, frame) for frame in range(8)] for name in ("labels", "instances", "flow")}
+    whole = {
+        name: [sequence.read(name, frame) for frame in range(8)]
+        for name in ("labels", "instances", "flow")
+    }
     for path in (tmp_path / "out").rglob("predictions/*"):
         path.unlink()  # flow is written last
     again = run()
     for name, arrays in whole.items():
         for frame, array in enumerate(arrays):
-            np.testing.assert_array_equal(again.read(name, frame), array, err_msg=f"{name} of frame {frame}")
+            np.testing.assert_array_equal(
+                again.read(name, frame), array, err_msg=f"{name} of frame {frame}"
+            )

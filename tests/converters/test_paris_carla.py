@@ -49,9 +49,15 @@ def test_scans_are_the_groups_of_the_file_with_everything_that_was_written(town:
         assert cloud.origins is not None
         assert cloud.seconds is not None
         pose = trajectory.at(found.times())[frame.number]
-        np.testing.assert_allclose(transform_points(pose, cloud.points[:, :3]), in_world(truth), atol=1e-5)
-        np.testing.assert_allclose(transform_points(pose, cloud.origins), truth.world_T_sensor[:, :3, 3], atol=1e-5)
-        np.testing.assert_allclose(cloud.seconds, frame.number * DRIVE.period_s + truth.seconds - time, atol=1e-6)
+        np.testing.assert_allclose(
+            transform_points(pose, cloud.points[:, :3]), in_world(truth), atol=1e-5
+        )
+        np.testing.assert_allclose(
+            transform_points(pose, cloud.origins), truth.world_T_sensor[:, :3, 3], atol=1e-5
+        )
+        np.testing.assert_allclose(
+            cloud.seconds, frame.number * DRIVE.period_s + truth.seconds - time, atol=1e-6
+        )
         np.testing.assert_array_equal(cloud.labels, TAG_OF_KIND[truth.kinds])
         expected = np.where(truth.instances > 0, truth.instances + FIRST_ACTOR, 0)
         np.testing.assert_array_equal(cloud.instances, expected)
@@ -86,7 +92,9 @@ def test_a_vehicle_that_stands_keeps_its_heading() -> None:
 
 def test_the_rows_of_a_scan_may_be_in_several_places(town: Path, tmp_path: Path) -> None:
     rows = [scan_rows(DRIVE, frame) for frame in range(DRIVE.frames)]
-    parts = [part for scan in rows[:4] for part in (scan[:100],)] + [scan[100:] for scan in rows[:4]]
+    parts = [part for scan in rows[:4] for part in (scan[:100],)] + [
+        scan[100:] for scan in rows[:4]
+    ]
     write_rows(tmp_path / "Town03.ply", np.concatenate(parts))
     found, whole = recording(tmp_path), recording(town)
     assert len(found.frames) == 4
@@ -101,7 +109,11 @@ def test_towns_are_found_below_the_folder_with_the_splits_of_the_paper(tmp_path:
         (tmp_path / "CARLA" / name).mkdir(parents=True)
         write_rows(tmp_path / "CARLA" / name / f"{name}.ply", rows)
     found = {town.name: town.split for town in ParisCarla3D(tmp_path).sequences()}
-    assert found == {"PARISCARLA_Town01": "Test", "PARISCARLA_Town02": "Train", "PARISCARLA_Town06": "Val"}
+    assert found == {
+        "PARISCARLA_Town01": "Test",
+        "PARISCARLA_Town02": "Train",
+        "PARISCARLA_Town06": "Val",
+    }
 
 
 def test_notes_say_what_the_licence_forbids(town: Path) -> None:
@@ -110,7 +122,12 @@ def test_notes_say_what_the_licence_forbids(town: Path) -> None:
 
 def test_a_conversion_keeps_points_times_and_where_rays_began(town: Path, tmp_path: Path) -> None:
     result = convert(
-        "paris-carla-3d", town.parent, tmp_path, layout=LayoutOptions(axes="right"), grids=None, run=Run(workers=1)
+        "paris-carla-3d",
+        town.parent,
+        tmp_path,
+        layout=LayoutOptions(axes="right"),
+        grids=None,
+        run=Run(workers=1),
     )
     assert result.failures == ()
     assert any("CC BY-NC-ND" in note for note in result.notes)
@@ -139,7 +156,9 @@ def test_an_interrupted_conversion_goes_on_to_the_same_bytes(town: Path, tmp_pat
     result = convert("paris-carla-3d", town, tmp_path / "broken", grids=None, run=Run(workers=1))
     assert result.made == 1
     for path in (path for path in (tmp_path / "whole").rglob("*") if path.is_file()):
-        assert (tmp_path / "broken" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
+        assert (
+            tmp_path / "broken" / path.relative_to(tmp_path / "whole")
+        ).read_bytes() == path.read_bytes()
 
 
 def text_file(path: Path) -> None:
@@ -180,13 +199,18 @@ def no_times(path: Path) -> None:
         (scattered, "the rows of each scan (index_frame) one after the other"),
         (
             no_times,
-            f"expected times that increase from scan to scan, found none from scan {FIRST_SCAN} to {FIRST_SCAN + 1}",
+            f"expected times that increase from scan to scan, found none from scan {FIRST_SCAN} "
+            f"to {FIRST_SCAN + 1}",
         ),
     ],
 )
 def test_a_wrong_file_is_named_in_one_line(tmp_path: Path, spoil: object, message: str) -> None:
     assert callable(spoil)
-    spoil(path := write_town(tmp_path / "Town03.ply", SimulatedDrive(frames=1, rolling=True, channels=4, columns=20)))
+    spoil(
+        path := write_town(
+            tmp_path / "Town03.ply", SimulatedDrive(frames=1, rolling=True, channels=4, columns=20)
+        )
+    )
     with pytest.raises(CarlascError) as error:
         recording(path).frames[0].read()
     assert isinstance(error.value, FormatError)
@@ -214,7 +238,9 @@ print(len(frames), points, peak // 1024, round(indexed, 1), round(time.perf_coun
 
 
 def write_large(path: Path, scans: int, points: int) -> None:
-    """Write a file of `scans` times `points` rows, in which only what the index needs differs from 0."""
+    """Write a file of `scans` times `points` rows, in which only what the index needs differs from
+    0.
+    """
     with path.open("wb") as file:
         file.write(header(scans * points))
         rows = np.zeros(points, ROW)
@@ -225,7 +251,9 @@ def write_large(path: Path, scans: int, points: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the peak memory of a process from Linux")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="reads the peak memory of a process from Linux"
+)
 def test_a_large_file_is_read_in_little_memory(tmp_path: Path) -> None:
     path = tmp_path / "Town01.ply"
     write_large(path, 400, 50_000)  # 20 million points, 1 GB

@@ -19,7 +19,15 @@ def vertices(count: int = 11) -> np.ndarray:
     return rows
 
 
-def write(path: Path, rows: np.ndarray, kind: str, *, extra: str = "", before: bytes = b"", after: bytes = b"") -> Path:
+def write(
+    path: Path,
+    rows: np.ndarray,
+    kind: str,
+    *,
+    extra: str = "",
+    before: bytes = b"",
+    after: bytes = b"",
+) -> Path:
     head = f"ply\nformat {kind} 1.0\ncomment made by a test\n{extra}element vertex {len(rows)}\n{HEADER}end_header\n"
     if kind == "ascii":
         body = "".join(f"{r['x']!s} {r['y']!s} {r['label']} {r['red']}\n" for r in rows).encode()
@@ -38,7 +46,9 @@ def test_every_kind_gives_the_rows_that_were_written(tmp_path: Path, kind: str, 
     for name in DTYPE.names or ():
         np.testing.assert_array_equal(ply.read()[name], rows[name])
     chunks = [np.array(chunk[["x", "red"]].tolist()) for chunk in ply.chunks(4)]
-    assert [len(chunk) for chunk in chunks] == [min(4, count - start) for start in range(0, count, 4)]
+    assert [len(chunk) for chunk in chunks] == [
+        min(4, count - start) for start in range(0, count, 4)
+    ]
     if count:
         np.testing.assert_array_equal(np.concatenate(chunks), np.array(rows[["x", "red"]].tolist()))
 
@@ -52,8 +62,12 @@ def test_rows_of_a_binary_file_are_read_alone_in_another_process(tmp_path: Path)
     assert len(again.rows(7, 7)) == 0
 
 
-@pytest.mark.parametrize(("kind", "before"), [("binary_little_endian", b"\x01\x02" * 8), ("ascii", b"1 2\n3 4\n")])
-def test_elements_before_and_after_the_vertices_are_passed_over(tmp_path: Path, kind: str, before: bytes) -> None:
+@pytest.mark.parametrize(
+    ("kind", "before"), [("binary_little_endian", b"\x01\x02" * 8), ("ascii", b"1 2\n3 4\n")]
+)
+def test_elements_before_and_after_the_vertices_are_passed_over(
+    tmp_path: Path, kind: str, before: bytes
+) -> None:
     rows = vertices()
     extra = "element camera 2\nproperty float a\nproperty float b\n"
     path = write(tmp_path / "a.ply", rows, kind, extra=extra, before=before, after=b"1 2\n")
@@ -71,11 +85,21 @@ def test_elements_before_and_after_the_vertices_are_passed_over(tmp_path: Path, 
         (b"ply\nformat binary_middle 1.0\nend_header\n", "'format binary_middle 1.0'"),
         (b"ply\nformat ascii 1.0\nproperty float x\nend_header\n", "'property float x'"),
         (b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "'element vertex many'"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty half x\nend_header\n1\n", "half for the property x"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int n\nend_header\n1 1\n", "the list n"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n1 1\n", "properties with names of their own"),
         (
-            b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int n\nelement vertex 0\nproperty int x\nend_header\n",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty half x\nend_header\n1\n",
+            "half for the property x",
+        ),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int n\nend_header\n1 1\n",
+            "the list n",
+        ),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n1 1\n",
+            "properties with names of their own",
+        ),
+        (
+            b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int n\nelement vertex "
+            b"0\nproperty int x\nend_header\n",
             "found face before them",
         ),
     ],
@@ -95,12 +119,16 @@ def test_a_wrong_header_is_one_line(tmp_path: Path, content: bytes, message: str
 def test_a_body_that_is_cut_short_is_refused(tmp_path: Path, kind: str, cut: int) -> None:
     path = write(tmp_path / "a.ply", vertices(), kind)
     content = path.read_bytes()
-    path.write_bytes(content[:-cut] if kind != "ascii" else b"\n".join(content.split(b"\n")[: -cut // 3]))
+    path.write_bytes(
+        content[:-cut] if kind != "ascii" else b"\n".join(content.split(b"\n")[: -cut // 3])
+    )
     with pytest.raises(FormatError, match=r"the file is incomplete"):
         PlyVertices.open(path).read()
 
 
-@pytest.mark.parametrize("line", [b"1 2 three 4\n", b"1 2\n", b"1 2 3 4 5\n", "1 2 3 4\u00b5\n".encode()])
+@pytest.mark.parametrize(
+    "line", [b"1 2 three 4\n", b"1 2\n", b"1 2 3 4 5\n", "1 2 3 4\u00b5\n".encode()]
+)
 def test_text_that_is_no_number_is_refused(tmp_path: Path, line: bytes) -> None:
     path = write(tmp_path / "a.ply", vertices(), "ascii")
     lines = path.read_bytes().splitlines(keepends=True)

@@ -1,4 +1,6 @@
-"""Points of any layout: holes, rows with padding, either order of bytes, and layouts that cannot be."""
+"""Points of any layout: holes, rows with padding, either order of bytes, and layouts that cannot
+be.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +24,11 @@ def points_of(count, layout=LAYOUT):
     random = np.random.default_rng(1)
     points = np.zeros(count, layout)
     for name in layout.names:
-        points[name] = random.integers(-100, 100, count) if layout[name].kind == "i" else random.random(count) * 100
+        points[name] = (
+            random.integers(-100, 100, count)
+            if layout[name].kind == "i"
+            else random.random(count) * 100
+        )
     return points
 
 
@@ -40,15 +46,24 @@ def test_every_field_comes_back_to_the_bit(big_endian, height, padding):
 def test_data_of_another_size_are_named():
     message = Messages("bag").cloud("/points", 1, points_of(6, VELODYNE))[3]
     message.data = message.data[:-1]
-    with pytest.raises(FormatError, match="message: expected 1 rows of 6 points of 32 bytes, found 191 bytes"):
+    with pytest.raises(
+        FormatError, match="message: expected 1 rows of 6 points of 32 bytes, found 191 bytes"
+    ):
         read_columns(message, "message")
 
 
 def test_a_field_outside_of_the_point_is_named():
-    with pytest.raises(FormatError, match="expected points of 8 bytes, found the field z up to byte 12"):
+    with pytest.raises(
+        FormatError, match="expected points of 8 bytes, found the field z up to byte 12"
+    ):
         unpack_fields(np.zeros(8, np.uint8), [("x", 0, "f4", 1), ("z", 8, "f4", 1)], 8, "message")
 
 
 def test_fields_of_several_values_or_of_unknown_types_are_left_out():
-    fields = [("x", 0, "f4", 1), ("descriptor", 4, "f4", 2), ("other", 4, "<V", 1), ("", 4, "f4", 1)]
+    fields = [
+        ("x", 0, "f4", 1),
+        ("descriptor", 4, "f4", 2),
+        ("other", 4, "<V", 1),
+        ("", 4, "f4", 1),
+    ]
     assert list(unpack_fields(np.zeros(12, np.uint8), fields, 12, "message")) == ["x"]

@@ -24,7 +24,9 @@ def test_the_unit_is_found_from_the_span_of_a_scan_and_times_come_back(unit, spa
 
 
 def test_a_span_that_no_lidar_has_asks_for_the_unit():
-    with pytest.raises(FormatError, match=r"x: times of points: expected a scan of 4 ms to 0.6 s .* `time_unit`"):
+    with pytest.raises(
+        FormatError, match=r"x: times of points: expected a scan of 4 ms to 0.6 s .* `time_unit`"
+    ):
         point_seconds(np.array([0.0, 2.0]), "auto", "x")
     assert point_seconds(np.array([0.0, 2.0]), "s", "x")[0].tolist() == [0, 2]
     with pytest.raises(FormatError, match="finite"):
@@ -37,7 +39,12 @@ def test_a_column_that_nobody_filled_has_no_unit():
 
 
 def test_names_are_recognised_in_any_case_and_absent_intensity_is_zero():
-    columns = {"X": np.ones(2), "Y": np.ones(2), "Z": np.ones(2), "Reflectivity": np.array([3, 4], np.uint16)}
+    columns = {
+        "X": np.ones(2),
+        "Y": np.ones(2),
+        "Z": np.ones(2),
+        "Reflectivity": np.array([3, 4], np.uint16),
+    }
     assert named_fields(columns, "x")["points"].tolist() == [[1, 1, 1, 3], [1, 1, 1, 4]]
     del columns["Reflectivity"]
     assert named_fields(columns | {"label": np.array([1.0, 2.0])}, "x")["label"].dtype == np.uint32

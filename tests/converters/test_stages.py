@@ -37,7 +37,8 @@ class UnposedBoxes(DriveConverter):
 class UnposedRolling(DriveConverter):
     gives = frozenset({"labels", "instances", "times"})
     drive = SimulatedDrive(
-        sensors=(Sensor("turns", SimulatedDrive().sensors[0].vehicle_T_sensor, deskewed=False),), rolling=True
+        sensors=(Sensor("turns", SimulatedDrive().sensors[0].vehicle_T_sensor, deskewed=False),),
+        rolling=True,
     )
 
 
@@ -45,7 +46,12 @@ def reads_of(converter, out, workers=1):
     DriveFrame.reads.clear()
     (out.parent / "nothing").mkdir(exist_ok=True)
     result = convert(
-        converter, out.parent / "nothing", out, grids=None, poses=PoseOptions(force=True), run=Run(workers)
+        converter,
+        out.parent / "nothing",
+        out,
+        grids=None,
+        poses=PoseOptions(force=True),
+        run=Run(workers),
     )
     assert result.failures == ()
     return sorted(DriveFrame.reads), result
@@ -91,18 +97,31 @@ class Memory(Sink):
 def test_a_store_that_cannot_be_read_back_gets_the_same(tmp_path):
     sink = Memory()
     (tmp_path / "nothing").mkdir()
-    convert(Boxed, tmp_path / "nothing", sink, poses=PoseOptions(force=True), grids=None, run=Run(workers=1))
+    convert(
+        Boxed,
+        tmp_path / "nothing",
+        sink,
+        poses=PoseOptions(force=True),
+        grids=None,
+        run=Run(workers=1),
+    )
     reads_of(Boxed, tmp_path / "out")
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
     for name in sequence.fields():
         for frame in FRAMES:
-            np.testing.assert_array_equal(sink.writer.fields[name, frame], sequence.read(name, frame))
+            np.testing.assert_array_equal(
+                sink.writer.fields[name, frame], sequence.read(name, frame)
+            )
 
 
 def test_two_workers_write_the_same_bytes(tmp_path):
     reads_of(Boxed, tmp_path / "one")
     reads_of(Boxed, tmp_path / "two", workers=2)
-    files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*") if path.is_file())
+    files = sorted(
+        path.relative_to(tmp_path / "one")
+        for path in (tmp_path / "one").rglob("*")
+        if path.is_file()
+    )
     assert files
     for path in files:
         assert (tmp_path / "one" / path).read_bytes() == (tmp_path / "two" / path).read_bytes()
@@ -137,7 +156,9 @@ class Sparse(Unposed):
         (recording,) = super().sequences()
         handle = recording.frames[3]
         read = handle.read
-        handle.read = lambda: [replace(read()[0], points=read()[0].points[:20], labels=None, instances=None)]
+        handle.read = lambda: [
+            replace(read()[0], points=read()[0].points[:20], labels=None, instances=None)
+        ]
         return [recording]
 
 
@@ -146,4 +167,5 @@ def test_a_scan_with_too_few_points_gets_the_pose_of_the_frame_before(tmp_path):
     (sequence,) = carlasc.open(tmp_path / "out").sequences().values()
     assert len(sequence.read("points", 3)) == 20
     assert np.array_equal(sequence.poses[3], sequence.poses[2])
-    assert np.linalg.norm(sequence.poses[7, :3, 3]) == pytest.approx(7 * 0.6, abs=0.7)  # a few points, and a gap
+    # a few points, and a gap
+    assert np.linalg.norm(sequence.poses[7, :3, 3]) == pytest.approx(7 * 0.6, abs=0.7)

@@ -44,7 +44,9 @@ def test_every_point_is_in_one_tile_in_the_order_of_the_table(table: Path) -> No
     for frame, pose in zip(area.frames, area.poses().world_T_vehicle, strict=True):
         (cloud,) = pickle.loads(pickle.dumps(frame)).read()
         inside = (np.abs(truth[:, :2] - pose[:2, 3]) < np.float32(25.6)).all(axis=1)
-        np.testing.assert_allclose(transform_points(pose, cloud.points[:, :3]), truth[inside], atol=2e-6)
+        np.testing.assert_allclose(
+            transform_points(pose, cloud.points[:, :3]), truth[inside], atol=2e-6
+        )
         np.testing.assert_array_equal(cloud.labels, labels[inside] + 1)
         assert cloud.points.dtype == np.float32
         done += len(cloud.points)
@@ -55,12 +57,15 @@ def test_tiles_lie_on_a_lattice_above_their_ground(table: Path) -> None:
     places = recording(table).poses().world_T_vehicle[:, :3, 3]
     step = 2 * float(np.float32(25.6))
     np.testing.assert_allclose(places[:, :2] / step % 1, 0.5, atol=1e-9)
-    np.testing.assert_allclose(places[:, 2], CORNER[2] + 1.8, atol=1e-6)  # also of the tiles without ground points
+    # also of the tiles without ground points
+    np.testing.assert_allclose(places[:, 2], CORNER[2] + 1.8, atol=1e-6)
     assert recording(table).sensors[0].height_m == pytest.approx(1.8)
 
 
 @pytest.mark.parametrize("grid", ["coarse", "fine"])
-def test_voxels_have_the_class_of_most_of_their_points_and_nothing_is_free(table: Path, grid: str) -> None:
+def test_voxels_have_the_class_of_most_of_their_points_and_nothing_is_free(
+    table: Path, grid: str
+) -> None:
     area = recording(table, grid=grid)
     spec = GridSpec.published(grid)
     assert area.voxels == spec
@@ -71,14 +76,18 @@ def test_voxels_have_the_class_of_most_of_their_points_and_nothing_is_free(table
     assert content is not None
     assert cloud.labels is not None
     votes: dict[int, Counter[int]] = {}
-    for cell, label in zip(spec.flat_index(cloud.points[:, :3]).tolist(), cloud.labels.tolist(), strict=True):
+    for cell, label in zip(
+        spec.flat_index(cloud.points[:, :3]).tolist(), cloud.labels.tolist(), strict=True
+    ):
         if cell >= 0:
             votes.setdefault(cell, Counter())[label] += 1
     assert len(votes) > 100
     np.testing.assert_array_equal(np.flatnonzero(content.known), sorted(votes))
     for cell, counts in votes.items():
         most = max(counts.values())
-        assert content.labels.flat[cell] == min(label for label, count in counts.items() if count == most)
+        assert content.labels.flat[cell] == min(
+            label for label, count in counts.items() if count == most
+        )
     assert (content.labels[content.known] > 0).all()
     assert (content.labels[~content.known] == 0).all()
 
@@ -107,21 +116,29 @@ def test_the_size_of_row_groups_makes_no_difference(table: Path, tmp_path: Path,
         {"x": "pos_x", "y": "Pos_Y", "z": "posZ", "label": "label_id"},
     ],
 )
-def test_columns_are_found_by_usual_names(table: Path, tmp_path: Path, names: dict[str, str]) -> None:
+def test_columns_are_found_by_usual_names(
+    table: Path, tmp_path: Path, names: dict[str, str]
+) -> None:
     other = recording(write_area(tmp_path / "area_3.parquet", DRIVE, names=names))
-    np.testing.assert_array_equal(other.frames[1].read()[0].points, recording(table).frames[1].read()[0].points)
+    np.testing.assert_array_equal(
+        other.frames[1].read()[0].points, recording(table).frames[1].read()[0].points
+    )
 
 
 def test_an_option_names_columns(table: Path) -> None:
     noisy = recording(table, columns="x=x_noise, y=y_noise,z=z_noise")
-    difference = noisy.poses().world_T_vehicle[0, 2, 3] - recording(table).poses().world_T_vehicle[0, 2, 3]
+    difference = (
+        noisy.poses().world_T_vehicle[0, 2, 3] - recording(table).poses().world_T_vehicle[0, 2, 3]
+    )
     assert difference == pytest.approx(0.005, abs=1e-6)
     assert recording(table, columns="label=label").columns["label"] == "label"
 
 
 @pytest.mark.parametrize("text", ["x", "x=", "x=a,x=b", "w=a", ""])
 def test_an_option_that_names_nothing_is_refused(table: Path, text: str) -> None:
-    with pytest.raises(ArgumentError, match="columns: expected x=NAME,y=NAME,z=NAME,label=NAME, or some of these"):
+    with pytest.raises(
+        ArgumentError, match="columns: expected x=NAME,y=NAME,z=NAME,label=NAME, or some of these"
+    ):
         recording(table, columns=text)
 
 
@@ -137,12 +154,20 @@ def test_the_temporary_folder_goes_with_the_frames(table: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_temporary_folder_is_deleted_when_the_process_ends_early(table: Path, tmp_path: Path) -> None:
-    code = "import sys; from pathlib import Path; from carlasc_converters.synthcity import SynthCity\n"
+def test_the_temporary_folder_is_deleted_when_the_process_ends_early(
+    table: Path, tmp_path: Path
+) -> None:
+    code = (
+        "import sys; from pathlib import Path; from carlasc_converters.synthcity import SynthCity\n"
+    )
     code += "frames = SynthCity(Path(sys.argv[1])).sequences()[0].frames; print(len(frames)); raise KeyboardInterrupt"
     environment = os.environ | {"TMPDIR": str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-c", code, str(table)], capture_output=True, text=True, env=environment, check=False
+        [sys.executable, "-c", code, str(table)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
     )
     assert int(done.stdout) > 4
     assert not list(tmp_path.iterdir())
@@ -152,11 +177,18 @@ def test_areas_are_found_below_the_folder(table: Path, tmp_path: Path) -> None:
     for area in ("area1", "area_2"):
         (tmp_path / area).mkdir()
         (tmp_path / area / f"{area}.parquet").write_bytes(table.read_bytes())
-    assert [area.name for area in SynthCity(tmp_path).sequences()] == ["SYNTHCITY_area1", "SYNTHCITY_area-2"]
+    assert [area.name for area in SynthCity(tmp_path).sequences()] == [
+        "SYNTHCITY_area1",
+        "SYNTHCITY_area-2",
+    ]
     with pytest.raises(MissingDataError, match="Parquet tables, one per area"):
         SynthCity(tmp_path / "none").sequences()
-    with pytest.raises(ArgumentError, match="grid: expected one of coarse, fine, found 'cylindrical'"):
-        convert("synthcity", tmp_path, tmp_path / "out", options={"grid": "cylindrical"}, run=Run(1))
+    with pytest.raises(
+        ArgumentError, match="grid: expected one of coarse, fine, found 'cylindrical'"
+    ):
+        convert(
+            "synthcity", tmp_path, tmp_path / "out", options={"grid": "cylindrical"}, run=Run(1)
+        )
 
 
 def test_notes_say_that_nothing_is_free(table: Path) -> None:
@@ -198,8 +230,12 @@ def test_a_conversion_in_other_processes_finds_the_tiles(table: Path, tmp_path: 
     assert result.made == len(recording(table).frames)
 
 
-def test_grids_from_scans_are_refused_because_nothing_is_known_to_be_free(table: Path, tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="grids: expected voxels or none, found scans for .*area_3.parquet"):
+def test_grids_from_scans_are_refused_because_nothing_is_known_to_be_free(
+    table: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(
+        ArgumentError, match="grids: expected voxels or none, found scans for .*area_3.parquet"
+    ):
         convert("synthcity", table, tmp_path / "out", run=Run(workers=1))
     assert not (tmp_path / "out").exists()
 
@@ -210,18 +246,29 @@ COLUMNS = {name: np.zeros(4) for name in ("x", "y", "z")} | {"label": np.zeros(4
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        (COLUMNS | {"label": np.array([0, 1, 9, 9])}, "expected labels 0 to 8 in the column label, found 9 in row 2"),
+        (
+            COLUMNS | {"label": np.array([0, 1, 9, 9])},
+            "expected labels 0 to 8 in the column label, found 9 in row 2",
+        ),
         (COLUMNS | {"label": np.array([0, -1, 0, 0])}, "found -1 in row 1"),
         (COLUMNS | {"label": np.array([0, 0.5, 0, 0])}, "found 0.5 in row 1"),
         (COLUMNS | {"label": ["road"] * 4}, "expected numbers in the column label, found string"),
         (COLUMNS | {"label": [1, None, 2, 3]}, "found nan in row 1"),
-        (COLUMNS | {"y": np.array([0, 0, 0, np.nan])}, "expected finite coordinates, found others in row 3"),
-        ({"x": np.zeros(4), "y": np.zeros(4)}, "expected one column z, found x, y: name the columns with the option"),
+        (
+            COLUMNS | {"y": np.array([0, 0, 0, np.nan])},
+            "expected finite coordinates, found others in row 3",
+        ),
+        (
+            {"x": np.zeros(4), "y": np.zeros(4)},
+            "expected one column z, found x, y: name the columns with the option",
+        ),
         (COLUMNS | {"Class": np.zeros(4)}, "expected one column label, found label, Class"),
         ({name: column[:0] for name, column in COLUMNS.items()}, "expected points, found none"),
     ],
 )
-def test_a_wrong_table_is_named_in_one_line(tmp_path: Path, columns: dict[str, np.ndarray], message: str) -> None:
+def test_a_wrong_table_is_named_in_one_line(
+    tmp_path: Path, columns: dict[str, np.ndarray], message: str
+) -> None:
     path = tmp_path / "area1.parquet"
     pq.write_table(pa.table(columns), path)
     with pytest.raises(CarlascError) as error:
@@ -265,15 +312,21 @@ def write_large(path: Path, millions: int) -> None:
     with pq.ParquetWriter(path, schema) as writer:
         x, y, z = rng.uniform(0, 1000, (3, millions * 10**6))
         label = rng.integers(0, 9, len(x))
-        writer.write_table(pa.table({"x": x, "y": y, "z": z / 100, "label": label}), row_group_size=len(x))
+        writer.write_table(
+            pa.table({"x": x, "y": y, "z": z / 100, "label": label}), row_group_size=len(x)
+        )
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the peak memory of a process from Linux")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="reads the peak memory of a process from Linux"
+)
 def test_a_large_area_is_cut_in_little_memory(tmp_path: Path) -> None:
     path = tmp_path / "area1.parquet"
     write_large(path, 8)
-    done = subprocess.run([sys.executable, "-c", MEASURE, str(path)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", MEASURE, str(path)], capture_output=True, text=True, check=True
+    )
     frames, points, peak_mib = map(int, done.stdout.split()[:3])
     assert (frames, points) == (400, 8_000_000)
     assert peak_mib < 350  # most of it is Python with NumPy, numba and pyarrow

@@ -9,7 +9,9 @@ from carlasc.errors import FormatError
 
 
 def placed(parent, child, pose, stamp_ns=0):
-    return PlacedFrame(stamp_ns, parent, child, (*pose[:3, 3], *quaternions_of(pose[None, :3, :3])[0]))
+    return PlacedFrame(
+        stamp_ns, parent, child, (*pose[:3, 3], *quaternions_of(pose[None, :3, :3])[0])
+    )
 
 
 BASE_T_MAST, MAST_T_LIDAR, BASE_T_REAR = (
@@ -22,7 +24,11 @@ BASE_T_MAST, MAST_T_LIDAR, BASE_T_REAR = (
 @pytest.fixture
 def tree():
     tree = FrameTree("drive.bag")
-    for row in (("base", "mast", BASE_T_MAST), ("mast", "lidar", MAST_T_LIDAR), ("base", "rear", BASE_T_REAR)):
+    for row in (
+        ("base", "mast", BASE_T_MAST),
+        ("mast", "lidar", MAST_T_LIDAR),
+        ("base", "rear", BASE_T_REAR),
+    ):
         tree.add(placed(*row))
     for second in range(3):
         tree.add(placed("odom", "base", translation((second, 0, 0)), second * 10**9))
@@ -31,8 +37,12 @@ def tree():
 
 def test_frames_are_found_up_across_and_down(tree):
     at = np.array([0])
-    np.testing.assert_allclose(tree.lookup("base", "lidar", at)[0], BASE_T_MAST @ MAST_T_LIDAR, atol=1e-12)
-    np.testing.assert_allclose(tree.lookup("lidar", "base", at)[0], invert(BASE_T_MAST @ MAST_T_LIDAR), atol=1e-12)
+    np.testing.assert_allclose(
+        tree.lookup("base", "lidar", at)[0], BASE_T_MAST @ MAST_T_LIDAR, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        tree.lookup("lidar", "base", at)[0], invert(BASE_T_MAST @ MAST_T_LIDAR), atol=1e-12
+    )
     across = invert(BASE_T_REAR) @ BASE_T_MAST @ MAST_T_LIDAR
     np.testing.assert_allclose(tree.lookup("rear", "lidar", at)[0], across, atol=1e-12)
     np.testing.assert_allclose(tree.lookup("rear", "rear", at)[0], np.eye(4))
@@ -52,7 +62,10 @@ def test_frames_without_a_path_are_not_connected_and_the_tree_names_them(tree):
 
 def test_a_circle_is_named(tree):
     tree.add(placed("lidar", "odom", np.eye(4)))
-    with pytest.raises(FormatError, match="expected a tree of frames, found a circle: lidar, mast, base, odom, lidar"):
+    with pytest.raises(
+        FormatError,
+        match="expected a tree of frames, found a circle: lidar, mast, base, odom, lidar",
+    ):
         tree.ancestors("lidar")
 
 

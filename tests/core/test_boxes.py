@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 
 from carlasc import Boxes
 from carlasc.core.boxes import BOXES_DTYPE
-from carlasc.core.geometry import quaternions_of, rotation_z, rotations_of, transform_points, translation
+from carlasc.core.geometry import (
+    quaternions_of,
+    rotation_z,
+    rotations_of,
+    transform_points,
+    translation,
+)
 from carlasc.errors import FormatError
 
 
@@ -39,15 +45,24 @@ def test_quaternions_and_rotations_are_each_others_inverse(seed):
 
 
 def test_half_turns_have_quaternions_too():
-    turns = np.stack([np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])]).astype(float)
+    turns = np.stack(
+        [np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
+    ).astype(float)
     assert quaternions_of(turns).tolist() == np.eye(4).tolist()
-    assert np.allclose(rotations_of(np.array([[np.cos(0.3), 0, 0, np.sin(0.3)]]))[0], rotation_z(0.6)[:3, :3])
+    assert np.allclose(
+        rotations_of(np.array([[np.cos(0.3), 0, 0, np.sin(0.3)]]))[0], rotation_z(0.6)[:3, :3]
+    )
 
 
 def test_a_point_is_inside_by_the_axes_of_the_box():
     boxes = some_boxes()
-    points = np.array([[10, 1.9, -1], [11.9, 0, -1], [10, 4, -0.2], [10.9, 2.1, -1], [10, 0, -1.74]], np.float32)
-    assert boxes.contains(points).tolist() == [[True, False, False, False, True], [False, False, True, False, False]]
+    points = np.array(
+        [[10, 1.9, -1], [11.9, 0, -1], [10, 4, -0.2], [10.9, 2.1, -1], [10, 0, -1.74]], np.float32
+    )
+    assert boxes.contains(points).tolist() == [
+        [True, False, False, False, True],
+        [False, False, True, False, False],
+    ]
     assert boxes.contains(points, 0.2)[0].tolist() == [True, False, False, True, True]
     assert boxes.contains(points, -0.2)[0].tolist() == [False] * 5
     assert boxes.contains(points, -3.0).sum() == 0
@@ -58,7 +73,9 @@ def test_a_point_in_two_boxes_belongs_to_the_smaller_one():
     boxes = some_boxes()
     inner = replace(boxes, centers=np.tile([10.0, 0, -1], (2, 1)))
     assert inner.owners(np.array([[10.0, 0, -1], [10, 1.5, -1]])).tolist() == [1, 0]
-    assert inner.select(np.array([1, 0])).owners(np.array([[10.0, 0, -1], [10, 1.5, -1]])).tolist() == [0, 1]
+    assert inner.select(np.array([1, 0])).owners(
+        np.array([[10.0, 0, -1], [10, 1.5, -1]])
+    ).tolist() == [0, 1]
 
 
 @given(st.integers(0, 1000))
@@ -93,11 +110,16 @@ def test_select_takes_boxes_by_mask_and_by_index():
     [
         ({"sizes": np.ones((1, 3))}, r"boxes: sizes: expected shape \(2, 3\), found \(1, 3\)"),
         ({"labels": np.array([1, 2])}, "boxes: labels: expected unsigned integers, found int64"),
-        ({"centers": np.array([[0, 0, 0], [1, np.nan, 2]])}, r"centers: expected finite.*nan, 2.0\] in box 1 \(track 3\)"),
-        ({"sizes": np.array([[1, 1, 0], [1, 1, 1.0]])}, r"sizes: expected positive.*in box 0 \(track 7\)"),
-        ({"quaternions": np.array([[1, 0, 0, 0], [1, 0, 0, 0.1]])}, "quaternions: expected a rotation.*in box 1"),
-        ({"tracks": np.array([0, 3], np.uint32)}, "tracks: expected numbers above 0, found 0 in box 0"),
-        ({"tracks": np.array([3, 3], np.uint32)}, r"one box per track in a frame, found 3 in box 1 \(track 3\)"),
+        ({"centers": np.array([[0, 0, 0], [1, np.nan, 2]])}, r"centers: expected finite.*nan, "
+                                                             r"2.0\] in box 1 \(track 3\)"),
+        ({"sizes": np.array([[1, 1, 0], [1, 1, 1.0]])}, r"sizes: expected positive.*in box 0 "
+                                                        r"\(track 7\)"),
+        ({"quaternions": np.array([[1, 0, 0, 0], [1, 0, 0, 0.1]])}, "quaternions: expected a "
+                                                                    "rotation.*in box 1"),
+        ({"tracks": np.array([0, 3], np.uint32)}, "tracks: expected numbers above 0, found 0 in "
+                                                  "box 0"),
+        ({"tracks": np.array([3, 3], np.uint32)}, r"one box per track in a frame, found 3 in box "
+                                                  r"1 \(track 3\)"),
     ],
 )  # fmt: skip
 def test_boxes_that_make_no_sense_are_refused(change, message):

@@ -53,7 +53,9 @@ def test_points_are_projected_as_opencv_says(lens):
             scale = (t + k[0] * t**3 + k[1] * t**5 + k[2] * t**7 + k[3] * t**9) / r
             u, v = a * scale, b * scale
         else:
-            f = (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3) / (1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3)
+            f = (1 + k[0] * r2 + k[1] * r2**2 + k[4] * r2**3) / (
+                1 + k[5] * r2 + k[6] * r2**2 + k[7] * r2**3
+            )
             u = a * f + 2 * k[2] * a * b + k[3] * (r2 + 2 * a * a)
             v = b * f + k[2] * (r2 + 2 * b * b) + 2 * k[3] * a * b
         expected = (K @ (u, v, 1))[:2]
@@ -63,8 +65,10 @@ def test_points_are_projected_as_opencv_says(lens):
 def test_what_is_behind_or_beyond_the_lens_has_no_pixel():
     points = np.array([[0, 0, -1.0], [0, 0, 0.0], [3, 0, 1.0]])
     assert np.isnan(camera().project(points)[:2]).all()
-    assert np.isnan(camera(*LENSES["kitti"]).project(points)).all()  # the last one would come back into the image
-    assert np.isfinite(camera(*LENSES["fisheye"]).project(np.array([[1.0, 0, -0.1]]))).all()  # wider than half a turn
+    # the last one would come back into the image
+    assert np.isnan(camera(*LENSES["kitti"]).project(points)).all()
+    # wider than half a turn
+    assert np.isfinite(camera(*LENSES["fisheye"]).project(np.array([[1.0, 0, -0.1]]))).all()
 
 
 @pytest.mark.parametrize("axes", ["left", "right"])
@@ -102,7 +106,9 @@ def test_what_is_no_camera_is_refused_in_one_line(change, expected):
     with pytest.raises(FormatError, match=expected) as error:
         camera(**change)
     assert "\n" not in str(error.value)
-    about = camera().to_dict() | {name: np.asarray(value).tolist() for name, value in change.items()}
+    about = camera().to_dict() | {
+        name: np.asarray(value).tolist() for name, value in change.items()
+    }
     with pytest.raises(FormatError, match="cameras.json"):
         CameraModel.from_dict(about, "cameras.json")
 

@@ -16,7 +16,9 @@ GRIDS = [
 
 
 def points_at_edges(spec):
-    """Random points, and points on and beside every edge of an axis, where the two others are in the middle of the grid."""
+    """Random points, and points on and beside every edge of an axis, where the two others are in
+    the middle of the grid.
+    """
     rng = np.random.default_rng(0)
     reach = [max(abs(low), abs(up)) * 1.2 for low, up in zip(spec.lower, spec.upper, strict=True)]
     points = [rng.uniform(-1, 1, (2000, 3)) * (reach[0], reach[0], reach[2]), np.zeros((1, 3))]
@@ -46,7 +48,9 @@ def test_points_that_are_not_numbers_are_outside():
 
 def test_the_fast_azimuth_is_within_its_error():
     rng = np.random.default_rng(1)
-    corners = [(x, y) for x in (-1, -0.0, 0.0, 1e-30, 1) for y in (-1, -0.0, 0.0, 1e-30, 1) if x or y]
+    corners = [
+        (x, y) for x in (-1, -0.0, 0.0, 1e-30, 1) for y in (-1, -0.0, 0.0, 1e-30, 1) if x or y
+    ]
     angles = np.linspace(-np.pi, np.pi, 1601)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     for x, y in np.concatenate([corners, circle, rng.normal(scale=20, size=(3000, 2))]).tolist():
@@ -57,4 +61,6 @@ def test_the_fast_azimuth_is_within_its_error():
 
 def test_a_pose_as_scalars_moves_points_as_the_matrix_does():
     pose = translation((1, 2, 3)) @ rotation_z(0.3)
-    assert transform(as_pose(pose), 4.0, 5.0, 6.0) == pytest.approx(transform_points(pose, np.array([4.0, 5.0, 6.0])))
+    assert transform(as_pose(pose), 4.0, 5.0, 6.0) == pytest.approx(
+        transform_points(pose, np.array([4.0, 5.0, 6.0]))
+    )

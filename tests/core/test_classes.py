@@ -66,7 +66,8 @@ def test_remapping_refuses_just_the_ids_it_does_not_know(ids):
     if unknown:
         with pytest.raises(FormatError) as caught:
             remap(labels, "000000.label")
-        found = caught.value.found.split(", ")  # the whole list: the message leaves out the middle of a long one
+        # the whole list: the message leaves out the middle of a long one
+        found = caught.value.found.split(", ")
         assert found == [f"{i} ({n} times)" for i, n in sorted(unknown.items())]
     else:
         assert remap(labels).tolist() == [remap.mapping[i] for i in ids]
@@ -74,18 +75,34 @@ def test_remapping_refuses_just_the_ids_it_does_not_know(ids):
 
 def test_kitti_goes_to_carla_and_back_where_the_format_says_so():
     there, back = REMAPS["semantickitti_to_carla"], REMAPS["carla_to_semantickitti"]
-    assert there(np.array([10, 252, 31, 60, 44, 71, 99], np.uint16)).tolist() == [10, 10, 4, 6, 14, 9, 3]
+    assert there(np.array([10, 252, 31, 60, 44, 71, 99], np.uint16)).tolist() == [
+        10,
+        10,
+        4,
+        6,
+        14,
+        9,
+        3,
+    ]
     assert back(np.array([1, 6, 7, 10, 22], np.uint8)).tolist() == [50, 60, 40, 10, 72]
 
 
 def test_carla_0914_tags_become_ours():
-    assert REMAPS["carla0914_to_carla"](np.array([1, 3, 12, 14, 19, 28], np.uint32)).tolist() == [7, 1, 4, 10, 10, 17]
+    assert REMAPS["carla0914_to_carla"](np.array([1, 3, 12, 14, 19, 28], np.uint32)).tolist() == [
+        7,
+        1,
+        4,
+        10,
+        10,
+        17,
+    ]
 
 
 def test_ids_beyond_the_vote_channels_are_named():
     CARLA.check(np.array([0, 24], np.uint32), "a.label")
     with pytest.raises(
-        FormatError, match=r"a.label: expected class ids 0..24 \(table carla\), found 30 in 2 of 3 labels"
+        FormatError,
+        match=r"a.label: expected class ids 0..24 \(table carla\), found 30 in 2 of 3 labels",
     ):
         CARLA.check(np.array([0, 30, 30], np.uint32), "a.label")
 
@@ -111,7 +128,10 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do():
 
 
 def test_a_table_must_colour_what_it_names():
-    with pytest.raises(ArgumentError, match="expected a name and a colour for each id, found only one of them for 0"):
+    with pytest.raises(
+        ArgumentError,
+        match="expected a name and a colour for each id, found only one of them for 0",
+    ):
         ClassTable("t", {0: "a"}, {})
     with pytest.raises(ArgumentError, match="3 -> 99"):
         Remap("r", CARLA, CARLASC11, {3: 99})
@@ -122,7 +142,10 @@ def test_a_table_must_colour_what_it_names():
     [
         ({"names": {-1: "a"}, "colors": {-1: (0, 0, 0)}}, "expected names of ids 0..65535"),
         ({"names": {70000: "a"}, "colors": {70000: (0, 0, 0)}}, "expected names of ids 0..65535"),
-        ({"colors": {0: (0, 0, 256)}}, r"expected three values 0..255 for each colour, found \(0, 0, 256\) for 0"),
+        (
+            {"colors": {0: (0, 0, 256)}},
+            r"expected three values 0..255 for each colour, found \(0, 0, 256\) for 0",
+        ),
         ({"ground": frozenset({1})}, "expected ids of the table in ground, found 1"),
         ({"moving": frozenset({2})}, "expected ids of the table in moving, found 2"),
         ({"geometry_only": 1}, "expected an id of the table in geometry_only, found 1"),
@@ -140,15 +163,26 @@ def test_a_table_that_contradicts_itself_is_refused(values, message):
 @pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
 def test_tables_come_back_from_json(table):
     assert ClassTable.from_dict(json.loads(json.dumps(table.to_dict())), "a.json") == table
-    assert table_from_json(table.to_dict(), "a.json") is table_from_json(table_to_json(table), "a.json") is table
+    assert (
+        table_from_json(table.to_dict(), "a.json")
+        is table_from_json(table_to_json(table), "a.json")
+        is table
+    )
 
 
-LAB = {"name": "lab", "names": {"0": "none", "7": "floor"}, "colors": {"0": [0, 0, 0], "7": [1, 2, 3]}, "ground": [7]}
+LAB = {
+    "name": "lab",
+    "names": {"0": "none", "7": "floor"},
+    "colors": {"0": [0, 0, 0], "7": [1, 2, 3]},
+    "ground": [7],
+}
 
 
 def test_a_table_of_ones_own_is_kept_whole():
     table = table_from_json(LAB, "a.json")
-    assert table == ClassTable("lab", {0: "none", 7: "floor"}, {0: (0, 0, 0), 7: (1, 2, 3)}, ground=frozenset({7}))
+    assert table == ClassTable(
+        "lab", {0: "none", 7: "floor"}, {0: (0, 0, 0), 7: (1, 2, 3)}, ground=frozenset({7})
+    )
     assert (table.num_channels, table.geometry_id) == (8, 7)
     assert table_to_json(table) == LAB | {"num_channels": 8}
 
@@ -161,10 +195,22 @@ def test_a_table_of_ones_own_is_kept_whole():
             {"colors": {"0": [0, 0, 0]}},
             "a.json: class table lab: expected a name and a colour for each id, found .* for 7",
         ),
-        ({"colors": {"0": [0, 0], "7": [0, 0, 0]}}, "a.json: classes: expected names and colours by id"),
-        ({"movable": [9]}, "a.json: class table lab: expected ids of the table in movable, found 9"),
-        ({"moveable": [7]}, "a.json: classes: expected only the keys name, names, .*found moveable"),
-        ({"name": "carla"}, "a.json: classes: expected a name that is not in use.*give the table a new name"),
+        (
+            {"colors": {"0": [0, 0], "7": [0, 0, 0]}},
+            "a.json: classes: expected names and colours by id",
+        ),
+        (
+            {"movable": [9]},
+            "a.json: class table lab: expected ids of the table in movable, found 9",
+        ),
+        (
+            {"moveable": [7]},
+            "a.json: classes: expected only the keys name, names, .*found moveable",
+        ),
+        (
+            {"name": "carla"},
+            "a.json: classes: expected a name that is not in use.*give the table a new name",
+        ),
     ],
 )
 def test_a_damaged_table_in_a_file_is_named(change, message):
@@ -182,7 +228,10 @@ def test_ground_and_actors_have_roles_in_every_table():
     assert [CARLA.names[i] for i in sorted(CARLA.ground)] == (
         ["RoadLine", "Road", "Sidewalk", "Ground", "Bridge", "RailTrack", "Water", "Terrain"]
     )
-    assert (CARLA.names[CARLA.geometry_id], SEMANTICKITTI.names[SEMANTICKITTI.geometry_id]) == ("Other", "other-object")
+    assert (CARLA.names[CARLA.geometry_id], SEMANTICKITTI.names[SEMANTICKITTI.geometry_id]) == (
+        "Other",
+        "other-object",
+    )
 
 
 def test_palettes_have_a_colour_for_every_channel():

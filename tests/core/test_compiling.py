@@ -1,4 +1,6 @@
-"""Compiled code is kept once for all environments, and is compiled again when any file that takes part changes."""
+"""Compiled code is kept once for all environments, and is compiled again when any file that takes
+part changes.
+"""
 
 import fcntl
 import os
@@ -54,7 +56,11 @@ def run(folder: Path, home: Path, factor: int = 2) -> list[str]:
     environment |= {"HOME": str(home), "XDG_CACHE_HOME": str(home / ".cache")}
     environment |= {"PYTHONPATH": os.pathsep.join([str(folder), *filter(None, sys.path)])}
     ran = subprocess.run(  # noqa: PLW1510
-        [sys.executable, "-B", "-c", "import outer"], env=environment, capture_output=True, text=True, timeout=100
+        [sys.executable, "-B", "-c", "import outer"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=100,
     )
     assert ran.returncode == 0, ran.stderr
     return ran.stdout.split("\n")[:-1]
@@ -73,8 +79,12 @@ def test_a_change_of_a_file_whose_functions_are_compiled_in_compiles_again(tmp_p
     assert run(tmp_path / "b", tmp_path) == ["7"]  # both versions are kept
 
 
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="needs a user who may not write everywhere")
-def test_where_the_folder_of_the_user_cannot_be_written_to_code_is_kept_beside_the_source(tmp_path: Path) -> None:
+@pytest.mark.skipif(
+    os.name != "posix" or os.geteuid() == 0, reason="needs a user who may not write everywhere"
+)
+def test_where_the_folder_of_the_user_cannot_be_written_to_code_is_kept_beside_the_source(
+    tmp_path: Path,
+) -> None:
     home = tmp_path / "home"
     home.mkdir(mode=0o500)
     assert run(tmp_path / "a", home)[-1] == "7"
@@ -115,7 +125,9 @@ def test_processes_that_need_a_function_at_once_compile_it_once(tmp_path: Path) 
     assert {lines[-1] for lines in made} == {"7"}
 
 
-def test_a_process_that_is_stopped_while_it_compiles_does_not_stop_the_others(tmp_path: Path, monkeypatch) -> None:
+def test_a_process_that_is_stopped_while_it_compiles_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch
+) -> None:
     @compiling.cached
     def add(x):
         return x + 1
@@ -144,11 +156,17 @@ def test_a_process_that_is_stopped_while_it_compiles_does_not_stop_the_others(tm
     ],
 )
 def test_numba_has_each_undocumented_name_that_the_cache_uses(holder, name) -> None:
-    assert hasattr(holder, name), f"Numba {numba.__version__} has no {name}, on which carlasc.core.compiling rests"
+    assert hasattr(holder, name), (
+        f"Numba {numba.__version__} has no {name}, on which carlasc.core.compiling rests"
+    )
 
 
 def test_numba_asks_a_locator_for_no_more_than_ours_has() -> None:
-    wanted = {name for name, value in vars(_CacheLocator).items() if getattr(value, "__isabstractmethod__", False)}
+    wanted = {
+        name
+        for name, value in vars(_CacheLocator).items()
+        if getattr(value, "__isabstractmethod__", False)
+    }
     missing = (wanted | {"ensure_cache_path", "from_function"}) - set(dir(compiling._SourceLocator))
     assert not missing, f"Numba {numba.__version__} asks locators for {sorted(missing)}"
 

@@ -1,4 +1,6 @@
-"""What the first use compiles: formatting the messages of NumPy's errors takes longer than our loops."""
+"""What the first use compiles: formatting the messages of NumPy's errors takes longer than our
+loops.
+"""
 
 import os
 import subprocess
@@ -37,7 +39,12 @@ hits(mesh.corners, seen.reshape(-1), *camera.rays(8, 8, slice(0, 8)))
 def test_loops_compile_without_the_messages_of_numpy(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     ran = subprocess.run(
-        [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True, timeout=120
+        [sys.executable, "-c", PROGRAM],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
     )
     compiled = [line.split() for line in ran.stdout.splitlines()]
     assert {"_count_pairs", "_fill", "_write_hits", "_write_rays"} <= {name for _, name in compiled}
@@ -70,7 +77,9 @@ def told(cache, after_s):
 
 
 @pytest.mark.slow
-def test_a_note_is_given_once_where_compiling_takes_long_and_never_where_it_was_done_before(tmp_path):
+def test_a_note_is_given_once_where_compiling_takes_long_and_never_where_it_was_done_before(
+    tmp_path,
+):
     assert told(tmp_path / "long", 0.01) == 1
     assert told(tmp_path / "long", 0.01) == 0
     assert told(tmp_path / "short", 60) == 0

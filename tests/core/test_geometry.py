@@ -13,7 +13,11 @@ offsets = arrays(np.float64, 3, elements=st.floats(-1e3, 1e3))
 
 def rigid(yaw, pitch, xyz):
     tilt = np.eye(4)
-    tilt[:3, :3] = [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+    tilt[:3, :3] = [
+        [np.cos(pitch), 0, np.sin(pitch)],
+        [0, 1, 0],
+        [-np.sin(pitch), 0, np.cos(pitch)],
+    ]
     return geometry.translation(xyz) @ geometry.rotation_z(yaw) @ tilt
 
 
@@ -21,7 +25,9 @@ def rigid(yaw, pitch, xyz):
 def test_the_inverse_brings_points_back(yaw, pitch, xyz, points):
     transform = rigid(yaw, pitch, xyz)
     there = geometry.transform_points(transform, points)
-    assert np.allclose(geometry.transform_points(geometry.invert(transform), there), points, atol=1e-9)
+    assert np.allclose(
+        geometry.transform_points(geometry.invert(transform), there), points, atol=1e-9
+    )
     assert np.allclose(geometry.invert(transform), np.linalg.inv(transform), atol=1e-9)
 
 
@@ -47,7 +53,10 @@ def test_poses_are_relative_to_the_first():
     ("spoil", "message"),
     [
         (lambda t: t.__setitem__((0, 3), np.nan), "NaN or infinity"),
-        (lambda t: t.__setitem__((1, 3), -1e12), "expected a position within 1e\\+09 m, found 1e\\+12 m"),
+        (
+            lambda t: t.__setitem__((1, 3), -1e12),
+            "expected a position within 1e\\+09 m, found 1e\\+12 m",
+        ),
         (lambda t: t.__imul__(2), "rigid transform"),
         (lambda t: t.__setitem__((3, 0), 1), "rigid transform"),
         (lambda t: t.__setitem__((slice(None), 1), -t[:, 1]), "reflection"),
@@ -61,5 +70,7 @@ def test_what_is_no_rigid_transform_is_refused_with_its_place(spoil, message):
 
 
 def test_a_wrong_shape_is_refused():
-    with pytest.raises(FormatError, match=r"pose.npy: expected 4 x 4 transforms, found shape \(3, 4\)"):
+    with pytest.raises(
+        FormatError, match=r"pose.npy: expected 4 x 4 transforms, found shape \(3, 4\)"
+    ):
         geometry.check_rigid(np.zeros((3, 4)), "pose.npy")

@@ -25,7 +25,10 @@ def specs(draw):
     size, lower, width = draw(sizes), draw(lowers), draw(widths)
     if draw(st.booleans()):
         return GridSpec(
-            "cartesian", size, lower, tuple(float(np.float32(a + w)) for a, w in zip(lower, width, strict=True))
+            "cartesian",
+            size,
+            lower,
+            tuple(float(np.float32(a + w)) for a, w in zip(lower, width, strict=True)),
         )
     radius = abs(lower[0])
     start = draw(st.floats(-PI32, 0, width=32))
@@ -49,7 +52,9 @@ def test_the_golden_params_are_those_of_the_presets(golden_capture):
         ("cartesian_fine", "fine"),
         ("cylindrical", "cylindrical"),
     ):
-        params = parse_json((golden_capture / folder / "evaluation" / "params.json").read_bytes(), folder)
+        params = parse_json(
+            (golden_capture / folder / "evaluation" / "params.json").read_bytes(), folder
+        )
         assert GridSpec.from_params(params) == GridSpec.published(name)
         assert GridSpec.published(name).to_params() == params
 
@@ -83,7 +88,9 @@ def test_from_axes_undoes_to_axes(spec):
 
 def test_bounds_are_half_open():
     spec = GridSpec("cartesian", (2, 1, 1), (0, 0, 0), (2, 1, 1))
-    cells, inside = spec.index(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [-1e-12, 0, 0], [np.nan, 0, 0]]))
+    cells, inside = spec.index(
+        np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [-1e-12, 0, 0], [np.nan, 0, 0]])
+    )
     assert inside.tolist() == [True, True, False, False, False]
     assert cells[:2, 0].tolist() == [0, 1]
 
@@ -204,7 +211,9 @@ def test_the_bits_are_those_of_the_format():
     ("min_confidence", "expected"),
     [(0, [1, 1, 1, 1, 1]), (0.5, [1, 1, 1, 1, 1]), (0.75, [1, 1, 0, 0, 1]), (0.9, [1, 0, 0, 0, 1])],
 )
-def test_a_voxel_is_confident_if_it_is_free_or_occupied_with_some_probability(min_confidence, expected):
+def test_a_voxel_is_confident_if_it_is_free_or_occupied_with_some_probability(
+    min_confidence, expected
+):
     occupied = np.array([0.05, 0.25, 0.5, 0.7, 1.0])
     assert is_confident(occupied, min_confidence).tolist() == [bool(value) for value in expected]
 
@@ -212,4 +221,8 @@ def test_a_voxel_is_confident_if_it_is_free_or_occupied_with_some_probability(mi
 def test_confidence_is_that_of_the_file_and_not_a_number_is_none():
     p = np.array([[0.8, np.nan]])
     assert float(np.float16(0.8)) < 0.8
-    assert is_confident(p, 0.8).tolist() == is_confident(p.astype(np.float16), 0.8).tolist() == [[True, False]]
+    assert (
+        is_confident(p, 0.8).tolist()
+        == is_confident(p.astype(np.float16), 0.8).tolist()
+        == [[True, False]]
+    )

@@ -7,7 +7,9 @@ from carlasc.errors import FormatError
 
 def test_every_field_must_fit_the_points():
     points = np.zeros((3, 3), np.float32)
-    with pytest.raises(FormatError, match=r"scan labels: expected shape \(3,\) for 3 points, found \(2,\)"):
+    with pytest.raises(
+        FormatError, match=r"scan labels: expected shape \(3,\) for 3 points, found \(2,\)"
+    ):
         Scan(points, labels=np.zeros(2, np.uint32))
     with pytest.raises(FormatError, match="scan flow"):
         Scan(points, flow=np.zeros((3, 2), np.float32))

@@ -1,4 +1,6 @@
-"""Instances and velocities of voxels in samples: their shapes, flips, cylindrical grids, and files that do not fit."""
+"""Instances and velocities of voxels in samples: their shapes, flips, cylindrical grids, and files
+that do not fit.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +28,9 @@ def write(root, coordinates="cartesian", parts=ACTORS, **changes):
     velocity["voxel"], velocity["velocity"] = [10, 40], [(1, 2, 0.5), (3, 4, 0)]
     arrays = {"instance": instance.reshape(SIZE), "velocity": velocity} | changes
     writer.write("points", 0, np.zeros((1, 4), np.float32))
-    writer.write("evaluation/labels", 0, np.where(instance > 0, 10, 7).astype(np.uint8).reshape(SIZE))
+    writer.write(
+        "evaluation/labels", 0, np.where(instance > 0, 10, 7).astype(np.uint8).reshape(SIZE)
+    )
     writer.write("evaluation/counts", 0, np.ones(SIZE, np.float32))
     for part in parts:
         writer.write(f"evaluation/{part}", 0, arrays[part])
@@ -34,7 +38,9 @@ def write(root, coordinates="cartesian", parts=ACTORS, **changes):
 
 
 def sample_of(root, coordinates="cartesian"):
-    dataset = Dataset(root, "train", fields=("labels", *ACTOR_FIELDS), coordinates=coordinates, remap=None)
+    dataset = Dataset(
+        root, "train", fields=("labels", *ACTOR_FIELDS), coordinates=coordinates, remap=None
+    )
     return dataset, dataset[0]
 
 
@@ -42,7 +48,10 @@ def sample_of(root, coordinates="cartesian"):
 def test_samples_have_numbers_and_dense_velocities(tmp_path, coordinates):
     _, sample = sample_of(write(tmp_path, coordinates), coordinates)
     assert sample["instances"].dtype == np.int64 and sample["instances"].shape == SIZE
-    assert np.flatnonzero(sample["instances"]).tolist() == [3, 10, 40] and sample["instances"].max() == 70_000
+    assert (
+        np.flatnonzero(sample["instances"]).tolist() == [3, 10, 40]
+        and sample["instances"].max() == 70_000
+    )
     flow = sample["voxel_flow"]
     assert flow.dtype == np.float32 and flow.shape == (*SIZE, 3)
     assert np.flatnonzero(flow.any(axis=-1)).tolist() == [10, 40]
@@ -57,7 +66,12 @@ def test_a_flip_of_a_cartesian_grid_mirrors_places_and_velocities(tmp_path, dire
     sign = np.where(np.arange(3) == axis, -1, 1)
     assert np.array_equal(turned["instances"], np.flip(sample["instances"], axis))
     assert np.array_equal(turned["voxel_flow"], np.flip(sample["voxel_flow"], axis) * sign)
-    assert sample["voxel_flow"].reshape(-1, 3)[10].tolist() == [1, 2, 0.5]  # the input is not changed
+    # the input is not changed
+    assert sample["voxel_flow"].reshape(-1, 3)[10].tolist() == [
+        1,
+        2,
+        0.5,
+    ]
     again = flip(turned, direction, dataset.spec)
     assert np.array_equal(again["voxel_flow"], sample["voxel_flow"])
 
@@ -111,10 +125,14 @@ def test_velocities_that_do_not_fit_are_named_by_samples_and_by_validate(tmp_pat
 def test_validate_names_repeated_voxels_actors_in_free_voxels_and_grids_of_another_size(tmp_path):
     assert not [f for f in validate(write(tmp_path / "good")).findings if f.check in ACTORS]
     write(tmp_path / "twice", velocity=velocities([3, 3]))
-    assert [f.check for f in validate(tmp_path / "twice").findings if f.check in ACTORS] == ["velocity"]
+    assert [f.check for f in validate(tmp_path / "twice").findings if f.check in ACTORS] == [
+        "velocity"
+    ]
     root = write(tmp_path / "free")
     (sequence,) = root.rglob("cartesian")
-    FolderSink(root).sequence("Train/Town01_Light/cartesian").write("evaluation/labels", 0, np.zeros(SIZE, np.uint8))
+    FolderSink(root).sequence("Train/Town01_Light/cartesian").write(
+        "evaluation/labels", 0, np.zeros(SIZE, np.uint8)
+    )
     (finding,) = [f for f in validate(root).findings if f.check in ACTORS]
     assert finding.check == "instance" and "3 others" in finding.found
     file = sequence / "evaluation/000000.instance"

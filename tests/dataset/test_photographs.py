@@ -1,4 +1,6 @@
-"""Images in samples: read, resized with the matrices that fit, and those of frames that lack one left out."""
+"""Images in samples: read, resized with the matrices that fit, and those of frames that lack one
+left out.
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +25,12 @@ def data(tmp_path):
     """Three frames; the images of the first two, one of them beside the sequence."""
     folder = write_drive(tmp_path / "A/cartesian", range(3), spec=SPEC)
     matrix = np.array([[50.0, 0, 39.5], [0, 50, 19.5], [0, 0, 1]])
-    values = {"width": WIDTH, "height": HEIGHT, "matrix": matrix, "sensor_T_camera": optical_axes((1.0, 0.0), "left")}
+    values = {
+        "width": WIDTH,
+        "height": HEIGHT,
+        "matrix": matrix,
+        "sensor_T_camera": optical_axes((1.0, 0.0), "left"),
+    }
     front = CameraModel(name="front", **values)
     other = CameraModel(name="other", images=("../other.png", "../other.png", ""), **values)
     writer = FolderSink(folder.parent).sequence("cartesian")
@@ -42,7 +49,10 @@ def test_samples_have_the_images_of_frames_that_have_all(data):
     assert [sample["frame"] for sample in dataset] == [0, 1]
     sample = dataset[1]
     assert np.array_equal(sample["images"]["front"], pixels + np.uint8(1))
-    assert np.array_equal(sample["images"]["other"], pixels) and list(sample["cameras"]) == ["front", "other"]
+    assert np.array_equal(sample["images"]["other"], pixels) and list(sample["cameras"]) == [
+        "front",
+        "other",
+    ]
     with pytest.raises(ArgumentError, match="a sample without images and cameras"):
         flip(sample, "y", SPEC)
 
@@ -53,9 +63,8 @@ def test_resized_images_have_matrices_that_fit(data):
     image, camera = sample["images"]["front"], sample["cameras"]["front"]
     assert image.shape == (10, 20, 3) and (camera.width, camera.height) == (20, 10)
     assert (image[:, :9] < 5).all() and (image[:, 11:] > 195).all()
-    assert camera.project(np.array([[0.0, 0, 5]]))[0] == pytest.approx(
-        [9.5, 4.5]
-    )  # still between the dark and the light half
+    # still between the dark and the light half
+    assert camera.project(np.array([[0.0, 0, 5]]))[0] == pytest.approx([9.5, 4.5])
     with pytest.raises(ArgumentError, match="1 or more pixels, found 0 x 10"):
         ResizeImages(0, 10)
 

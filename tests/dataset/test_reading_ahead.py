@@ -1,4 +1,6 @@
-"""Training from a store behind a URL: loaders with a ShardSampler and a cache, what is fetched and when, and going on in an epoch."""
+"""Training from a store behind a URL: loaders with a ShardSampler and a cache, what is fetched and
+when, and going on in an epoch.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,12 @@ SHAPE = {"seed": 1, "shard": 4, "window": 2}
 def drives(tmp_path_factory):
     root = tmp_path_factory.mktemp("drives")
     for seed in range(2):
-        write_drive(root / "files" / "Train" / f"Town0{seed}_Light" / "cartesian", range(FRAMES), spec=SPEC, seed=seed)
+        write_drive(
+            root / "files" / "Train" / f"Town0{seed}_Light" / "cartesian",
+            range(FRAMES),
+            spec=SPEC,
+            seed=seed,
+        )
     (root / "served").mkdir()
     pack(root / "files", root / "served" / "x.zarr")
     return root
@@ -74,7 +81,10 @@ def frames_of(batches, truth=None):
 
 def order_of(sampler, epoch):
     dataset = sampler.dataset
-    return [(sample["sequence"], sample["frame"]) for sample in (dataset[int(i)] for i in sampler.order(epoch))]
+    return [
+        (sample["sequence"], sample["frame"])
+        for sample in (dataset[int(i)] for i in sampler.order(epoch))
+    ]
 
 
 def fetching_threads():
@@ -101,20 +111,26 @@ def test_loaders_read_each_file_once_and_give_the_samples_of_the_files_in_the_or
 
 def test_files_are_fetched_before_their_samples_are_drawn_but_not_much_earlier(tmp_path):
     for seed in range(4):
-        write_drive(tmp_path / "files" / f"Town0{seed}_Light" / "cartesian", range(4), spec=SPEC, seed=seed)
+        write_drive(
+            tmp_path / "files" / f"Town0{seed}_Light" / "cartesian", range(4), spec=SPEC, seed=seed
+        )
     pack(tmp_path / "files", tmp_path / "served" / "x.zarr")
     with serve_folder(tmp_path / "served") as served:
         dataset = dataset_at(served, tmp_path / "cache", split=None)
         sampler = ShardSampler(dataset, shard=4, window=1, read_ahead=1)  # each sequence is a shard
         order = [
             sequence
-            for sequence, frame in order_of(ShardSampler(dataset_at(served, None, split=None), shard=4, window=1), 0)
+            for sequence, frame in order_of(
+                ShardSampler(dataset_at(served, None, split=None), shard=4, window=1), 0
+            )
         ]
         served.sent.clear()
 
         def fetched():
             return [
-                name for name in dict.fromkeys(order) if any(f"{name}/cartesian/scans" in path for path in served.sent)
+                name
+                for name in dict.fromkeys(order)
+                if any(f"{name}/cartesian/scans" in path for path in served.sent)
             ]
 
         drawing = iter(sampler)
@@ -262,13 +278,23 @@ if end == "error":
 )
 def test_a_program_ends_at_once_in_the_middle_of_an_epoch(served, tmp_path, workers, end, status):
     served.before = lambda path: time.sleep(0.05)  # so that it ends while files are being fetched
-    command = [sys.executable, "-c", SCRIPT, f"{served.url}/x.zarr", str(tmp_path / "cache"), workers, end]
+    command = [
+        sys.executable,
+        "-c",
+        SCRIPT,
+        f"{served.url}/x.zarr",
+        str(tmp_path / "cache"),
+        workers,
+        end,
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (status, "begun\n", "")
 
 
 class TestStatefulDataLoader:
-    """torchdata's loader saves the position of the batch that it gave last, whatever its workers have drawn since."""
+    """torchdata's loader saves the position of the batch that it gave last, whatever its workers
+    have drawn since.
+    """
 
     @pytest.fixture
     def loader(self, drives):
@@ -276,7 +302,9 @@ class TestStatefulDataLoader:
         dataset = Dataset(drives / "served" / "x.zarr", "train", history=HISTORY)
 
         def build(workers):
-            return stateful(dataset, BATCH, sampler=ShardSampler(dataset, **SHAPE), num_workers=workers)
+            return stateful(
+                dataset, BATCH, sampler=ShardSampler(dataset, **SHAPE), num_workers=workers
+            )
 
         return build
 
@@ -310,7 +338,9 @@ class TestStatefulDataLoader:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_bucket_is_read_through_the_cache_and_a_new_version_of_it_is_seen(drives, truth, tmp_path, workers):
+def test_a_bucket_is_read_through_the_cache_and_a_new_version_of_it_is_seen(
+    drives, truth, tmp_path, workers
+):
     import fsspec
 
     with s3_server() as endpoint:
@@ -318,11 +348,15 @@ def test_a_bucket_is_read_through_the_cache_and_a_new_version_of_it_is_seen(driv
         bucket = fsspec.filesystem("s3", **options)
         bucket.put(str(drives / "served" / "x.zarr"), f"{BUCKET}/x.zarr", recursive=True)
         for _ in range(2):  # the second time from the cache
-            dataset = Dataset(carlasc.open(f"s3://{BUCKET}/x.zarr", cache=tmp_path, **options), history=HISTORY)
+            dataset = Dataset(
+                carlasc.open(f"s3://{BUCKET}/x.zarr", cache=tmp_path, **options), history=HISTORY
+            )
             sampler = ShardSampler(dataset, **SHAPE)
             loader = DataLoader(dataset, BATCH, sampler=sampler, num_workers=workers)
             assert frames_of(loader, truth) == order_of(sampler, 0)
         (_, path), *_ = dataset.cached_files([0])
         bucket.pipe(f"{BUCKET}/x.zarr/{path}", b"something else")
         with pytest.raises(carlasc.errors.CarlascError, match=r"x\.zarr"):
-            Dataset(carlasc.open(f"s3://{BUCKET}/x.zarr", cache=tmp_path, **options), history=HISTORY)[0]
+            Dataset(
+                carlasc.open(f"s3://{BUCKET}/x.zarr", cache=tmp_path, **options), history=HISTORY
+            )[0]

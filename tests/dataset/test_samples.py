@@ -31,7 +31,9 @@ def world(tmp_path_factory):
 
 @pytest.mark.parametrize("history", [1, 3])
 @pytest.mark.parametrize("align", [True, False])
-def test_stacks_labels_and_counts_are_those_of_the_published_loader(golden, golden_capture, history, align):
+def test_stacks_labels_and_counts_are_those_of_the_published_loader(
+    golden, golden_capture, history, align
+):
     expected = np.load(golden / "loader.npz")
     fields = ("occupancy", "density", "labels", "counts", "known")
     sample = Dataset(golden_capture / "cartesian", history=history, align=align, fields=fields)[2]
@@ -45,12 +47,18 @@ def test_stacks_labels_and_counts_are_those_of_the_published_loader(golden, gold
 
 def test_occupancy_alone_equals_the_published_loader_too(golden, golden_capture):
     sample = Dataset(golden_capture / "cartesian", history=3)[2]
-    np.testing.assert_array_equal(sample["occupancy"], np.load(golden / "loader.npz")["T3_pose1_binary1_input"])
+    np.testing.assert_array_equal(
+        sample["occupancy"], np.load(golden / "loader.npz")["T3_pose1_binary1_input"]
+    )
 
 
 def test_every_field_has_the_documented_shape_and_type(world):
     sample = Dataset(world, "train", history=3, fields=FIELDS)[4]
-    found = {name: (array.dtype.name, array.shape) for name, array in sample.items() if isinstance(array, np.ndarray)}
+    found = {
+        name: (array.dtype.name, array.shape)
+        for name, array in sample.items()
+        if isinstance(array, np.ndarray)
+    }
     assert found == {
         "occupancy": ("uint8", (3, 16, 16, 4)),
         "density": ("uint16", (3, 16, 16, 4)),
@@ -67,7 +75,9 @@ def test_every_field_has_the_documented_shape_and_type(world):
     }
     assert (sample["sequence"], sample["frame"]) == ("Town01_Light", 4)
     assert all(
-        array.flags.writeable and array.flags.c_contiguous for array in sample.values() if hasattr(array, "flags")
+        array.flags.writeable and array.flags.c_contiguous
+        for array in sample.values()
+        if hasattr(array, "flags")
     )
 
 
@@ -81,7 +91,9 @@ def test_values_are_those_of_the_files(world):
         np.testing.assert_array_equal(sample["point_labels"], remap(sequence.read("labels", frame)))
         np.testing.assert_array_equal(sample["flow"], sequence.read("flow", frame))
         np.testing.assert_array_equal(sample["remission"], sequence.read("points", frame)[:, 3])
-        np.testing.assert_array_equal(sample["labels"], remap(sequence.read("evaluation/labels", frame)))
+        np.testing.assert_array_equal(
+            sample["labels"], remap(sequence.read("evaluation/labels", frame))
+        )
         np.testing.assert_array_equal(sample["counts"], sequence.read("evaluation/counts", frame))
         np.testing.assert_array_equal(sample["known"], sample["counts"] > 0)
 
@@ -91,7 +103,9 @@ def test_stacks_are_those_of_the_plain_loader(tmp_path, coordinates):
     folder = write_drive(tmp_path / "Train" / "Town01_Light" / coordinates, range(7), points=3000)
     for density in (False, True):
         what = "density" if density else "occupancy"
-        dataset = Dataset(tmp_path, history=4, coordinates=coordinates, fields=(what, "labels", "known"))
+        dataset = Dataset(
+            tmp_path, history=4, coordinates=coordinates, fields=(what, "labels", "known")
+        )
         plain = PlainLoader(folder, 4, density=density)
         for frame in (6, 0, 3, 4, 5):
             for name, array in plain[frame].items():
@@ -109,7 +123,10 @@ def test_history_crosses_neither_sequences_nor_gaps(tmp_path):
     write_drive(tmp_path / "Train" / "A" / "cartesian", [0, 1, 2, 5, 6], spec=SMALL)
     write_drive(tmp_path / "Train" / "B" / "cartesian", [0, 1], spec=SMALL)
     dataset = Dataset(tmp_path, history=3)
-    valid = {(s["sequence"], s["frame"]): s["valid"].sum() for s in (dataset[i] for i in range(len(dataset)))}
+    valid = {
+        (s["sequence"], s["frame"]): s["valid"].sum()
+        for s in (dataset[i] for i in range(len(dataset)))
+    }
     assert list(valid.values()) == [1, 2, 3, 1, 2, 1, 2]
     for (sequence, frame), count in valid.items():
         stack = dataset[dataset.index_of(sequence, frame)]["occupancy"]
@@ -125,7 +142,9 @@ def test_poses_take_past_points_to_the_current_frame(world):
 
 
 def test_frames_without_a_grid_are_left_out_only_when_a_grid_is_asked_for(tmp_path):
-    write_drive(tmp_path / "Train" / "A" / "cartesian", range(11), grid_frames=[0, 5, 10], spec=SMALL)
+    write_drive(
+        tmp_path / "Train" / "A" / "cartesian", range(11), grid_frames=[0, 5, 10], spec=SMALL
+    )
     with_grid = Dataset(tmp_path, history=3)
     assert [with_grid[i]["frame"] for i in range(len(with_grid))] == [0, 5, 10]
     assert with_grid[1]["valid"].all()  # its past scans have no grids, and are there
@@ -141,9 +160,14 @@ def test_without_counts_every_voxel_is_known(tmp_path):
         Dataset(tmp_path, fields=("counts",))
 
 
-@pytest.mark.parametrize("split", ["train", "Train", "TRAIN", ["Town01_Light", "Train/Town02_Light"]])
+@pytest.mark.parametrize(
+    "split", ["train", "Train", "TRAIN", ["Town01_Light", "Train/Town02_Light"]]
+)
 def test_a_split_is_named_in_any_case_or_is_a_list_of_sequences(world, split):
-    assert [sequence.name for sequence in Dataset(world, split).sequences] == ["Town01_Light", "Town02_Light"]
+    assert [sequence.name for sequence in Dataset(world, split).sequences] == [
+        "Town01_Light",
+        "Town02_Light",
+    ]
 
 
 def test_no_split_means_all_and_the_root_may_be_any_level_or_a_source(world):
@@ -155,20 +179,38 @@ def test_no_split_means_all_and_the_root_may_be_any_level_or_a_source(world):
 
 def test_grids_come_from_a_second_root_by_split_and_sequence(tmp_path, world):
     fine = SMALL.with_size((32, 32, 8))
-    write_drive(tmp_path / "Train" / "Town01_Light" / "cartesian", [], grid_frames=[1, 3, 4], spec=fine, seed=7)
-    write_drive(tmp_path / "Val" / "Town01_Light" / "cartesian", [], grid_frames=[0], spec=fine, seed=8)
+    write_drive(
+        tmp_path / "Train" / "Town01_Light" / "cartesian",
+        [],
+        grid_frames=[1, 3, 4],
+        spec=fine,
+        seed=7,
+    )
+    write_drive(
+        tmp_path / "Val" / "Town01_Light" / "cartesian", [], grid_frames=[0], spec=fine, seed=8
+    )
     dataset = Dataset(world, ["Town01_Light"], history=2, grids_source=tmp_path, remap=None)
     assert dataset.spec == fine and dataset.classes == CARLA
     assert [dataset[i]["frame"] for i in range(len(dataset))] == [1, 3, 4]
-    truth = FolderSource(tmp_path).sequences()["Train/Town01_Light/cartesian"].read("evaluation/labels", 3)
+    truth = (
+        FolderSource(tmp_path)
+        .sequences()["Train/Town01_Light/cartesian"]
+        .read("evaluation/labels", 3)
+    )
     np.testing.assert_array_equal(dataset[1]["labels"], truth)
     assert dataset[1]["occupancy"].shape == (2, *fine.size) and dataset[1]["occupancy"][0].any()
 
 
 def test_cylindrical_grids_of_a_second_root_take_scans_and_poses_from_cartesian(tmp_path, world):
-    for split, name in (("Train", "Town01_Light"), ("Train", "Town02_Light"), ("Val", "Town07_Light")):
+    for split, name in (
+        ("Train", "Town01_Light"),
+        ("Train", "Town02_Light"),
+        ("Val", "Town07_Light"),
+    ):
         folder = tmp_path / split / name / "cylindrical"
-        write_drive(folder, [], grid_frames=[2, 3] if split == "Train" else [2], spec=SMALL_CYLINDRICAL)
+        write_drive(
+            folder, [], grid_frames=[2, 3] if split == "Train" else [2], spec=SMALL_CYLINDRICAL
+        )
     dataset = Dataset(world, history=2, coordinates="cylindrical", grids_source=tmp_path)
     assert len(dataset) == 5 and dataset.spec == SMALL_CYLINDRICAL
     assert {sequence.coordinates for sequence in dataset.sequences} == {"cartesian"}
@@ -178,20 +220,31 @@ def test_cylindrical_grids_of_a_second_root_take_scans_and_poses_from_cartesian(
 
 
 @pytest.mark.parametrize("own_scans", [True, False])
-def test_cylindrical_grids_beside_cartesian_ones_take_their_own_scans_if_there_are_any(tmp_path, own_scans):
+def test_cylindrical_grids_beside_cartesian_ones_take_their_own_scans_if_there_are_any(
+    tmp_path, own_scans
+):
     sequence = tmp_path / "Train" / "A"
     write_drive(sequence / "cartesian", range(3), spec=SMALL, seed=1)
-    write_drive(sequence / "cylindrical", range(3 if own_scans else 0), grid_frames=range(3), spec=SMALL_CYLINDRICAL)
+    write_drive(
+        sequence / "cylindrical",
+        range(3 if own_scans else 0),
+        grid_frames=range(3),
+        spec=SMALL_CYLINDRICAL,
+    )
     dataset = Dataset(tmp_path, coordinates="cylindrical")
     assert len(dataset) == 3 and dataset.spec == SMALL_CYLINDRICAL
     assert dataset.sequences[0].coordinates == ("cylindrical" if own_scans else "cartesian")
 
 
 def test_two_roots_that_are_one_sequence_each_go_together(golden_capture):
-    fine = Dataset(golden_capture / "cartesian", history=3, grids_source=golden_capture / "cartesian_fine")
+    fine = Dataset(
+        golden_capture / "cartesian", history=3, grids_source=golden_capture / "cartesian_fine"
+    )
     assert fine.spec == GridSpec.published("fine") and len(fine) == 3
     cylindrical = Dataset(
-        golden_capture / "cartesian", coordinates="cylindrical", grids_source=golden_capture / "cylindrical"
+        golden_capture / "cartesian",
+        coordinates="cylindrical",
+        grids_source=golden_capture / "cylindrical",
     )
     assert cylindrical.spec == GridSpec.published("cylindrical")
     assert cylindrical[2]["occupancy"].any()
@@ -245,19 +298,29 @@ def test_remaps_by_name_table_mapping_or_none_agree(world):
 
 
 def test_ids_over_255_are_not_wrapped(tmp_path):
-    folder = write_drive(tmp_path / "A" / "cartesian", [0], spec=SMALL, metadata={"classes": "semantickitti"})
+    folder = write_drive(
+        tmp_path / "A" / "cartesian", [0], spec=SMALL, metadata={"classes": "semantickitti"}
+    )
     labels = np.full(SMALL.size, 259, np.uint32)
     (folder / "evaluation" / "000000.label").write_bytes(labels.tobytes())
     raw = Dataset(tmp_path, remap=None, fields=("labels",))
-    assert raw[0]["labels"].dtype == np.uint16 and (raw[0]["labels"] == 259).all() and raw.classes == SEMANTICKITTI
+    assert (
+        raw[0]["labels"].dtype == np.uint16
+        and (raw[0]["labels"] == 259).all()
+        and raw.classes == SEMANTICKITTI
+    )
     assert (Dataset(tmp_path, remap="semantickitti19", fields=("labels",))[0]["labels"] == 5).all()
 
 
 def test_points_out_of_range_go_into_no_grid_and_stay_among_the_points(tmp_path):
     ranges = {"min_range_m": 2.5, "max_range_m": 9.0}
     for name, metadata in (("A", None), ("B", ranges)):
-        write_drive(tmp_path / name / "cartesian", range(3), spec=SMALL, metadata=metadata, points=2000)
-    every, ranged = (Dataset(tmp_path, [n], history=2, fields=("density", "points"))[2] for n in "AB")
+        write_drive(
+            tmp_path / name / "cartesian", range(3), spec=SMALL, metadata=metadata, points=2000
+        )
+    every, ranged = (
+        Dataset(tmp_path, [n], history=2, fields=("density", "points"))[2] for n in "AB"
+    )
     np.testing.assert_array_equal(every["points"], ranged["points"])
     assert 0 < ranged["density"].sum() < every["density"].sum()
     distance = np.linalg.norm(ranged["points"].astype(np.float64), axis=1)
@@ -272,7 +335,9 @@ def test_right_handed_data_are_told_apart_never_mirrored_or_mixed(tmp_path):
     left, right = (Dataset(tmp_path, [name]) for name in "AB")
     assert (left.axes, right.axes) == ("left", "right")
     np.testing.assert_array_equal(left[0]["occupancy"], right[0]["occupancy"])
-    with pytest.raises(FormatError, match=r"B/cartesian: expected the axes of .*A/cartesian \(left\), found right"):
+    with pytest.raises(
+        FormatError, match=r"B/cartesian: expected the axes of .*A/cartesian \(left\), found right"
+    ):
         Dataset(tmp_path)
 
 
@@ -304,17 +369,23 @@ def test_a_zip_is_read_in_place(world, tmp_path):
     with zipfile.ZipFile(tmp_path / "all.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(world.rglob("*")):
             archive.write(path, path.relative_to(world))
-    plain, zipped = (Dataset(root, "train", history=3, fields=FIELDS) for root in (world, tmp_path / "all.zip"))
+    plain, zipped = (
+        Dataset(root, "train", history=3, fields=FIELDS) for root in (world, tmp_path / "all.zip")
+    )
     for i in (7, 0, 3):
         for name, value in plain[i].items():
             np.testing.assert_array_equal(zipped[i][name], value)
 
 
-@pytest.mark.parametrize("ending, package", [("zarr", "zarr"), ("h5", "h5py"), ("parquet", "pyarrow")])
+@pytest.mark.parametrize(
+    "ending, package", [("zarr", "zarr"), ("h5", "h5py"), ("parquet", "pyarrow")]
+)
 def test_a_packed_store_gives_the_samples_of_the_files(world, tmp_path, ending, package):
     pytest.importorskip(package)
     pack(world, tmp_path / f"packed.{ending}")
-    plain, packed = (Dataset(root, history=3, fields=FIELDS) for root in (world, tmp_path / f"packed.{ending}"))
+    plain, packed = (
+        Dataset(root, history=3, fields=FIELDS) for root in (world, tmp_path / f"packed.{ending}")
+    )
     assert len(plain) == len(packed)
     for i in (5, 0, 12, 7):
         for name, value in plain[i].items():
@@ -337,7 +408,9 @@ def test_scans_read_in_order_are_read_once(world, monkeypatch):
     kind = type(dataset.sequences[0])
     read, original = [], kind.read_many
     monkeypatch.setattr(
-        kind, "read_many", lambda self, field, frames: read.extend(frames) or original(self, field, frames)
+        kind,
+        "read_many",
+        lambda self, field, frames: read.extend(frames) or original(self, field, frames),
     )
     for i in range(6):
         dataset[i]
@@ -373,18 +446,26 @@ def test_constructing_prints_nothing_and_loads_neither_torch_nor_numba(world):
     [
         (
             {"split": "training"},
-            "split: expected Train, Val, Test in any case, or one or more of Town01_Light, .*, found 'training'",
+            "split: expected Train, Val, Test in any case, or one or more of Town01_Light, .*, "
+            "found 'training'",
         ),
-        ({"fields": ("occupancy", "label")}, "fields: expected any of occupancy, .*, found 'label'"),
+        (
+            {"fields": ("occupancy", "label")},
+            "fields: expected any of occupancy, .*, found 'label'",
+        ),
         ({"fields": ()}, "fields: expected at least one"),
         ({"history": 0}, "history: expected a number of scans of 1 or more, found 0"),
         ({"history": 2.5}, "history: expected a number of scans"),
         ({"coordinates": "polar"}, "coordinates: expected cartesian or cylindrical, found 'polar'"),
         ({"remap": "carlasc12"}, "remap: expected one of carlasc11.*found 'carlasc12'"),
-        ({"remap": "carlasc12", "fields": ("points",)}, "remap: expected one of carlasc11.*found 'carlasc12'"),
+        (
+            {"remap": "carlasc12", "fields": ("points",)},
+            "remap: expected one of carlasc11.*found 'carlasc12'",
+        ),
         (
             {"remap": "semantickitti19"},
-            "remap: expected a remap of .* class table carla, found semantickitti19, which maps semantickitti",
+            "remap: expected a remap of .* class table carla, found semantickitti19, which maps "
+            "semantickitti",
         ),
         ({"remap": {}}, "remap: expected ids"),
         ({"remap": [[1]]}, "remap: expected a name, a mapping or a table of ids"),
@@ -406,7 +487,10 @@ def expect(kind, message, *args, **arguments):
 def test_a_split_or_sequence_that_is_not_there_is_named_with_what_is(world):
     expect(MissingDataError, "expected the split test, found Train, Val", world, "test")
     expect(
-        MissingDataError, "expected the sequence Town99, found Town01_Light, Town02", world, ["Town01_Light", "Town99"]
+        MissingDataError,
+        "expected the sequence Town99, found Town01_Light, Town02",
+        world,
+        ["Town01_Light", "Town99"],
     )
 
 
@@ -416,10 +500,22 @@ def test_missing_or_short_or_broken_poses_are_named(tmp_path):
     (folder / "poses.txt").write_text("\n".join(lines[:3]) + "\n")
     expect(FormatError, "poses.txt: expected a line for each of 4 frames", tmp_path, history=2)
     assert len(Dataset(tmp_path)) == 4  # one scan needs no pose
-    (folder / "poses.txt").write_text("\n".join([*lines[:2], " ".join(["nan"] * 12), lines[3]]) + "\n")
-    expect(FormatError, "poses.txt, line 3: expected a rigid transform, found .nan", tmp_path, history=2)
+    (folder / "poses.txt").write_text(
+        "\n".join([*lines[:2], " ".join(["nan"] * 12), lines[3]]) + "\n"
+    )
+    expect(
+        FormatError,
+        "poses.txt, line 3: expected a rigid transform, found .nan",
+        tmp_path,
+        history=2,
+    )
     (folder / "poses.txt").write_text("\n".join([*lines[:3], " ".join(["0"] * 12)]) + "\n")
-    expect(FormatError, "poses.txt, line 4: expected a rigid transform, found .0.0", tmp_path, history=2)
+    expect(
+        FormatError,
+        "poses.txt, line 4: expected a rigid transform, found .0.0",
+        tmp_path,
+        history=2,
+    )
     (folder / "poses.txt").unlink()
     expect(MissingDataError, "poses.txt: expected a file, found nothing", tmp_path, history=2)
 
@@ -433,16 +529,29 @@ def test_a_sequence_without_the_grid_is_named(tmp_path):
 
 def test_a_second_root_without_the_sequence_or_the_coordinates_is_named(tmp_path, world):
     write_drive(tmp_path / "Train" / "Town01_Light" / "cartesian", [], grid_frames=[1], spec=SMALL)
-    message = "expected cartesian grids of Train/Town02_Light, found the sequences Train/Town01_Light"
+    message = (
+        "expected cartesian grids of Train/Town02_Light, found the sequences Train/Town01_Light"
+    )
     expect(MissingDataError, message, world, "train", grids_source=tmp_path)
     message = "expected cylindrical grids of Train/Town01_Light, found only cartesian"
-    expect(MissingDataError, message, world, ["Town01_Light"], grids_source=tmp_path, coordinates="cylindrical")
+    expect(
+        MissingDataError,
+        message,
+        world,
+        ["Town01_Light"],
+        grids_source=tmp_path,
+        coordinates="cylindrical",
+    )
 
 
 def test_an_empty_folder_and_a_level_too_low_are_told_what_to_give(tmp_path, world):
     expect(MissingDataError, "expected a data set, .*: give the folder that holds Train", tmp_path)
     low = world / "Train" / "Town01_Light" / "cartesian" / "velodyne"
-    expect(MissingDataError, "expected a sequence or a folder above it, .*: give the folder above this one", low)
+    expect(
+        MissingDataError,
+        "expected a sequence or a folder above it, .*: give the folder above this one",
+        low,
+    )
     expect(MissingDataError, "expected a folder", tmp_path / "nowhere")
 
 
@@ -461,14 +570,20 @@ def test_grids_of_different_geometry_are_not_mixed(tmp_path):
 def test_only_cylindrical_data_are_not_taken_for_cartesian(tmp_path):
     write_drive(tmp_path / "A" / "cylindrical", range(2), spec=SMALL_CYLINDRICAL)
     expect(
-        MissingDataError, "expected cartesian data, found only cylindrical: give `coordinates='cylindrical'`", tmp_path
+        MissingDataError,
+        "expected cartesian data, found only cylindrical: give `coordinates='cylindrical'`",
+        tmp_path,
     )
 
 
 def test_damaged_files_are_named_when_they_are_read(tmp_path):
     folder = write_drive(tmp_path / "A" / "cartesian", range(2), spec=SMALL)
-    (folder / "evaluation" / "000001.label").write_bytes(np.full(SMALL.size, 77, np.uint32).tobytes())
-    expect(FormatError, "evaluation/labels of frame 1: expected class ids of carla, found 77", tmp_path)
+    (folder / "evaluation" / "000001.label").write_bytes(
+        np.full(SMALL.size, 77, np.uint32).tobytes()
+    )
+    expect(
+        FormatError, "evaluation/labels of frame 1: expected class ids of carla, found 77", tmp_path
+    )
     expect(FormatError, r"expected class ids 0\.\.24 .*, found 77", tmp_path, remap=None)
     (folder / "evaluation" / "000001.label").write_bytes(b"1234")
     expect(FormatError, "000001.label: expected 4096 bytes", tmp_path)
@@ -482,7 +597,9 @@ def test_an_empty_scan_is_an_empty_grid(tmp_path):
     for name in ("velodyne/000001.bin", "labels/000001.label", "predictions/000001.bin"):
         (folder / name).write_bytes(b"")
     sample = Dataset(tmp_path, history=2, fields=FIELDS)[1]
-    assert sample["valid"].all() and sample["occupancy"][0].any() and not sample["occupancy"][1].any()
+    assert (
+        sample["valid"].all() and sample["occupancy"][0].any() and not sample["occupancy"][1].any()
+    )
     assert sample["points"].shape == sample["flow"].shape == (0, 3)
     assert sample["point_labels"].shape == sample["remission"].shape == (0,)
 
@@ -495,7 +612,9 @@ def test_negative_indices_count_from_the_end_and_others_are_out_of_range(world):
     dataset = Dataset(world, "val", fields=("points",))
     assert [dataset[index]["frame"] for index in (-3, -1, 2)] == [0, 2, 2]
     for index in (-4, 3):
-        with pytest.raises(IndexError, match=f"sample {index} is out of range: there are 3 samples"):
+        with pytest.raises(
+            IndexError, match=f"sample {index} is out of range: there are 3 samples"
+        ):
             dataset[index]
 
 

@@ -1,4 +1,6 @@
-"""The order of ShardSampler: every sample once, the same for any number of processes, continued anywhere, few shards at a time."""
+"""The order of ShardSampler: every sample once, the same for any number of processes, continued
+anywhere, few shards at a time.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def sequences_of(*frames, history=1):
 data = st.lists(st.sets(st.integers(0, 150), min_size=1, max_size=60), min_size=1, max_size=4).map(
     lambda frames: sequences_of(*frames)
 )
-shapes = st.fixed_dictionaries({"shard": st.integers(1, 40), "window": st.integers(1, 6), "seed": st.integers(0, 9)})
+shapes = st.fixed_dictionaries(
+    {"shard": st.integers(1, 40), "window": st.integers(1, 6), "seed": st.integers(0, 9)}
+)
 
 
 def samples_in(dataset):
@@ -36,7 +40,9 @@ def samples_in(dataset):
 
 
 def steps(dataset, world, batch, shape, state=None):
-    """Return the set of samples of each step, over all processes; their batches come from loaders of `batch // world` samples."""
+    """Return the set of samples of each step, over all processes; their batches come from loaders
+    of `batch // world` samples.
+    """
     drawn = []
     for rank in range(world):
         sampler = ShardSampler(dataset, rank=rank, world=world, **shape)
@@ -45,8 +51,12 @@ def steps(dataset, world, batch, shape, state=None):
         indices = list(sampler)
         size = batch // world
         drawn.append([indices[k : k + size] for k in range(0, len(indices), size)])
-    assert len({len(batches) for batches in drawn}) == 1, "a process would wait for the others forever"
-    return [sorted(index for batches in step for index in batches) for step in zip(*drawn, strict=True)]
+    assert len({len(batches) for batches in drawn}) == 1, (
+        "a process would wait for the others forever"
+    )
+    return [
+        sorted(index for batches in step for index in batches) for step in zip(*drawn, strict=True)
+    ]
 
 
 @given(data, shapes, st.integers(0, 3))
@@ -65,12 +75,22 @@ def test_each_step_has_the_same_samples_for_one_two_and_four_processes(dataset, 
         shared = steps(dataset, world, batch, shape)
         assert len(shared) == len(alone)
         assert shared[:-1] == alone[:-1]
-        assert set(shared[-1]) >= set(alone[-1])  # up to world - 1 samples are given twice, to make the steps equal
+        # up to world - 1 samples are given twice, to make the steps equal
+        assert set(shared[-1]) >= set(alone[-1])
         assert sum(map(len, shared)) - sum(map(len, alone)) == -samples_in(dataset) % world
 
 
-@given(data, shapes, st.integers(0, 2), st.floats(0, 1), st.sampled_from([1, 2, 4]), st.sampled_from([1, 2, 4]))
-def test_it_goes_on_at_any_position_with_any_other_number_of_processes(dataset, shape, epoch, part, before, after):
+@given(
+    data,
+    shapes,
+    st.integers(0, 2),
+    st.floats(0, 1),
+    st.sampled_from([1, 2, 4]),
+    st.sampled_from([1, 2, 4]),
+)
+def test_it_goes_on_at_any_position_with_any_other_number_of_processes(
+    dataset, shape, epoch, part, before, after
+):
     count = samples_in(dataset)
     first = ShardSampler(dataset, rank=before - 1, world=before, **shape)
     first.set_epoch(epoch)
@@ -88,9 +108,10 @@ def test_it_goes_on_at_any_position_with_any_other_number_of_processes(dataset, 
 @given(data, shapes)
 def test_frames_of_few_shards_are_mixed_at_any_time(dataset, shape):
     sampler = ShardSampler(dataset, **shape)
+    # the shard of each sample, found in another way
     names = np.concatenate(
         [frames // shape["shard"] + 1000 * k for k, frames in enumerate(dataset.frames)]
-    )  # the shard of each sample, found in another way
+    )
     order = names[sampler.order(0)]
     first = {shard: place for place, shard in reversed(list(enumerate(order.tolist())))}
     last = {shard: place for place, shard in enumerate(order.tolist())}
@@ -112,7 +133,9 @@ def test_a_window_of_one_shard_reads_shard_after_shard_and_a_wide_one_mixes_them
 def test_epochs_and_seeds_differ_and_repeat():
     dataset = sequences_of(range(100), range(50))
     orders = {
-        (seed, epoch): tuple(ShardSampler(dataset, seed=seed).order(epoch)) for seed in range(2) for epoch in range(2)
+        (seed, epoch): tuple(ShardSampler(dataset, seed=seed).order(epoch))
+        for seed in range(2)
+        for epoch in range(2)
     }
     assert len(set(orders.values())) == 4
     assert orders[1, 1] == tuple(ShardSampler(dataset, seed=1).order(1))
@@ -174,7 +197,14 @@ def test_after_the_state_of_a_finished_epoch_nothing_is_left_and_the_next_epoch_
 
 
 @pytest.mark.parametrize(
-    "change", [{"shard": 8}, {"window": 3}, {"frames": [range(30)]}, {"frames": [range(1, 41)]}, {"position": 41}]
+    "change",
+    [
+        {"shard": 8},
+        {"window": 3},
+        {"frames": [range(30)]},
+        {"frames": [range(1, 41)]},
+        {"position": 41},
+    ],
 )
 def test_the_state_of_other_data_or_another_order_is_refused(change):
     state = ShardSampler(sequences_of(range(40))).state_dict()
@@ -185,7 +215,8 @@ def test_the_state_of_other_data_or_another_order_is_refused(change):
 
 
 @pytest.mark.parametrize(
-    "name, value", [("seed", -1), ("shard", 0), ("window", 0), ("world", 0), ("rank", 1), ("read_ahead", -1)]
+    "name, value",
+    [("seed", -1), ("shard", 0), ("window", 0), ("world", 0), ("rank", 1), ("read_ahead", -1)],
 )
 def test_wrong_arguments_are_named(name, value):
     with pytest.raises(ArgumentError, match=f"^{name}: expected"):
@@ -197,7 +228,13 @@ def test_wrong_arguments_are_named(name, value):
 def test_a_sampler_of_a_real_data_set_can_be_pickled_in_the_middle(tmp_path_factory, history):
     folder = tmp_path_factory.mktemp("drive")
     for seed in range(2):
-        write_drive(folder / "Train" / f"Town0{seed}_Light" / "cartesian", range(20), spec=SPEC, seed=seed, points=20)
+        write_drive(
+            folder / "Train" / f"Town0{seed}_Light" / "cartesian",
+            range(20),
+            spec=SPEC,
+            seed=seed,
+            points=20,
+        )
     dataset = Dataset(folder, history=history)
     sampler = ShardSampler(dataset, shard=4, window=2)
     drawing = iter(sampler)

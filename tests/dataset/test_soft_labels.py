@@ -18,7 +18,9 @@ CLASSES = (1, 6, 7, 13, 20)  # 6 and 7, 13 and 20 are one class of the eleven
 
 
 def write_evidence(folder, frames, seed=0):
-    """Write what is known of each voxel: up to three classes, whose probabilities add up to at most 1."""
+    """Write what is known of each voxel: up to three classes, whose probabilities add up to at most
+    1.
+    """
     rng = np.random.default_rng(seed)
     writer = FolderSink(folder.parent).sequence(folder.name)
     for frame in frames:
@@ -26,7 +28,10 @@ def write_evidence(folder, frames, seed=0):
         for voxel in range(SPEC.num_voxels):
             labels = np.sort(rng.choice(CLASSES, rng.integers(0, 4), replace=False))
             shares = rng.dirichlet(np.ones(4))[: len(labels)]
-            rows += [(voxel, label, int(share * layout.CERTAIN)) for label, share in zip(labels, shares, strict=True)]
+            rows += [
+                (voxel, label, int(share * layout.CERTAIN))
+                for label, share in zip(labels, shares, strict=True)
+            ]
         writer.write("evaluation/occupied", frame, rng.random(SPEC.size).astype(np.float16))
         writer.write("evaluation/classes", frame, np.array(rows, field_files.VOTES_DTYPE))
         writer.write("evaluation/flags", frame, rng.integers(0, 16, SPEC.size).astype(np.uint8))
@@ -75,7 +80,10 @@ def test_samples_say_which_cameras_see_each_voxel(tmp_path):
     folder = write_drive(tmp_path / "A/cartesian", range(2), spec=SPEC)
     with pytest.raises(MissingDataError, match=r"field evaluation/seen.*keep_seen=True"):
         Dataset(tmp_path, fields=("camera_visible",))
-    writer, bits = FolderSink(folder.parent).sequence("cartesian"), np.arange(SPEC.num_voxels).reshape(SPEC.size)
+    writer, bits = (
+        FolderSink(folder.parent).sequence("cartesian"),
+        np.arange(SPEC.num_voxels).reshape(SPEC.size),
+    )
     writer.write("evaluation/seen", 1, bits.astype(np.uint8))
     dataset = Dataset(tmp_path, fields=("labels", "camera_visible"))
     (sample,) = dataset
@@ -110,7 +118,11 @@ def test_a_grid_in_which_nothing_is_occupied_is_free(tmp_path):
 
 def test_the_other_fields_are_those_of_the_files(world):
     sample = Dataset(world, "train", fields=EVIDENCE_FIELDS, history=2)[2]
-    found = {name: (array.dtype.name, array.shape) for name, array in sample.items() if name in EVIDENCE_FIELDS}
+    found = {
+        name: (array.dtype.name, array.shape)
+        for name, array in sample.items()
+        if name in EVIDENCE_FIELDS
+    }
     assert found == {
         "posterior": ("float32", (11, *SPEC.size)),
         "occupied": ("float32", SPEC.size),
@@ -118,16 +130,22 @@ def test_the_other_fields_are_those_of_the_files(world):
         "views": ("uint16", SPEC.size),
     }
     for name in ("occupied", "flags", "views"):
-        np.testing.assert_array_equal(sample[name], sequence_of(world).read(f"evaluation/{name}", 2))
+        np.testing.assert_array_equal(
+            sample[name], sequence_of(world).read(f"evaluation/{name}", 2)
+        )
         assert sample[name].flags.writeable
 
 
 @pytest.mark.parametrize("min_confidence", [0.0, 0.8])
 @pytest.mark.parametrize("inferred", [True, False])
-def test_inferred_and_doubtful_voxels_can_be_left_out_of_what_is_known(world, inferred, min_confidence):
+def test_inferred_and_doubtful_voxels_can_be_left_out_of_what_is_known(
+    world, inferred, min_confidence
+):
     fields = ("known", "posterior", "counts", "labels")
     whole = Dataset(world, "train", fields=fields)[0]
-    sample = Dataset(world, "train", fields=fields, inferred=inferred, min_confidence=min_confidence)[0]
+    sample = Dataset(
+        world, "train", fields=fields, inferred=inferred, min_confidence=min_confidence
+    )[0]
     sequence = sequence_of(world)
     p, flags = sequence.read("evaluation/occupied", 0), sequence.read("evaluation/flags", 0)
     known = whole["counts"] > 0
@@ -146,7 +164,9 @@ def test_flips_turn_every_field_as_they_turn_labels(world, direction):
     flipped = flip(sample, direction, SPEC)
     axis = "xy".index(direction)
     for name in EVIDENCE_FIELDS:
-        np.testing.assert_array_equal(flipped[name], np.flip(sample[name], axis + (name == "posterior")))
+        np.testing.assert_array_equal(
+            flipped[name], np.flip(sample[name], axis + (name == "posterior"))
+        )
         assert (flipped[name] != sample[name]).any() and flipped[name].flags.c_contiguous
     np.testing.assert_array_equal(flipped["labels"], np.flip(sample["labels"], axis))
 
@@ -156,7 +176,9 @@ def test_packed_stores_give_the_same_samples(world, tmp_path, ending):
     pytest.importorskip({"zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}[ending])
     carlasc.pack(world, tmp_path / f"packed.{ending}")
     fields = (*EVIDENCE_FIELDS, "known")
-    wanted, found = (Dataset(root, "train", fields=fields)[1] for root in (world, tmp_path / f"packed.{ending}"))
+    wanted, found = (
+        Dataset(root, "train", fields=fields)[1] for root in (world, tmp_path / f"packed.{ending}")
+    )
     for name in fields:
         np.testing.assert_array_equal(found[name], wanted[name])
         assert found[name].dtype == wanted[name].dtype
@@ -164,12 +186,18 @@ def test_packed_stores_give_the_same_samples(world, tmp_path, ending):
 
 @pytest.mark.parametrize(
     "arguments",
-    [*({"fields": [name]} for name in EVIDENCE_FIELDS), {"inferred": False}, {"min_confidence": 0.9}],
+    [
+        *({"fields": [name]} for name in EVIDENCE_FIELDS),
+        {"inferred": False},
+        {"min_confidence": 0.9},
+    ],
 )
 def test_a_grid_that_does_not_say_how_certain_it_is_is_named_with_what_to_do(world, arguments):
     with pytest.raises(MissingDataError) as error:
         Dataset(world, "val", **arguments)
-    assert str(error.value).startswith(f"{world / 'Val/Town07_Light/cartesian'}: expected the field evaluation/")
+    assert str(error.value).startswith(
+        f"{world / 'Val/Town07_Light/cartesian'}: expected the field evaluation/"
+    )
     assert "regrid with `voting=Voting(keep_evidence=True)`" in str(error.value)
 
 
@@ -177,7 +205,9 @@ def test_options_that_nothing_depends_on_ask_for_nothing(world):
     assert len(Dataset(world, "val", fields=("labels",), inferred=False, min_confidence=0.9)) == 3
 
 
-@pytest.mark.parametrize("row, message", [((48, 7, 1), "voxels 0 to 47, found 48"), ((-1, 7, 1), "found -1")])
+@pytest.mark.parametrize(
+    "row, message", [((48, 7, 1), "voxels 0 to 47, found 48"), ((-1, 7, 1), "found -1")]
+)
 def test_voxels_outside_of_the_grid_are_named(tmp_path, row, message):
     folder = write_drive(tmp_path / "A/cartesian", [0], spec=SPEC)
     writer = write_evidence(folder, [0])
@@ -190,7 +220,9 @@ def test_class_ids_without_a_target_are_named(tmp_path):
     folder = write_drive(tmp_path / "A/cartesian", [0], spec=SPEC)
     writer = write_evidence(folder, [0])
     writer.write("evaluation/classes", 0, np.array([(0, 200, 1)], field_files.VOTES_DTYPE))
-    with pytest.raises(FormatError, match="evaluation/classes of frame 0: expected class ids of carla, found 200"):
+    with pytest.raises(
+        FormatError, match="evaluation/classes of frame 0: expected class ids of carla, found 200"
+    ):
         Dataset(tmp_path, fields=("posterior",))[0]
 
 
@@ -201,5 +233,7 @@ def test_a_remap_of_other_classes_is_refused_for_soft_labels_too(world):
 
 @pytest.mark.parametrize("min_confidence", [-0.1, 1.0, float("nan")])
 def test_a_confidence_is_a_probability_below_1(world, min_confidence):
-    with pytest.raises(ArgumentError, match="min_confidence: expected a probability from 0 to below 1"):
+    with pytest.raises(
+        ArgumentError, match="min_confidence: expected a probability from 0 to below 1"
+    ):
         Dataset(world, min_confidence=min_confidence)

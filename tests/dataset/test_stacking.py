@@ -46,12 +46,19 @@ def specs(draw):
         return GridSpec("cartesian", size, lower, upper)
     start = draw(st.sampled_from([-PI32, -1.0, 0.0, 2.0]))
     turn = draw(st.sampled_from([2 * PI32, np.pi, 1.0]))
-    return GridSpec("cylindrical", size, (abs(lower[0]), start, lower[2]), (abs(lower[0]) + 20, start + turn, upper[2]))
+    return GridSpec(
+        "cylindrical",
+        size,
+        (abs(lower[0]), start, lower[2]),
+        (abs(lower[0]) + 20, start + turn, upper[2]),
+    )
 
 
 @st.composite
 def moves(draw):
-    return translation(draw(st.tuples(*[st.floats(-5, 5)] * 3))) @ rotation_z(draw(st.floats(-3.2, 3.2)))
+    return translation(draw(st.tuples(*[st.floats(-5, 5)] * 3))) @ rotation_z(
+        draw(st.floats(-3.2, 3.2))
+    )
 
 
 @given(specs(), moves(), st.integers(0, 700), st.integers(0, 2**32 - 1))
@@ -64,7 +71,11 @@ def test_any_grid_and_pose_bin_as_the_rules_say(spec, move, count, seed):
 @settings(max_examples=150, deadline=None)
 def test_points_on_and_beside_cell_edges_fall_as_the_rules_say(spec, places, ulps):
     axes = np.stack(
-        [spec.lower[a] + (np.roll(places, a) % (spec.size[a] + 3) - 1) * spec.voxel_size[a] for a in range(3)], 1
+        [
+            spec.lower[a] + (np.roll(places, a) % (spec.size[a] + 3) - 1) * spec.voxel_size[a]
+            for a in range(3)
+        ],
+        1,
     )
     points = np.asarray(spec.from_axes(axes), np.float32)
     for _ in range(abs(ulps)):
@@ -81,13 +92,19 @@ def test_published_grids_agree_on_a_drive(name):
 
 def test_bounds_that_are_no_float32_numbers_agree():
     spec = GridSpec("cartesian", (100, 7, 9), (-0.1, -1e-3, 1e6), (0.7, 0.9, 1e6 + 1 / 3))
-    points = np.random.default_rng(2).uniform((-0.2, 0, 1e6), (0.8, 1, 1e6 + 0.4), (5000, 3)).astype(np.float32)
+    points = (
+        np.random.default_rng(2)
+        .uniform((-0.2, 0, 1e6), (0.8, 1, 1e6 + 0.4), (5000, 3))
+        .astype(np.float32)
+    )
     agree(points, np.eye(4), spec)
 
 
 def test_what_is_not_finite_is_in_no_voxel():
     values = [np.nan, np.inf, -np.inf, 0.5]
-    points = np.array([p for p in itertools.product(values, repeat=3) if not np.isfinite(p).all()], np.float32)
+    points = np.array(
+        [p for p in itertools.product(values, repeat=3) if not np.isfinite(p).all()], np.float32
+    )
     for name in ("cartesian", "cylindrical"):
         assert not stack_scans([points], bend(3)[2:], GridSpec.published(name)).any()
 
@@ -104,7 +121,9 @@ def test_points_nearer_or_farther_than_the_ranges_are_left_out(near, far):
 
 def test_none_and_an_empty_scan_leave_their_grids_empty():
     points = random_points(np.random.default_rng(4), 500)
-    stack = stack_scans([None, points, points[:0]], np.tile(np.eye(4), (3, 1, 1)), GridSpec.published())
+    stack = stack_scans(
+        [None, points, points[:0]], np.tile(np.eye(4), (3, 1, 1)), GridSpec.published()
+    )
     assert [grid.any() for grid in stack] == [False, True, False]
 
 

@@ -20,13 +20,20 @@ GRIDS = {
 
 
 def off_edges(points, spec, margin=1e-3):
-    """Keep the points that lie clear of every cell edge: there half-open cells are mirrored to half-closed ones."""
-    cells = (spec.to_axes(points[:, :3].astype(np.float64)) - np.array(spec.lower)) / spec.voxel_size
+    """Keep the points that lie clear of every cell edge: there half-open cells are mirrored to
+    half-closed ones.
+    """
+    cells = (
+        spec.to_axes(points[:, :3].astype(np.float64)) - np.array(spec.lower)
+    ) / spec.voxel_size
     return points[(np.abs(cells - np.round(cells)) > margin).all(axis=1)]
 
 
 def sample_of(points, spec):
-    stacks = {what: stack_scans([points, points[::2]], bend(2), spec, what) for what in ("occupancy", "density")}
+    stacks = {
+        what: stack_scans([points, points[::2]], bend(2), spec, what)
+        for what in ("occupancy", "density")
+    }
     return stacks | {"points": points[:, :3].copy(), "poses": bend(2), "sequence": "A", "frame": 0}
 
 
@@ -38,9 +45,14 @@ def test_flipping_points_then_binning_is_binning_then_flipping(grid, axis, seed)
     spec = GRIDS[grid]
     points = off_edges(random_points(np.random.default_rng(seed), 400), spec)
     still = np.eye(4)[None]
-    sample = {"density": stack_scans([points], still, spec, "density"), "points": points[:, :3].copy()}
+    sample = {
+        "density": stack_scans([points], still, spec, "density"),
+        "points": points[:, :3].copy(),
+    }
     flipped = flip(sample, axis, spec)
-    np.testing.assert_array_equal(stack_scans([flipped["points"]], still, spec, "density"), flipped["density"])
+    np.testing.assert_array_equal(
+        stack_scans([flipped["points"]], still, spec, "density"), flipped["density"]
+    )
     assert flipped["density"].sum() == sample["density"].sum() > 0
 
 
@@ -53,7 +65,10 @@ def test_flipped_poses_still_bring_flipped_past_scans_into_the_current_frame(gri
     moved = past[:, :3].astype(np.float64) @ current_T_past[:3, :3].T + current_T_past[:3, 3]
     cells = (spec.to_axes(moved) - np.array(spec.lower)) / spec.voxel_size
     past = past[(np.abs(cells - np.round(cells)) > 1e-3).all(axis=1)]
-    sample = {"occupancy": stack_scans([past], current_T_past[None], spec), "poses": current_T_past[None]}
+    sample = {
+        "occupancy": stack_scans([past], current_T_past[None], spec),
+        "poses": current_T_past[None],
+    }
     sample = flip(sample | {"points": past[:, :3].copy()}, axis, spec)
     again = stack_scans([sample["points"]], sample["poses"], spec)
     np.testing.assert_array_equal(again, sample["occupancy"])
@@ -65,7 +80,12 @@ def test_labels_known_and_counts_are_flipped_as_the_points_in_their_voxels(grid)
     centres = spec.from_axes(spec.centers().reshape(-1, 3)).astype(np.float32)
     labels = np.arange(spec.num_voxels).reshape(spec.size)
     for axis in ("x", "y"):
-        sample = {"labels": labels, "counts": labels * 2.0, "known": labels % 3 == 0, "points": centres}
+        sample = {
+            "labels": labels,
+            "counts": labels * 2.0,
+            "known": labels % 3 == 0,
+            "points": centres,
+        }
         flipped = flip(sample, axis, spec)
         places = spec.flat_index(flipped["points"].astype(np.float64))
         np.testing.assert_array_equal(flipped["labels"].reshape(-1)[places], labels.reshape(-1))
@@ -131,7 +151,11 @@ def how(transform, frame, sequence="A"):
 def test_a_seed_makes_flips_that_depend_on_seed_epoch_sequence_and_frame_alone():
     transform = Flip(None, seed=3)
     first = [how(transform, frame) for frame in range(200)]
-    assert first == [how(transform, frame) for frame in range(200)] == [how(Flip(None, seed=3), f) for f in range(200)]
+    assert (
+        first
+        == [how(transform, frame) for frame in range(200)]
+        == [how(Flip(None, seed=3), f) for f in range(200)]
+    )
     assert first != [how(Flip(None, seed=4), frame) for frame in range(200)]
     assert first != [how(transform, frame, "B") for frame in range(200)]
     transform.set_epoch(1)
@@ -148,7 +172,9 @@ def test_each_axis_has_its_own_fair_coin():
 
 @pytest.mark.parametrize("probability, expected", [(0, (False, False)), (1, (True, False))])
 def test_probability_and_axes_are_kept_to(probability, expected):
-    assert {how(Flip(None, ["x"], probability=probability), frame) for frame in range(20)} == {expected}
+    assert {how(Flip(None, ["x"], probability=probability), frame) for frame in range(20)} == {
+        expected
+    }
 
 
 def test_without_a_seed_the_same_sample_is_flipped_anew_each_time():

@@ -24,7 +24,9 @@ def test_voxels_are_hit_passed_or_unseen_as_plain_sampling_says(spec, step_m):
     seen = stack_visibility(scans, moves, spec)
     assert seen.dtype == np.uint8 and seen.shape == (3, *spec.size)
     for grid, points, move in zip(seen, scans, moves, strict=True):
-        observation = Observation(np.ascontiguousarray(points[:, :3]), np.ones(len(points), np.uint16), move)
+        observation = Observation(
+            np.ascontiguousarray(points[:, :3]), np.ones(len(points), np.uint16), move
+        )
         votes = plain_votes([observation], spec, free_step_m=step_m)
         expected = np.where(votes[:, 1] > 0, HIT, np.where(votes[:, 0] > 0, PASSED, UNSEEN))
         np.testing.assert_array_equal(grid, expected.reshape(spec.size))
@@ -33,7 +35,9 @@ def test_voxels_are_hit_passed_or_unseen_as_plain_sampling_says(spec, step_m):
 
 def test_rays_of_a_past_scan_begin_where_its_sensor_was():
     wall = np.array([[6.0, 0.1, 0.1]], np.float32)
-    here, behind = stack_visibility([wall, wall], np.stack([np.eye(4), translation((-5.0, 0, 0))]), SPEC)[..., 8, 2]
+    here, behind = stack_visibility(
+        [wall, wall], np.stack([np.eye(4), translation((-5.0, 0, 0))]), SPEC
+    )[..., 8, 2]
     assert here.tolist() == [UNSEEN] * 8 + [PASSED] * 6 + [HIT, UNSEEN]
     assert behind.tolist() == [UNSEEN] * 3 + [PASSED] * 6 + [HIT] + [UNSEEN] * 6
 
@@ -77,4 +81,6 @@ def test_of_a_dense_scan_some_rays_are_followed_and_all_hits_are_kept():
     seen = stack_visibility([points], np.eye(4)[None], SPEC)
     some = stack_visibility([points[::3]], np.eye(4)[None], SPEC)
     np.testing.assert_array_equal(seen == HIT, stack_scans([points], np.eye(4)[None], SPEC) == 1)
-    np.testing.assert_array_equal((seen == PASSED) | (seen == HIT), (some != UNSEEN) | (seen == HIT))
+    np.testing.assert_array_equal(
+        (seen == PASSED) | (seen == HIT), (some != UNSEEN) | (seen == HIT)
+    )

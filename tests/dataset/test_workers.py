@@ -47,7 +47,9 @@ def same(batches, others):
 def test_default_collate_takes_every_dense_field_as_it_is(world):
     dataset = Dataset(world, history=3, fields=DENSE)
     batch = next(iter(loader(dataset, workers=0)))
-    assert {name: value.dtype for name, value in batch.items() if isinstance(value, torch.Tensor)} == {
+    assert {
+        name: value.dtype for name, value in batch.items() if isinstance(value, torch.Tensor)
+    } == {
         "occupancy": torch.uint8,
         "density": torch.uint16,
         "visibility": torch.uint8,
@@ -70,7 +72,16 @@ def test_collate_keeps_ragged_fields_as_lists(tmp_path):
         write_drive(tmp_path / name / "cartesian", [0], spec=SPEC, points=200 + 50 * seed)
     dataset = Dataset(tmp_path, fields=("points", "labels", "point_labels", "flow", "remission"))
     (batch,) = loader(dataset, workers=0, collate_fn=collate)
-    assert list(batch) == ["points", "labels", "point_labels", "flow", "remission", "valid", "sequence", "frame"]
+    assert list(batch) == [
+        "points",
+        "labels",
+        "point_labels",
+        "flow",
+        "remission",
+        "valid",
+        "sequence",
+        "frame",
+    ]
     assert [tuple(points.shape) for points in batch["points"]] == [(200, 3), (250, 3)]
     assert batch["labels"].shape == (2, *SPEC.size)
     for name in RAGGED:
@@ -86,12 +97,24 @@ def test_workers_give_what_one_process_gives(world):
 
 def test_shuffled_epochs_of_persistent_workers_give_every_sample_once(world):
     dataset = Dataset(world, history=2)
-    batches = loader(dataset, 2, shuffle=True, persistent_workers=True, generator=torch.Generator().manual_seed(0))
+    batches = loader(
+        dataset,
+        2,
+        shuffle=True,
+        persistent_workers=True,
+        generator=torch.Generator().manual_seed(0),
+    )
     orders = []
     for _ in range(3):
-        seen = [(s, f) for batch in batches for s, f in zip(batch["sequence"], batch["frame"].tolist(), strict=True)]
+        seen = [
+            (s, f)
+            for batch in batches
+            for s, f in zip(batch["sequence"], batch["frame"].tolist(), strict=True)
+        ]
         orders.append(seen)
-        assert sorted(seen) == sorted((s, f) for s in ("Town01_Light", "Town02_Light") for f in range(9))
+        assert sorted(seen) == sorted(
+            (s, f) for s in ("Town01_Light", "Town02_Light") for f in range(9)
+        )
     assert orders[0] != orders[1] != orders[2]
 
 
@@ -107,7 +130,9 @@ def test_distributed_ranks_share_the_samples(world):
 
 
 @pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
-def test_seeded_flips_are_those_of_one_process_and_follow_the_epoch_into_persistent_workers(world, method):
+def test_seeded_flips_are_those_of_one_process_and_follow_the_epoch_into_persistent_workers(
+    world, method
+):
     dataset = Dataset(world, history=2, fields=(*DENSE, "points", "flow"))
     dataset.transform = transform = Flip(dataset.spec, seed=5)
     alone = loader(dataset, 0, collate_fn=collate)
@@ -129,7 +154,9 @@ def test_flips_do_not_depend_on_how_many_workers_there_are_or_on_the_order(world
         return {
             (s, f): grid.numpy()
             for batch in batches
-            for s, f, grid in zip(batch["sequence"], batch["frame"].tolist(), batch["occupancy"], strict=True)
+            for s, f, grid in zip(
+                batch["sequence"], batch["frame"].tolist(), batch["occupancy"], strict=True
+            )
         }
 
     plain = by_frame(loader(dataset, 0))

@@ -1,4 +1,7 @@
-"""The examples are scripts and the packages beside them. They are not installed, so their folder goes on the path."""
+"""The examples are scripts and the packages beside them.
+
+They are not installed, so their folder goes on the path.
+"""
 
 from __future__ import annotations
 

@@ -27,7 +27,15 @@ from completion.weights import read_weights, write_weights
 
 CPU = torch.device("cpu")
 ALONE = Processes(0, 1, CPU)
-QUICK = Config("baseline", history=2, epochs=2, batch_size=2, workers=0, learning_rate=0.01, class_weights="train")
+QUICK = Config(
+    "baseline",
+    history=2,
+    epochs=2,
+    batch_size=2,
+    workers=0,
+    learning_rate=0.01,
+    class_weights="train",
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +65,14 @@ def test_it_tells_apart_what_was_hit_what_was_passed_and_what_was_never_seen():
     torch.manual_seed(0)
     network = Baseline(5, 4).eval()
     with torch.no_grad():
-        nothing, passed, hit = (network(torch.full((1, 1, 8, 8, 4), float(value))) for value in (0, PASSED, HIT))
-    assert not torch.equal(nothing, passed) and not torch.equal(passed, hit) and not torch.equal(nothing, hit)
+        nothing, passed, hit = (
+            network(torch.full((1, 1, 8, 8, 4), float(value))) for value in (0, PASSED, HIT)
+        )
+    assert (
+        not torch.equal(nothing, passed)
+        and not torch.equal(passed, hit)
+        and not torch.equal(nothing, hit)
+    )
 
 
 def test_the_layers_of_height_are_not_mixed_up():
@@ -76,14 +90,19 @@ def test_the_layers_of_height_are_not_mixed_up():
     assert (network(torch.zeros(2, 1, 8, 8, 4)).argmax(-1) == target).float().mean() > 0.9
 
 
-def test_it_learns_and_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(data, tmp_path):
+def test_it_learns_and_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(
+    data, tmp_path
+):
     config = replace(QUICK, epochs=3, soft_labels=False)
     whole = train(data, config, tmp_path / "whole", ALONE)
     assert whole.losses[-1] < whole.losses[0]
     train(data, replace(config, epochs=1), tmp_path / "parts", ALONE)
     parts = train(data, replace(config, keep_samples=True), tmp_path / "parts", ALONE, resume=True)
     assert parts.losses == whole.losses  # also with samples that are kept in memory
-    expected, found = read_weights(tmp_path / "whole" / LAST), read_weights(tmp_path / "parts" / LAST)
+    expected, found = (
+        read_weights(tmp_path / "whole" / LAST),
+        read_weights(tmp_path / "parts" / LAST),
+    )
     for name, value in expected.items():
         assert torch.equal(value, found[name]), name
 
@@ -92,7 +111,9 @@ def test_history_may_be_shuffled_and_the_newest_scan_stays_last(data):
     from completion.data import open_split
 
     config = replace(QUICK, history=3)
-    plain, shuffled = (open_split(data, "train", replace(config, shuffle_history=on))[2] for on in (False, True))
+    plain, shuffled = (
+        open_split(data, "train", replace(config, shuffle_history=on))[2] for on in (False, True)
+    )
     np.testing.assert_array_equal(plain["visibility"][-1], shuffled["visibility"][-1])
     assert sorted(grid.tobytes() for grid in plain["visibility"]) == sorted(
         grid.tobytes() for grid in shuffled["visibility"]
@@ -106,10 +127,15 @@ def test_without_rays_it_is_told_the_hits_alone(data, weights, tmp_path):
     sample = Dataset(data, "val", history=2, fields=("visibility", "occupancy"))[1]
     batch = {name: torch.from_numpy(sample[name])[None] for name in ("visibility", "occupancy")}
     (all_seen,), (hit,) = (task.arguments(task.prepare(batch, CPU)) for task in (told, hits))
-    assert torch.equal(hit, torch.where(all_seen == HIT, all_seen, 0.0)) and (all_seen == PASSED).any()
+    assert (
+        torch.equal(hit, torch.where(all_seen == HIT, all_seen, 0.0)) and (all_seen == PASSED).any()
+    )
     np.testing.assert_array_equal(hits.seen(sample, SPEC), told.seen(sample, SPEC))
-    assert np.isfinite(train(data, replace(QUICK, network="baseline_hits", epochs=1), tmp_path, ALONE).losses[0])
-    assert Model.read(tmp_path / "best.safetensors").network == "baseline_hits"  # by the settings of the run
+    assert np.isfinite(
+        train(data, replace(QUICK, network="baseline_hits", epochs=1), tmp_path, ALONE).losses[0]
+    )
+    # by the settings of the run
+    assert Model.read(tmp_path / "best.safetensors").network == "baseline_hits"
     assert Model.read(weights, 2).network == "baseline"
 
 
@@ -133,12 +159,18 @@ def test_raw_scans_are_completed_by_a_network_of_one_scan(data, tmp_path):
     model = Model.read(tmp_path / "one.pt")
     assert predict_scans(model, scans, tmp_path / "raw", CPU, "eager", spec=SPEC) == 3
     assert predict_dataset(model, str(data), tmp_path / "out", CPU, "eager", split="val") == 3
-    (one,), (other,) = (open_source(tmp_path / name).sequences().values() for name in ("raw", "out"))
-    np.testing.assert_array_equal(one.grid("evaluation", 2).labels, other.grid("evaluation", 2).labels)
+    (one,), (other,) = (
+        open_source(tmp_path / name).sequences().values() for name in ("raw", "out")
+    )
+    np.testing.assert_array_equal(
+        one.grid("evaluation", 2).labels, other.grid("evaluation", 2).labels
+    )
 
 
 def test_weights_for_another_history_or_grid_and_grids_that_do_not_divide_are_refused(weights):
-    with pytest.raises(FormatError, match=r"seen.0.weight: expected 32 x 16 x 3 x 3, found 32 x 32 .*history"):
+    with pytest.raises(
+        FormatError, match=r"seen.0.weight: expected 32 x 16 x 3 x 3, found 32 x 32 .*history"
+    ):
         Model.read(weights, 1).complete_on(SPEC, CPU, "eager")
     with pytest.raises(ArgumentError, match="multiples of 8 x 8 x 1 cells, found 12 x 16 x 8"):
         build_network("baseline", 11, SPEC.with_size((12, 16, 8)))
@@ -153,8 +185,13 @@ def test_what_it_takes_is_measured_like_other_networks():
 
 
 @pytest.mark.needs("tensorboard")
-def test_a_sample_that_is_alone_in_its_batch_is_too_little_for_the_batch_norms_of_a_small_grid(data, tmp_path):
-    config = Config("motionsc", epochs=1, batch_size=5, workers=0, class_weights="none")  # 6 samples, 16 x 16 cells
-    with pytest.raises(CarlascError, match=r"epoch 1, batch 2: 1 sample is too little .*choose a batch_size") as error:
+def test_a_sample_that_is_alone_in_its_batch_is_too_little_for_the_batch_norms_of_a_small_grid(
+    data, tmp_path
+):
+    # 6 samples, 16 x 16 cells
+    config = Config("motionsc", epochs=1, batch_size=5, workers=0, class_weights="none")
+    with pytest.raises(
+        CarlascError, match=r"epoch 1, batch 2: 1 sample is too little .*choose a batch_size"
+    ) as error:
         train(data, config, tmp_path, ALONE)
     assert "\n" not in str(error.value)

@@ -1,4 +1,6 @@
-"""The mini benchmark: its drives and labels, its rows, what it keeps and prints; and the check with published weights."""
+"""The mini benchmark: its drives and labels, its rows, what it keeps and prints; and the check with
+published weights.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,16 @@ from benchmarking.kept import note, read
 from benchmarking.rows import history_rows, js3cnet_rows, label_rows, network_rows
 from benchmarking.runs import RATES, Result, result_of, settings_of_run
 from benchmarking.sizes import SIZES, SPLITS, key_of, settings_of
-from benchmarking.tables import LABELS, MIOU, NETWORK, VEHICLES, difference, figure_table, to_markdown, with_interval
+from benchmarking.tables import (
+    LABELS,
+    MIOU,
+    NETWORK,
+    VEHICLES,
+    difference,
+    figure_table,
+    to_markdown,
+    with_interval,
+)
 from completion.processes import Processes
 
 ALONE = Processes(0, 1, torch.device("cpu"))
@@ -43,7 +54,9 @@ def folder(tmp_path_factory):
 
 
 def result(correct: int = 50, phantoms: int = 0, seed: int = 0) -> Result:
-    """Return a result over two frames of two drives, which are alike: 50 voxels of vehicles, 500 free ones in each."""
+    """Return a result over two frames of two drives, which are alike: 50 voxels of vehicles, 500
+    free ones in each.
+    """
     counts = np.zeros((2, 11, 11), np.int64)
     counts[:, VEHICLE, VEHICLE], counts[:, VEHICLE, 0] = correct // 2, 50 - correct // 2
     counts[:, 0, PEDESTRIAN], counts[:, 0, 0] = phantoms // 2, 500 - phantoms // 2
@@ -55,7 +68,9 @@ def result(correct: int = 50, phantoms: int = 0, seed: int = 0) -> Result:
 def test_the_same_frames_of_a_drive_have_four_kinds_of_labels(folder):
     samples = {}
     for name in ("evaluation", "tube", "align", "wrong"):
-        data = Dataset(folder / "data", "train", grid=name, fields=("labels", "known", "visibility"))
+        data = Dataset(
+            folder / "data", "train", grid=name, fields=("labels", "known", "visibility")
+        )
         assert [data[i]["frame"] for i in range(len(data))] == [1, 2, 3]
         assert data.spec == TINY.scenes.spec
         samples[name] = data[1]
@@ -75,7 +90,9 @@ def test_the_same_frames_of_a_drive_have_four_kinds_of_labels(folder):
 def test_drives_are_made_once_and_other_scenes_do_not_mix_with_them(folder):
     files = {path: path.stat().st_mtime_ns for path in (folder / "data").rglob("*.bin")}
     done = []
-    build_drives(folder / "data", TINY.scenes, workers=1, progress=lambda *steps: done.append(steps))
+    build_drives(
+        folder / "data", TINY.scenes, workers=1, progress=lambda *steps: done.append(steps)
+    )
     assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert {path: path.stat().st_mtime_ns for path in files} == files
     with pytest.raises(ConflictError, match="scenes.json: expected .* found other scenes"):
@@ -89,7 +106,9 @@ def test_a_run_is_kept_and_made_again_only_with_other_settings(folder):
     (kept,) = (folder / "results").iterdir()
     assert kept.stem == key_of(settings_of_run(TINY.scenes, row.config))
     written = kept.stat().st_mtime_ns
-    again = result_of(TINY.scenes, dataclasses.replace(row.config, workers=3, keep_samples=False), folder, ALONE)
+    again = result_of(
+        TINY.scenes, dataclasses.replace(row.config, workers=3, keep_samples=False), folder, ALONE
+    )
     assert kept.stat().st_mtime_ns == written
     np.testing.assert_array_equal(again.matrix.counts, first.matrix.counts)
     assert (again.frames, again.best_epoch) == (first.frames, first.best_epoch) == (6, 1)
@@ -119,7 +138,10 @@ def test_the_benchmark_keeps_its_results_and_a_second_run_trains_nothing(folder,
     assert {run.settings["run"]["learning_rate"] for run in runs} <= set(RATES)
     made = benchmark_page.tables(kept)
     assert not [text for text in made.values() if "Not run" in text]
-    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "tiny" / "runs").rglob("best.safetensors")}
+    written = {
+        path: path.stat().st_mtime_ns
+        for path in (tmp_path / "tiny" / "runs").rglob("best.safetensors")
+    }
     before = results.read_text()
     benchmark.main(tmp_path, **arguments)
     assert results.read_text() == before
@@ -129,7 +151,9 @@ def test_the_benchmark_keeps_its_results_and_a_second_run_trains_nothing(folder,
 def test_a_stretch_with_pedestrians_and_moving_vehicles_is_chosen():
     def actor(label, at, speed=0.0):
         mesh = SimpleNamespace(labels=np.array([label, label, 0]))
-        return SimpleNamespace(world_T_actor=translation(at), velocity=np.array([speed, 0, 0]), mesh=mesh)
+        return SimpleNamespace(
+            world_T_actor=translation(at), velocity=np.array([speed, 0, 0]), mesh=mesh
+        )
 
     class Stub:
         def actors(self, frame):
@@ -145,12 +169,16 @@ def test_a_stretch_with_pedestrians_and_moving_vehicles_is_chosen():
 
 def test_seeds_of_the_splits_are_apart_and_a_part_fits_the_size():
     for size in SIZES.values():
-        towns = [range(first, first + count) for (_, first), count in zip(SPLITS, size.scenes.towns, strict=True)]
+        towns = [
+            range(first, first + count)
+            for (_, first), count in zip(SPLITS, size.scenes.towns, strict=True)
+        ]
         assert len(set().union(*towns)) == sum(map(len, towns))
         assert size.scenes.spec.size == size.scenes.cells
     medium, small = SIZES["medium"].scenes, SIZES["small"].scenes
     assert medium.spec.voxel_size[:2] == pytest.approx(0.4)
-    assert all(a <= b for a, b in zip(small.towns, medium.towns, strict=True))  # the small one is a part of it
+    # the small one is a part of it
+    assert all(a <= b for a, b in zip(small.towns, medium.towns, strict=True))
 
 
 def test_every_row_trains_as_its_paper_says():
@@ -160,7 +188,10 @@ def test_every_row_trains_as_its_paper_says():
     for weighting in ("log", "root"):
         sscnet = networks[f"SSCNet full, {weighting}"]
         assert (sscnet.free_ratio, sscnet.decay, sscnet.weighting) == (2.0, 1.0, weighting)
-        decays = networks[f"LMSCNet SS, {weighting}"].decay, networks[f"MotionSC T=5, {weighting}"].decay
+        decays = (
+            networks[f"LMSCNet SS, {weighting}"].decay,
+            networks[f"MotionSC T=5, {weighting}"].decay,
+        )
         assert decays == (0.98, 0.96)
     (js3cnet,) = js3cnet_rows(size)
     assert (js3cnet.config.decay, js3cnet.config.decay_every) == (0.7, 10)
@@ -172,9 +203,12 @@ def test_every_row_trains_as_its_paper_says():
         "align, soft labels": "align",
         "capture truth": "evaluation",
     }
-    assert labels["capture truth"].config == networks["Baseline T=5, root"]  # one run for both tables
+    # one run for both tables
+    assert labels["capture truth"].config == networks["Baseline T=5, root"]
     assert [row.config.history for row in history_rows(size)] == [1, 5, 5, 5] * 2
-    assert {row.seeds for row in (*labels.values(), *network_rows(size), *history_rows(size))} == {3}
+    assert {row.seeds for row in (*labels.values(), *network_rows(size), *history_rows(size))} == {
+        3
+    }
 
 
 def test_settings_that_change_a_result_change_its_key():
@@ -182,7 +216,8 @@ def test_settings_that_change_a_result_change_its_key():
     key = key_of(settings_of_run(scenes, config))
     assert key == key_of(settings_of_run(scenes, dataclasses.replace(config, workers=7)))
     others = [
-        dataclasses.replace(config, **{name: value}) for name, value in (("seed", 1), ("grid", "align"), ("epochs", 9))
+        dataclasses.replace(config, **{name: value})
+        for name, value in (("seed", 1), ("grid", "align"), ("epochs", 9))
     ]
     assert key not in {key_of(settings_of_run(scenes, other)) for other in others}
     denser = dataclasses.replace(scenes, lidar=Lidar(channels=64))
@@ -198,7 +233,9 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
     assert {**vars(other), "drives": None} == {**vars(one), "drives": None}
     for seed in (1, 0):
         note(tmp_path / "results.json", "labels", "tube", result(40, 10, seed))
-    assert [run.settings["run"]["seed"] for run in read(tmp_path / "results.json")["labels"]["tube"]] == [0, 1]
+    assert [
+        run.settings["run"]["seed"] for run in read(tmp_path / "results.json")["labels"]["tube"]
+    ] == [0, 1]
 
 
 def test_figures_are_those_of_the_counts():
@@ -239,12 +276,17 @@ def test_a_difference_that_every_drive_and_seed_shows_is_sure_and_one_of_a_singl
 
 
 def test_a_study_that_was_stopped_has_equally_many_seeds_of_each_row():
-    rows = {"MotionSC T=5, root": [result(40), result(44, seed=1)], "Baseline T=5, root": [result(60)]}
+    rows = {
+        "MotionSC T=5, root": [result(40), result(44, seed=1)],
+        "Baseline T=5, root": [result(60)],
+    }
     made = benchmark_page.tables({"networks": rows})
     assert "| MotionSC T=5 | root | 0.001 | 12.2 | 40.0 |" in made["networks"]
     assert "one seed, 3 epochs, 2 test drives of 1 frames" in made["networks"]
     assert "Not run yet: Baseline T=5, log; MotionSC T=5, log; LMSCNet SS, log" in made["networks"]
-    assert made["history"].startswith("Not run: `python examples/benchmark.py WORK --size medium --study history`")
+    assert made["history"].startswith(
+        "Not run: `python examples/benchmark.py WORK --size medium --study history`"
+    )
 
 
 def test_the_page_has_the_tables_of_the_results_that_are_kept():
@@ -257,7 +299,9 @@ def test_the_page_has_the_tables_of_the_results_that_are_kept():
 @pytest.mark.slow
 @pytest.mark.parametrize("weights", ["LMSC_11_T1B.pt", "SSC_Full_11_T1B.pt"])
 def test_the_published_weights_see_a_simulated_town(real, tmp_path, weights):
-    """3 of the 30 frames of docs/networks.md: free space, poles and buildings are where the town has them."""
+    """3 of the 30 frames of docs/networks.md: free space, poles and buildings are where the town
+    has them.
+    """
     score = published.score_towns(real / weights, tmp_path, every=10, workers=1)
     iou = {name: 100 * value for name, value in score.class_iou.items()}
     assert iou["Free"] >= 90

@@ -1,4 +1,6 @@
-"""The frame of the scripts: progress where there is no terminal, what Ctrl-C leaves, and the README's command on the demo's data."""
+"""The frame of the scripts: progress where there is no terminal, what Ctrl-C leaves, and the
+README's command on the demo's data.
+"""
 
 import re
 import shlex
@@ -40,7 +42,10 @@ def test_ctrl_c_says_how_to_continue(monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         command.run(main, "with --resume, the same command continues")
     assert ended.value.code == 130
-    assert capsys.readouterr().err == "\ntrain.py: interrupted: with --resume, the same command continues\n"
+    assert (
+        capsys.readouterr().err
+        == "\ntrain.py: interrupted: with --resume, the same command continues\n"
+    )
 
 
 @pytest.mark.slow

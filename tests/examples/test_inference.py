@@ -33,7 +33,9 @@ class Small(torch.nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layer = torch.nn.Sequential(torch.nn.Conv2d(8, 3 * 8, 3, padding=1), torch.nn.BatchNorm2d(24))
+        self.layer = torch.nn.Sequential(
+            torch.nn.Conv2d(8, 3 * 8, 3, padding=1), torch.nn.BatchNorm2d(24)
+        )
 
     def forward(self, occupancy):
         features = self.layer(occupancy[:, -1].permute(0, 3, 1, 2)).relu()
@@ -45,7 +47,9 @@ class Small(torch.nn.Module):
 def test_a_compiled_network_gives_the_labels_of_the_eager_one():
     torch.manual_seed(0)
     network = Small()
-    occupancy = torch.from_numpy((np.random.default_rng(0).random((1, 1, *SPEC.size)) < 0.1).astype(np.uint8))
+    occupancy = torch.from_numpy(
+        (np.random.default_rng(0).random((1, 1, *SPEC.size)) < 0.1).astype(np.uint8)
+    )
     eager = prepare(network, CPU, "eager")(occupancy)
     assert len(eager.unique()) == 3
     compiled = prepare(network, CPU, "compile")

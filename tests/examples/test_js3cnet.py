@@ -38,7 +38,9 @@ def expected(golden):
 
 @cache
 def entries(path, tag):
-    (listed,) = (v for v in json.loads(path.read_text())["configs"][tag].values() if isinstance(v, list))
+    (listed,) = (
+        v for v in json.loads(path.read_text())["configs"][tag].values() if isinstance(v, list)
+    )
     return listed
 
 
@@ -50,7 +52,11 @@ def values(index, entry, keys):
     drawn = np.random.default_rng(index).standard_normal(shape)
     if key.endswith("running_var"):
         return (np.abs(drawn) + 0.5).astype(np.float32)
-    if key.endswith("weight") and len(shape) == 1 and f"{key.removesuffix('weight')}running_var" in keys:
+    if (
+        key.endswith("weight")
+        and len(shape) == 1
+        and f"{key.removesuffix('weight')}running_var" in keys
+    ):
         return (1 + 0.1 * drawn).astype(np.float32)
     drawn = drawn / np.sqrt(np.prod(shape[1:])) if len(shape) >= 2 else drawn / 10
     return np.asarray(drawn, np.float32)
@@ -67,7 +73,9 @@ def layout(array, entry):
 def filled(golden, tag, gain=1.0, **settings):
     listed = entries(golden / "js3c_state_dict.json", tag)
     keys = {entry["key"] for entry in listed}
-    network = JS3CNet(CLASSES[tag], SPECS[tag], **SETTINGS[tag], **{"search": "topk"} | settings).eval()
+    network = JS3CNet(
+        CLASSES[tag], SPECS[tag], **SETTINGS[tag], **{"search": "topk"} | settings
+    ).eval()
     state = {entry["key"]: layout(values(i, entry, keys), entry) for i, entry in enumerate(listed)}
     for entry in listed:
         if len(entry["shape"]) == 5 and entry["key"].startswith("seg_head"):
@@ -108,10 +116,15 @@ def test_outputs_are_the_golden_ones(golden, expected, tag):
 
 
 @pytest.mark.parametrize("tag", ["A", "B"])
-def test_outputs_with_larger_weights_are_the_golden_ones_at_the_deepest_level_too(golden, expected, tag):
+def test_outputs_with_larger_weights_are_the_golden_ones_at_the_deepest_level_too(
+    golden, expected, tag
+):
     with torch.no_grad():
         prediction = run(filled(golden, tag, float(expected[f"{tag}_gain_value"])), expected, tag)
-        for name, found in {"seg": prediction.points, "ssc": prediction.voxels.permute(0, 4, 1, 2, 3)}.items():
+        for name, found in {
+            "seg": prediction.points,
+            "ssc": prediction.voxels.permute(0, 4, 1, 2, 3),
+        }.items():
             wanted = expected[f"{tag}_gain_{name}_logits"]
             close(found, wanted, 1e-5 * np.abs(wanted).max())
 
@@ -136,17 +149,23 @@ def test_every_stage_of_the_u_net_is_the_golden_one(golden, expected):
         run(network, expected, "A")
     assert len(seen) == 28
     for name, sites in seen.items():
-        np.testing.assert_array_equal(sites.levels[-1].cells[:, 1:].numpy(), expected[f"A_{name}_coords"], name)
+        np.testing.assert_array_equal(
+            sites.levels[-1].cells[:, 1:].numpy(), expected[f"A_{name}_coords"], name
+        )
         close(sites.features, expected[f"A_{name}_feat"])
 
 
 def test_pooling_decoder_neighbours_and_fusion_are_the_golden_ones(golden, expected):
     network, seen = filled(golden, "A"), {}
     head = network.complet_head
-    modules = {name: module for name, module in head.Decoder.named_children() if f"A_{name}" in expected}
+    modules = {
+        name: module for name, module in head.Decoder.named_children() if f"A_{name}" in expected
+    }
     modules |= {"decoder": head.Decoder, "fused": head.interaction_module}
     for name, module in modules.items():
-        module.register_forward_hook(lambda _m, _i, output, name=name: seen.__setitem__(name, output))
+        module.register_forward_hook(
+            lambda _m, _i, output, name=name: seen.__setitem__(name, output)
+        )
     head.register_forward_pre_hook(lambda _m, inputs: seen.__setitem__("volume", inputs[0]))
     with torch.no_grad():
         run(network, expected, "A")
@@ -160,19 +179,28 @@ def test_pooling_decoder_neighbours_and_fusion_are_the_golden_ones(golden, expec
 
 
 def test_neighbours_are_the_golden_ones_up_to_the_rule_for_index_0(expected):
-    supports, queries = (torch.from_numpy(expected[f"A_knn_{name}"]) for name in ("support", "query"))
+    supports, queries = (
+        torch.from_numpy(expected[f"A_knn_{name}"]) for name in ("support", "query")
+    )
     wanted = torch.from_numpy(expected["A_knn_idx"]).long()
     wanted = torch.where(wanted == 0, wanted[:, :1], wanted)
     assert torch.equal(nearest(supports, queries, "topk"), wanted)
 
 
-def test_the_exact_variant_and_the_reference_s_own_tree_are_the_golden_ones(golden, expected, monkeypatch):
+def test_the_exact_variant_and_the_reference_s_own_tree_are_the_golden_ones(
+    golden, expected, monkeypatch
+):
     with torch.no_grad():
         exact = run(filled(golden, "A", exact=True), expected, "A").voxels
         close(exact.permute(0, 4, 1, 2, 3), expected["A_exact_ssc_logits"])
         index = torch.from_numpy(expected["A_nano_knn_idx"]).long()
-        monkeypatch.setattr("js3cnet.model.nearest", lambda *_: torch.where(index == 0, index[:, :1], index))
-        close(run(filled(golden, "A"), expected, "A").voxels.permute(0, 4, 1, 2, 3), expected["A_nano_ssc_logits"])
+        monkeypatch.setattr(
+            "js3cnet.model.nearest", lambda *_: torch.where(index == 0, index[:, :1], index)
+        )
+        close(
+            run(filled(golden, "A"), expected, "A").voxels.permute(0, 4, 1, 2, 3),
+            expected["A_nano_ssc_logits"],
+        )
 
 
 def test_the_tree_and_topk_find_neighbours_at_the_same_distances():
@@ -180,16 +208,24 @@ def test_the_tree_and_topk_find_neighbours_at_the_same_distances():
     supports = torch.randint(-9, 9, (300, 3), generator=generator).float()
     queries = torch.randint(-9, 9, (80, 3), generator=generator).float()
     found = [
-        (supports[nearest(supports, queries, search)] - queries[:, None]).norm(dim=2) for search in ("tree", "topk")
+        (supports[nearest(supports, queries, search)] - queries[:, None]).norm(dim=2)
+        for search in ("tree", "topk")
     ]
     same = (found[0] == found[1]).all(1)
-    assert same.double().mean() > 0.9  # index 0 is taken for empty, in either, and may be found in either of two ties
+    # index 0 is taken for empty, in either, and may be found in either of two ties
+    assert same.double().mean() > 0.9
 
 
 def test_fewer_supports_than_neighbours_are_filled_up_with_the_nearest():
-    supports, queries = torch.tensor([[9.0, 0, 0], [0, 0, 0], [1, 0, 0]]), torch.tensor([[0.0, 0, 0], [2, 0, 0]])
+    supports, queries = (
+        torch.tensor([[9.0, 0, 0], [0, 0, 0], [1, 0, 0]]),
+        torch.tensor([[0.0, 0, 0], [2, 0, 0]]),
+    )
     for search in ("tree", "topk"):
-        assert nearest(supports, queries, search).tolist() == [[1, 2, 1, 1, 1, 1, 1, 1], [2, 1, 2, 2, 2, 2, 2, 2]]
+        assert nearest(supports, queries, search).tolist() == [
+            [1, 2, 1, 1, 1, 1, 1, 1],
+            [2, 1, 2, 2, 2, 2, 2, 2],
+        ]
 
 
 def test_a_cell_holds_the_mean_of_five_slots():
@@ -197,7 +233,11 @@ def test_a_cell_holds_the_mean_of_five_slots():
     cells = torch.tensor([0, 0, 0, 3, 2, 2, 2, 2, 2])
     volume = pool(features, cells, (1, 2, 2, 1)).flatten()
     torch.testing.assert_close(volume, torch.tensor([(3 + 10 + 100) / 5, 0, (4 + 1000) / 5, 7]))
-    more = pool(torch.cat([features, torch.tensor([[9999.0]])]), torch.cat([cells, torch.tensor([2])]), (1, 2, 2, 1))
+    more = pool(
+        torch.cat([features, torch.tensor([[9999.0]])]),
+        torch.cat([cells, torch.tensor([2])]),
+        (1, 2, 2, 1),
+    )
     torch.testing.assert_close(more.flatten(), volume)
 
 
@@ -257,7 +297,9 @@ def test_scans_wider_than_the_u_net_lose_the_points_beyond():
 
 def test_augmented_cells_are_within_the_grid_and_come_from_the_generator():
     xyz = torch.rand(500, 3) * 40 - 20
-    first, second, again = (site_cells(xyz, 0.1, 2048, torch.Generator().manual_seed(seed)) for seed in (0, 1, 0))
+    first, second, again = (
+        site_cells(xyz, 0.1, 2048, torch.Generator().manual_seed(seed)) for seed in (0, 1, 0)
+    )
     assert first[1].all() and (first[0] >= 0).all() and (first[0] < 2048).all()
     assert torch.equal(first[0], again[0])
     assert not torch.equal(first[0], second[0])
@@ -283,13 +325,16 @@ def test_losses_and_gradients_are_the_golden_ones(golden, expected, tag):
     target = given["ssc_label"].masked_fill(given["invalid"] == 1, IGNORE)
     outputs = run(network, expected, tag)
     own = [torch.from_numpy(expected[f"{tag}_loss_{name}_w"]) for name in ("seg", "ssc")]
-    # Points and voxels have weights of their own there; here those of the points are those of the occupied classes.
+    # Points and voxels have weights of their own there; here those of the points are those of the
+    # occupied classes.
     points = task.loss(outputs, batch, target, torch.cat([own[1][:1], own[0]]))
     voxels = task.loss(outputs, batch, target, own[1])
     parts = torch.stack([points[0][0] / points[1][0], voxels[0][1] / voxels[1][1]])
     factors, offset = task.balance(network, parts)
     loss = (factors * parts).sum() + offset
-    np.testing.assert_allclose([*parts.tolist(), loss.item()], expected[f"{tag}_loss_values"], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        [*parts.tolist(), loss.item()], expected[f"{tag}_loss_values"], rtol=0, atol=1e-4
+    )
     loss.backward()
     parameters = dict(network.named_parameters())
     for key, norm in zip(expected[f"{tag}_grad_keys"], expected[f"{tag}_grad_norm"], strict=True):
@@ -305,9 +350,13 @@ def test_a_scan_without_points_or_with_wrong_ones_is_named():
         "sequence": ["a", "Town01_Light"],
         "frame": torch.tensor([1, 7]),
     }
-    with pytest.raises(ArgumentError, match="Town01_Light 7: points: expected one point or more, found none"):
+    with pytest.raises(
+        ArgumentError, match="Town01_Light 7: points: expected one point or more, found none"
+    ):
         task.prepare(batch, cpu)
-    with pytest.raises(ArgumentError, match="points: expected finite values, found 1 points with others"):
+    with pytest.raises(
+        ArgumentError, match="points: expected finite values, found 1 points with others"
+    ):
         task.prepare({"points": [torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]])]}, cpu)
 
 
@@ -323,7 +372,9 @@ def test_remission_is_the_fourth_column_where_a_network_takes_it_and_must_be_the
 
 
 def test_class_weights_are_cube_roots_of_the_rarity():
-    np.testing.assert_allclose(WEIGHTINGS[PointsAndVoxels().weighting](np.array([800, 100, 0])), [1, 2, 0])
+    np.testing.assert_allclose(
+        WEIGHTINGS[PointsAndVoxels().weighting](np.array([800, 100, 0])), [1, 2, 0]
+    )
 
 
 def test_the_momentum_of_the_norms_of_points_falls_and_the_others_stay():
@@ -339,7 +390,9 @@ def test_the_momentum_of_the_norms_of_points_falls_and_the_others_stay():
 
 @pytest.mark.slow
 def test_a_full_scan_takes_seconds_on_one_core():
-    """120,000 points on surfaces, nearly each in a site of its own: at most 2.5 s for the points, 4 s for all of it."""
+    """120,000 points on surfaces, nearly each in a site of its own: at most 2.5 s for the points, 4
+    s for all of it.
+    """
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-45, 45, (2, 120_000))
     z = np.where(rng.random(120_000) < 0.3, rng.uniform(-1.8, 1, 120_000), -1.8)

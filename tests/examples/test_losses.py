@@ -31,7 +31,8 @@ def test_coarse_scales_join_the_loss_as_a_mean():
     sums, totals = completion_loss([fine, half], target, weights)
     coarse = coarsen(target, 2, K)
     expected = (
-        cross_entropy(fine.reshape(-1, K), target.reshape(-1)) + cross_entropy(half.reshape(-1, K), coarse.reshape(-1))
+        cross_entropy(fine.reshape(-1, K), target.reshape(-1))
+        + cross_entropy(half.reshape(-1, K), coarse.reshape(-1))
     ) / 2
     torch.testing.assert_close((sums / totals).mean(), expected)
 
@@ -56,7 +57,9 @@ def test_blocks_are_those_of_a_plain_loop():
     for b, x, y, z in np.ndindex(found.shape):
         inside = target[b, 4 * x : 4 * x + 4, 4 * y : 4 * y + 4, 4 * z : 4 * z + 4]
         counts = [(inside == c).sum() for c in range(1, K)]
-        expected = 1 + int(np.argmax(counts)) if max(counts) else 0 if (inside == 0).any() else IGNORE
+        expected = (
+            1 + int(np.argmax(counts)) if max(counts) else 0 if (inside == 0).any() else IGNORE
+        )
         assert found[b, x, y, z] == expected
 
 

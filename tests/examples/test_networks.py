@@ -33,7 +33,11 @@ def fill(network: torch.nn.Module) -> None:
         values = rng.standard_normal(shape)
         if key.endswith("running_var"):
             values = np.abs(values) + 0.5
-        elif key.endswith("weight") and len(shape) == 1 and f"{key.removesuffix('weight')}running_var" in state:
+        elif (
+            key.endswith("weight")
+            and len(shape) == 1
+            and f"{key.removesuffix('weight')}running_var" in state
+        ):
             values = 1 + 0.1 * values
         elif len(shape) >= 2:
             values = values / np.sqrt(np.prod(shape[1:]))
@@ -55,9 +59,13 @@ def test_outputs_are_the_golden_ones(name, golden):
     network = NETWORKS[name]().eval()
     fill(network)
     frames = int(name.rpartition("_T")[2]) if "_T" in name else 1
-    occupancy = (np.random.default_rng(1000 + frames).random((2, frames, 16, 16, 8)) < 0.15).astype(np.float32)
+    occupancy = (np.random.default_rng(1000 + frames).random((2, frames, 16, 16, 8)) < 0.15).astype(
+        np.float32
+    )
     with torch.no_grad(), np.load(golden / "models.npz") as expected:
-        np.testing.assert_allclose(network(torch.from_numpy(occupancy)).numpy(), expected[name], rtol=0, atol=1e-4)
+        np.testing.assert_allclose(
+            network(torch.from_numpy(occupancy)).numpy(), expected[name], rtol=0, atol=1e-4
+        )
 
 
 @pytest.mark.parametrize("frames", [1, 6, 7, 13])
@@ -89,11 +97,17 @@ def test_sizes_are_those_of_the_papers():
         ("SSCNet_full", "SSC_Full_11_T1B.pt", "published_ssc_full.npz"),
     ],
 )
-def test_the_published_weights_load_strictly_and_give_the_published_outputs(real, golden, name, weights, outputs):
+def test_the_published_weights_load_strictly_and_give_the_published_outputs(
+    real, golden, name, weights, outputs
+):
     network = NETWORKS[name]().eval()
-    network.load_state_dict(torch.load(real / weights, map_location="cpu", weights_only=True), strict=True)
+    network.load_state_dict(
+        torch.load(real / weights, map_location="cpu", weights_only=True), strict=True
+    )
     occupancy = (np.random.default_rng(7).random((1, 1, 128, 128, 8)) < 0.05).astype(np.float32)
     with torch.no_grad(), np.load(golden / outputs) as expected:
         logits = network(torch.from_numpy(occupancy)).numpy()
-        np.testing.assert_allclose(logits[:, :24, :24], expected["logits_corner"], rtol=0, atol=1e-4)
+        np.testing.assert_allclose(
+            logits[:, :24, :24], expected["logits_corner"], rtol=0, atol=1e-4
+        )
         np.testing.assert_array_equal(logits.argmax(-1), expected["labels"])

@@ -68,15 +68,20 @@ def test_weights_say_what_they_are_of(tmp_path, name, history, suffix):
 
 def test_a_data_set_is_completed_into_a_folder_that_evaluate_and_open_read(data, tmp_path):
     model = Model.read(save(tmp_path / "motionsc.pt", "motionsc", history=2), 2)
-    made = predict_dataset(model, str(data), tmp_path / "out", CPU, "eager", split="test", frames=(1, None))
+    made = predict_dataset(
+        model, str(data), tmp_path / "out", CPU, "eager", split="test", frames=(1, None)
+    )
     assert made == 2
     sequence = open_source(tmp_path / "out").sequences()["Test/Town10_Light/cartesian"]
     assert sequence.metadata.classes.name == "carlasc11"
     samples = Dataset(data, history=2)
     for frame in (1, 2):
-        np.testing.assert_array_equal(sequence.grid("evaluation", frame).labels, run(model, samples[frame]))
+        np.testing.assert_array_equal(
+            sequence.grid("evaluation", frame).labels, run(model, samples[frame])
+        )
     assert evaluate(tmp_path / "out", data, frames=(1, 3)).frames == 2
-    assert predict_dataset(model, str(data), tmp_path / "out", CPU, "eager") == 1  # the others are there
+    # the others are there
+    assert predict_dataset(model, str(data), tmp_path / "out", CPU, "eager") == 1
 
 
 def test_grids_beside_the_data_leave_the_data_as_they_are(data, tmp_path):
@@ -88,7 +93,9 @@ def test_grids_beside_the_data_leave_the_data_as_they_are(data, tmp_path):
     assert all(path.read_bytes() == content for path, content in before.items())
     assert evaluate(root, root, grid="completion").frames == 2
     with pytest.raises(ConflictError, match="expected predictions of sscnet"):
-        predict_dataset(Model.read(save(tmp_path / "other.pt", "sscnet")), str(root), None, CPU, "eager")
+        predict_dataset(
+            Model.read(save(tmp_path / "other.pt", "sscnet")), str(root), None, CPU, "eager"
+        )
 
 
 def test_a_folder_of_raw_scans_is_completed_and_mirrored_if_right_handed(data, tmp_path):
@@ -100,9 +107,13 @@ def test_a_folder_of_raw_scans_is_completed_and_mirrored_if_right_handed(data, t
     np.testing.assert_array_equal(labels, run(model, samples[1]))
 
     (tmp_path / "mirrored").mkdir()
-    points = np.fromfile(scans / "000001.bin", np.float32).reshape(-1, 4) * np.array([1, -1, 1, 1], np.float32)
+    points = np.fromfile(scans / "000001.bin", np.float32).reshape(-1, 4) * np.array(
+        [1, -1, 1, 1], np.float32
+    )
     points.tofile(tmp_path / "mirrored" / "a scan.bin")
-    predict_scans(model, tmp_path / "mirrored", tmp_path / "right", CPU, "eager", spec=SPEC, right_handed=True)
+    predict_scans(
+        model, tmp_path / "mirrored", tmp_path / "right", CPU, "eager", spec=SPEC, right_handed=True
+    )
     mirrored = open_source(tmp_path / "right").sequences()["cartesian"].grid("evaluation", 0).labels
     np.testing.assert_array_equal(mirrored, labels)
 
@@ -112,16 +123,25 @@ def test_networks_of_points_complete_data_sets_and_raw_scans_alike(data, tmp_pat
     assert predict_dataset(model, str(data), tmp_path / "out", CPU, "compile") == 3
     scans = data / "Test/Town10_Light/cartesian/velodyne"
     assert predict_scans(model, scans, tmp_path / "raw", CPU, "eager", spec=SPEC) == 3
-    (one,), (other,) = (open_source(tmp_path / name).sequences().values() for name in ("out", "raw"))
+    (one,), (other,) = (
+        open_source(tmp_path / name).sequences().values() for name in ("out", "raw")
+    )
     for frame in range(3):
-        np.testing.assert_array_equal(one.grid("evaluation", frame).labels, other.grid("evaluation", frame).labels)
+        np.testing.assert_array_equal(
+            one.grid("evaluation", frame).labels, other.grid("evaluation", frame).labels
+        )
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "000000.bin").write_bytes(b"")
     with pytest.raises(ArgumentError, match="points: expected one point or more, found none"):
         predict_scans(model, tmp_path / "empty", tmp_path / "none", CPU, "eager", spec=SPEC)
     with pytest.raises(ArgumentError, match="expected their remission"):
         predict_scans(
-            Model.read(save(tmp_path / "kitti.pt", "js3cnet_kitti")), scans, tmp_path / "k", CPU, "eager", spec=SPEC
+            Model.read(save(tmp_path / "kitti.pt", "js3cnet_kitti")),
+            scans,
+            tmp_path / "k",
+            CPU,
+            "eager",
+            spec=SPEC,
         )
 
 
@@ -137,7 +157,8 @@ def test_points_of_another_class_table_are_refused(tmp_path):
     model = Model.read(save(tmp_path / "kitti.pt", "js3cnet", classes=20))
     assert model.classes.name == "semantickitti19"
     with pytest.raises(
-        FormatError, match=r"seg_head.linear.weight: expected 10 x 16, found 19 x 16: .* number of classes"
+        FormatError,
+        match=r"seg_head.linear.weight: expected 10 x 16, found 19 x 16: .* number of classes",
     ):
         replace(model, classes=CARLASC11).complete_on(SPEC, CPU, "eager")
 
@@ -165,13 +186,20 @@ def test_weights_that_do_not_fit_name_the_layer_and_both_shapes(tmp_path):
 
     with pytest.raises(
         FormatError,
-        match=r"conv_classes.weight: expected 11 x 128 x 1 x 1 x 1, found 7 x .*: the weights are for another number of classes",
+        match=r"conv_classes.weight: expected 11 x 128 x 1 x 1 x 1, found 7 x .*: the weights are "
+        r"for another number of classes",
     ):
         load_weights(
-            build_network("sscnet", 11, SPEC), read_weights(save(tmp_path / "k.pt", "sscnet", classes=7)), "k.pt"
+            build_network("sscnet", 11, SPEC),
+            read_weights(save(tmp_path / "k.pt", "sscnet", classes=7)),
+            "k.pt",
         )
     with pytest.raises(FormatError, match="expected the layer .* found none"):
-        load_weights(build_network("sscnet_full", 11, SPEC), read_weights(save(tmp_path / "s.pt", "sscnet")), "s.pt")
+        load_weights(
+            build_network("sscnet_full", 11, SPEC),
+            read_weights(save(tmp_path / "s.pt", "sscnet")),
+            "s.pt",
+        )
 
 
 class Evil:
@@ -202,7 +230,14 @@ def test_scans_without_poses_take_no_history_and_an_empty_folder_is_named(tmp_pa
     with pytest.raises(ArgumentError, match="expected 1 for scans without poses"):
         predict_scans(model, tmp_path, tmp_path / "out", CPU, "eager", spec=SPEC)
     with pytest.raises(MissingDataError, match="expected .bin scans"):
-        predict_scans(Model.read(save(tmp_path / "one.pt")), tmp_path, tmp_path / "out", CPU, "eager", spec=SPEC)
+        predict_scans(
+            Model.read(save(tmp_path / "one.pt")),
+            tmp_path,
+            tmp_path / "out",
+            CPU,
+            "eager",
+            spec=SPEC,
+        )
 
 
 def test_grids_that_do_not_divide_are_refused():
@@ -217,10 +252,15 @@ def test_the_script_completes_and_a_mistake_is_one_line(data, tmp_path, examples
     weights = save(tmp_path / "net.pt")
     command = [sys.executable, str(examples / "predict.py")]
     done = subprocess.run(
-        [*command, weights, data, tmp_path / "out", "--eager"], capture_output=True, text=True, check=False
+        [*command, weights, data, tmp_path / "out", "--eager"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert "3 frames completed" in done.stdout
-    failed = subprocess.run([*command, tmp_path / "none.pt", data], capture_output=True, text=True, check=False)
+    failed = subprocess.run(
+        [*command, tmp_path / "none.pt", data], capture_output=True, text=True, check=False
+    )
     assert (failed.returncode, failed.stderr.count("\n")) == (1, 1)
     assert "expected weights, found nothing" in failed.stderr

@@ -29,7 +29,9 @@ from completion.training import BEST, LAST, train
 from completion.weights import read_checkpoint, read_weights
 
 ALONE = Processes(0, 1, torch.device("cpu"))
-QUICK = Config("lmscnet_ss", epochs=2, batch_size=2, workers=0, learning_rate=0.01, class_weights="train")
+QUICK = Config(
+    "lmscnet_ss", epochs=2, batch_size=2, workers=0, learning_rate=0.01, class_weights="train"
+)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +67,10 @@ def test_a_resumed_run_ends_with_the_weights_of_one_that_was_never_stopped(data,
     train(data, replace(config, epochs=1), tmp_path / "parts", ALONE)
     parts = train(data, config, tmp_path / "parts", ALONE, resume=True)
     assert parts.losses == whole.losses
-    expected, found = read_weights(tmp_path / "whole" / LAST), read_weights(tmp_path / "parts" / LAST)
+    expected, found = (
+        read_weights(tmp_path / "whole" / LAST),
+        read_weights(tmp_path / "parts" / LAST),
+    )
     for name, value in expected.items():
         assert torch.equal(value, found[name]), name
 
@@ -94,7 +99,10 @@ def test_a_run_that_is_stopped_in_the_middle_of_an_epoch_ends_with_the_same_weig
     assert steps == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
     parts = train(source, config, tmp_path / "parts", ALONE, resume=True)
     assert parts.losses == whole.losses and parts.mious == whole.mious
-    expected, found = read_weights(tmp_path / "whole" / LAST), read_weights(tmp_path / "parts" / LAST)
+    expected, found = (
+        read_weights(tmp_path / "whole" / LAST),
+        read_weights(tmp_path / "parts" / LAST),
+    )
     for name, value in expected.items():
         assert torch.equal(value, found[name]), name
 
@@ -107,13 +115,18 @@ def test_training_from_a_server_gives_the_weights_of_training_from_disk(data, tm
         source = carlasc.open(f"{served.url}/data.zarr", cache=tmp_path / "cache")
         there = train(source, replace(QUICK, epochs=1), tmp_path / "there", ALONE)
     assert there.losses == here.losses and there.mious == here.mious
-    assert max(served.sent[path] - (store.parent / path).stat().st_size for path in served.sent) == 0
+    assert (
+        max(served.sent[path] - (store.parent / path).stat().st_size for path in served.sent) == 0
+    )
 
 
 def test_shards_of_a_packed_store_are_read_one_after_another_and_files_in_any_order(data, tmp_path):
     assert isinstance(TrainLoader(open_split(data, "train", QUICK), QUICK).sampler, EpochSampler)
     packed = pack(data, tmp_path / "data.zarr").out
-    loaders = [TrainLoader(open_split(packed, "train", QUICK), replace(QUICK, batch_size=4), r, 2) for r in range(2)]
+    loaders = [
+        TrainLoader(open_split(packed, "train", QUICK), replace(QUICK, batch_size=4), r, 2)
+        for r in range(2)
+    ]
     assert all(isinstance(loader.sampler, ShardSampler) for loader in loaders)
     places = [[str(b["sequence"]) + str(b["frame"]) for b in loader.epoch(0)] for loader in loaders]
     assert len(places[0]) == len(places[1]) == 2 and not set(places[0]) & set(places[1])
@@ -150,13 +163,17 @@ def test_every_network_and_precision_trains(data, tmp_path, changes):
 def test_points_with_remission_train_the_network_that_takes_it(tmp_path):
     for split in ("Train", "Val"):
         write_split(tmp_path, split, [f"Town01_{split}"], frames=2, remission=0.5)
-    progress = train(tmp_path, replace(QUICK, network="js3cnet_kitti", epochs=1), tmp_path / "run", ALONE)
+    progress = train(
+        tmp_path, replace(QUICK, network="js3cnet_kitti", epochs=1), tmp_path / "run", ALONE
+    )
     assert np.isfinite(progress.losses[0])
 
 
 @pytest.mark.needs("tensorboard")
 def test_a_loss_that_is_no_number_stops_the_run_and_names_the_batch(data, tmp_path):
-    with pytest.raises(CarlascError, match=r"epoch 1, batch \d+: the loss is (nan|inf).*Town0\d_Light \d"):
+    with pytest.raises(
+        CarlascError, match=r"epoch 1, batch \d+: the loss is (nan|inf).*Town0\d_Light \d"
+    ):
         train(data, replace(QUICK, learning_rate=1e30, flips=""), tmp_path, ALONE)
 
 
@@ -167,7 +184,8 @@ def test_running_out_of_memory_says_which_batch_size_to_try(data, tmp_path, monk
 
     monkeypatch.setattr(training, "target_of", no_memory)
     with pytest.raises(
-        CarlascError, match="batch size 2: out of memory: try --set batch_size=1 or --set precision=bf16"
+        CarlascError,
+        match="batch size 2: out of memory: try --set batch_size=1 or --set precision=bf16",
     ):
         train(data, QUICK, tmp_path, ALONE)
 
@@ -183,7 +201,9 @@ def test_data_that_cannot_be_trained_on_is_named(data, tmp_path):
     with pytest.raises(ArgumentError, match="only motionsc"):
         replace(QUICK, history=2)
     with pytest.raises(FormatError, match="carlasc stats --json"):
-        train(data, replace(QUICK, class_weights=str(tmp_path / "none.json")), tmp_path / "c", ALONE)
+        train(
+            data, replace(QUICK, class_weights=str(tmp_path / "none.json")), tmp_path / "c", ALONE
+        )
 
 
 def test_class_weights_come_from_the_table_the_split_or_a_file_of_carlasc_stats(data, tmp_path):
@@ -192,8 +212,12 @@ def test_class_weights_come_from_the_table_the_split_or_a_file_of_carlasc_stats(
     split = open_split(data, "train", QUICK)
     names = split.classes.names
     assert len(class_weights(data, split, replace(QUICK, class_weights="table"))) == 11
-    np.testing.assert_array_equal(class_weights(data, split, replace(QUICK, class_weights="none")), np.ones(11))
-    (tmp_path / "stats.json").write_text(json.dumps({"class_weights": {name: i / 10 for i, name in names.items()}}))
+    np.testing.assert_array_equal(
+        class_weights(data, split, replace(QUICK, class_weights="none")), np.ones(11)
+    )
+    (tmp_path / "stats.json").write_text(
+        json.dumps({"class_weights": {name: i / 10 for i, name in names.items()}})
+    )
     found = class_weights(data, split, replace(QUICK, class_weights=str(tmp_path / "stats.json")))
     np.testing.assert_allclose(found, np.arange(11) / 10)
 
@@ -203,9 +227,13 @@ def test_how_much_rare_classes_weigh_is_the_networks_own_unless_the_settings_say
     from completion.tasks import root_weights
 
     split = open_split(data, "train", QUICK)
-    log, root = (class_weights(data, split, replace(QUICK, weighting=kind)) for kind in ("log", "root"))
+    log, root = (
+        class_weights(data, split, replace(QUICK, weighting=kind)) for kind in ("log", "root")
+    )
     np.testing.assert_array_equal(class_weights(data, split, QUICK), log)
-    np.testing.assert_array_equal(class_weights(data, split, replace(QUICK, network="baseline")), root)
+    np.testing.assert_array_equal(
+        class_weights(data, split, replace(QUICK, network="baseline")), root
+    )
     assert root.max() / root[0] > log.max() / log[0]
     np.testing.assert_allclose(root_weights(np.array([800, 100, 0])), [1, 2, 0])
     with pytest.raises(ArgumentError, match="weighting: expected .*found 'much'"):
@@ -220,7 +248,9 @@ def test_a_score_with_certainty_is_the_score_and_its_calibration(data):
     val = open_split(data, "val", QUICK)
     network = build_network("lmscnet_ss", 11, val.spec)
     matrix, certainty = score_with_certainty(network, eval_loader(val, QUICK), 11, ALONE)
-    np.testing.assert_array_equal(matrix.counts, score(network, eval_loader(val, QUICK), 11, ALONE).counts)
+    np.testing.assert_array_equal(
+        matrix.counts, score(network, eval_loader(val, QUICK), 11, ALONE).counts
+    )
     result = certainty.compute()
     voxels = result.empty.count.sum() + result.occupied.count.sum()
     assert voxels == matrix.total
@@ -258,7 +288,9 @@ def test_the_mistakes_of_the_fork_of_js3cnet_are_not_made(data):
 def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_path):
     raw = (10, 40, 52, 99)  # car, road, and two that the benchmark ignores
     for split in ("Train", "Val"):
-        write_split(tmp_path, split, [f"KITTI_{split}"], frames=2, classes=raw, table="semantickitti")
+        write_split(
+            tmp_path, split, [f"KITTI_{split}"], frames=2, classes=raw, table="semantickitti"
+        )
     config = replace(QUICK, remap="semantickitti19", epochs=1)
     sample = open_split(tmp_path, "train", config)[0]
     assert set(np.unique(sample["labels"])) == {0, 1, 9}
@@ -269,7 +301,8 @@ def test_semantickitti_trains_on_its_19_classes_and_leaves_ignored_ones_out(tmp_
     assert set(np.unique(points["point_labels"])) == {0, 1, 9}
     write_split(tmp_path / "carla", "Train", ["Town01_Light"], frames=2)
     with pytest.raises(
-        ArgumentError, match="remap: expected one for data with the classes carla, found semantickitti19"
+        ArgumentError,
+        match="remap: expected one for data with the classes carla, found semantickitti19",
     ):
         open_split(tmp_path / "carla", "train", config)
 
@@ -288,20 +321,43 @@ def test_settings_files_of_every_network_are_read(examples):
 @pytest.mark.slow
 def test_two_processes_of_torchrun_end_with_the_weights_of_one(data, tmp_path, examples):
     config = tmp_path / "config.yaml"
-    settings = replace(QUICK, network="sscnet", epochs=1)  # no batch norm: its statistics would be each process's own
+    # no batch norm: its statistics would be each process's own
+    settings = replace(QUICK, network="sscnet", epochs=1)
     settings.write(config)
     train(data, settings, tmp_path / "one", ALONE)
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command += [str(examples / "train.py"), str(config), str(data), "--out", str(tmp_path / "two"), "--device", "cpu"]
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+    ]
+    command += [
+        str(examples / "train.py"),
+        str(config),
+        str(data),
+        "--out",
+        str(tmp_path / "two"),
+        "--device",
+        "cpu",
+    ]
     done = subprocess.run(
-        command, env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False
+        command,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     one, two = read_checkpoint(tmp_path / "one" / LAST), read_checkpoint(tmp_path / "two" / LAST)
     assert two["losses"] == pytest.approx(one["losses"], rel=1e-4)
     assert two["mious"] == pytest.approx(one["mious"], rel=1e-2)
-    for name, value in one["network"].items():  # Adam turns rounding into steps where a gradient is nearly zero
-        assert torch.isclose(value, two["network"][name], rtol=1e-3, atol=1e-4).double().mean() > 0.98, name
+    # Adam turns rounding into steps where a gradient is nearly zero
+    for name, value in one["network"].items():
+        assert (
+            torch.isclose(value, two["network"][name], rtol=1e-3, atol=1e-4).double().mean() > 0.98
+        ), name
 
 
 @pytest.fixture(scope="module")
@@ -314,9 +370,12 @@ def certain(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "network, free_ratio", [("lmscnet_ss", 0.0), ("lmscnet", 0.0), ("sscnet", 2.0), ("js3cnet", 0.0)]
+    "network, free_ratio",
+    [("lmscnet_ss", 0.0), ("lmscnet", 0.0), ("sscnet", 2.0), ("js3cnet", 0.0)],
 )
-def test_training_on_certain_probabilities_is_training_on_labels(certain, tmp_path, network, free_ratio):
+def test_training_on_certain_probabilities_is_training_on_labels(
+    certain, tmp_path, network, free_ratio
+):
     config = replace(QUICK, network=network, free_ratio=free_ratio, epochs=1)
     hard = train(certain, config, tmp_path / "hard", ALONE)
     soft = train(certain, replace(config, soft_labels=True), tmp_path / "soft", ALONE)
@@ -327,19 +386,27 @@ def test_training_on_certain_probabilities_is_training_on_labels(certain, tmp_pa
 
 
 def test_a_run_on_soft_labels_learns(tmp_path):
-    write_split(tmp_path / "data", "Train", ["Town01_Light", "Town02_Light"], frames=3, certainty=0.9)
+    write_split(
+        tmp_path / "data", "Train", ["Town01_Light", "Town02_Light"], frames=3, certainty=0.9
+    )
     write_split(tmp_path / "data", "Val", ["Town07_Light"], frames=3, seed=1)
     hard = train(tmp_path / "data", replace(QUICK, epochs=4), tmp_path / "hard", ALONE)
-    soft = train(tmp_path / "data", replace(QUICK, epochs=4, soft_labels=True), tmp_path / "run", ALONE)
+    soft = train(
+        tmp_path / "data", replace(QUICK, epochs=4, soft_labels=True), tmp_path / "run", ALONE
+    )
     assert soft.losses[-1] < soft.losses[0]
     assert soft.losses != hard.losses
     assert Config.read(tmp_path / "run" / "config.yaml").soft_labels
 
 
 def test_data_that_have_no_soft_labels_are_refused_with_what_to_do(data, tmp_path):
-    with pytest.raises(MissingDataError, match=r"split 'train': .*evaluation/classes.*keep_evidence=True"):
+    with pytest.raises(
+        MissingDataError, match=r"split 'train': .*evaluation/classes.*keep_evidence=True"
+    ):
         train(data, replace(QUICK, soft_labels=True), tmp_path, ALONE)
-    with pytest.raises(ArgumentError, match="soft_labels: expected False with remap=semantickitti19"):
+    with pytest.raises(
+        ArgumentError, match="soft_labels: expected False with remap=semantickitti19"
+    ):
         replace(QUICK, soft_labels=True, remap="semantickitti19")
 
 

@@ -17,7 +17,9 @@ def scenes(tmp_path):
         path = f"Val/{name}/cartesian"
         write_scene(tmp_path / "in", frames=4, grid="evaluation", path=path)
         for frame in range(4):
-            FolderSink(tmp_path / "in").sequence(path).write("flow", frame, np.zeros((2, 3), np.float32))
+            FolderSink(tmp_path / "in").sequence(path).write(
+                "flow", frame, np.zeros((2, 3), np.float32)
+            )
     return tmp_path / "in"
 
 
@@ -25,8 +27,12 @@ def scenes(tmp_path):
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 2, 1)])
 def test_parts_make_the_files_of_one_export(scenes, tmp_path, name, order):
     whole = export(name, scenes, tmp_path / "whole", run=Run(workers=1))
-    made = [export(name, scenes, tmp_path / "parts", run=Run(part=Part(n, 3), workers=1)).made for n in order]
-    assert sum(made) == whole.made == (2 if name == "sscbench" else 8)  # SSCBench has every fifth frame
+    made = [
+        export(name, scenes, tmp_path / "parts", run=Run(part=Part(n, 3), workers=1)).made
+        for n in order
+    ]
+    # SSCBench has every fifth frame
+    assert sum(made) == whole.made == (2 if name == "sscbench" else 8)
     assert files_and_bytes(tmp_path / "parts") == files_and_bytes(tmp_path / "whole")
 
 

@@ -13,7 +13,13 @@ from typer.testing import CliRunner
 
 from carlasc.cli import app
 from carlasc.converting import export, exporter_names, load_exporter, option_declarations
-from carlasc.errors import ArgumentError, ConflictError, DependencyError, FormatError, MissingDataError
+from carlasc.errors import (
+    ArgumentError,
+    ConflictError,
+    DependencyError,
+    FormatError,
+    MissingDataError,
+)
 from carlasc.running import Run
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "exporter.md"
@@ -30,7 +36,9 @@ def installed(tmp_path, monkeypatch):
     (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     (entry,) = re.findall(r"^```toml\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     (site / "lab_exporter.py").write_text(code)
-    (site / "lab-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n")
+    (site / "lab-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n"
+    )
     declared = tomllib.loads(entry)["project"]["entry-points"]["carlasc.exporters"]
     declared |= {"broken": "lab_exporter:Nothing", "wrong": "lab_exporter:np"}
     lines = "".join(f"{name} = {value}\n" for name, value in declared.items())
@@ -66,13 +74,19 @@ def test_the_exporter_of_the_documentation_works(installed, tmp_path):
     assert sorted(files_and_bytes(tmp_path / "out")) == [
         "carlasc-export.json",
         "index.json",
-        *(f"town07_light/{name}" for name in ("000000.npy", "000001.npy", "000002.npy", "frames.txt")),
+        *(
+            f"town07_light/{name}"
+            for name in ("000000.npy", "000001.npy", "000002.npy", "frames.txt")
+        ),
     ]
     for frame in range(3):
         labels, _ = scene_grid(shift_m=0.4 * frame)
         columns = labels[:, ::-1].reshape(-1, labels.shape[2])
         top = [column[column > 0][-1] if column.any() else 0 for column in columns]
-        assert np.load(tmp_path / "out" / "town07_light" / f"{frame:06d}.npy").reshape(-1).tolist() == top
+        assert (
+            np.load(tmp_path / "out" / "town07_light" / f"{frame:06d}.npy").reshape(-1).tolist()
+            == top
+        )
     assert json.loads((tmp_path / "out" / "index.json").read_text()) == ["town07_light"]
 
 
@@ -106,9 +120,13 @@ def test_wrong_options_are_named_and_the_exit_code_is_2(installed, tmp_path, opt
 
 
 def test_an_exporter_that_does_not_load_is_named(installed, tmp_path):
-    with pytest.raises(DependencyError, match=r"exporter broken \(lab_exporter:Nothing\): cannot be loaded"):
+    with pytest.raises(
+        DependencyError, match=r"exporter broken \(lab_exporter:Nothing\): cannot be loaded"
+    ):
         load_exporter("broken")
-    with pytest.raises(DependencyError, match=r"expected a class that inherits carlasc.converting.Exporter"):
+    with pytest.raises(
+        DependencyError, match=r"expected a class that inherits carlasc.converting.Exporter"
+    ):
         load_exporter("wrong")
     with pytest.raises(ArgumentError, match="name: expected one of .*topviews.*, found 'other'"):
         load_exporter("other")
@@ -118,10 +136,18 @@ def test_an_exporter_that_does_not_load_is_named(installed, tmp_path):
 
 def test_truth_values_are_read_from_text(installed, tmp_path):
     for text in ("true", "Yes", "1"):
-        export("kitti", installed, tmp_path / text, options={"predictions": text}, run=Run(workers=1))
+        export(
+            "kitti", installed, tmp_path / text, options={"predictions": text}, run=Run(workers=1)
+        )
         assert (tmp_path / text / "sequences" / "00" / "predictions" / "000000.label").is_file()
     with pytest.raises(ArgumentError, match="predictions: expected true or false, found 'perhaps'"):
-        export("kitti", installed, tmp_path / "out", options={"predictions": "perhaps"}, run=Run(workers=1))
+        export(
+            "kitti",
+            installed,
+            tmp_path / "out",
+            options={"predictions": "perhaps"},
+            run=Run(workers=1),
+        )
 
 
 def test_frames_that_fail_are_listed_and_the_exit_code_is_1(installed, tmp_path):
@@ -157,7 +183,9 @@ def test_exporters_of_different_data_sets_do_not_share_a_record(installed, tmp_p
     export("topviews", installed, tmp_path / "out", run=Run(workers=1))
     assert export("kitti", installed, tmp_path / "out", run=Run(workers=1)).made == 3
     with pytest.raises(ConflictError):
-        export("kitti", installed, tmp_path / "out", options={"grid": "evaluation"}, run=Run(workers=1))
+        export(
+            "kitti", installed, tmp_path / "out", options={"grid": "evaluation"}, run=Run(workers=1)
+        )
 
 
 def test_two_sequences_of_one_name_are_not_written_to_one_place(installed, tmp_path):

@@ -1,4 +1,6 @@
-"""Voxel grids as Occ3D, OpenOccupancy and SSCBench have them, read again by the facts of these formats."""
+"""Voxel grids as Occ3D, OpenOccupancy and SSCBench have them, read again by the facts of these
+formats.
+"""
 
 import json
 import re
@@ -50,7 +52,11 @@ def test_occ3d_has_things_where_they_are_from_the_ground_below_the_sensor(occ3d)
     assert len(tokens) == 6
     for number, token in enumerate(tokens):
         semantics, mask = arrays[token]["semantics"], arrays[token]["mask_lidar"]
-        assert (semantics.shape, semantics.dtype, mask.dtype) == ((200, 200, 16), np.uint8, np.uint8)
+        assert (semantics.shape, semantics.dtype, mask.dtype) == (
+            (200, 200, 16),
+            np.uint8,
+            np.uint8,
+        )
         for (x, y, z), label in THINGS.items():
             cell = occ3d_cell(x + 0.4 * number, -y, z + HEIGHT_M)
             assert semantics[cell] == classes[label]
@@ -64,14 +70,22 @@ def test_occ3d_masks_what_no_voxel_of_the_source_knows(occ3d):
     _, arrays = read_occ3d(occ3d[0], NAME)
     for array in arrays.values():
         assert np.array_equal(array["mask_lidar"], array["mask_camera"])
-        for unknown in ((-7, 0, 0.1), (20, 0, 0.1), (1, 0, 5.3)):  # no votes, beside the grid, above it
+        # no votes, beside the grid, above it
+        for unknown in (
+            (-7, 0, 0.1),
+            (20, 0, 0.1),
+            (1, 0, 5.3),
+        ):
             assert array["mask_lidar"][occ3d_cell(*unknown)] == 0
             assert array["semantics"][occ3d_cell(*unknown)] == 17
 
 
 def test_occ3d_says_that_the_mask_of_cameras_is_a_copy(occ3d):
     annotations, _ = read_occ3d(occ3d[0], NAME)
-    assert annotations["carlasc"] == "mask_camera is a copy of mask_lidar, because no cameras are known"
+    assert (
+        annotations["carlasc"]
+        == "mask_camera is a copy of mask_lidar, because no cameras are known"
+    )
     assert sum(annotations["carlasc"] in note for note in occ3d[1].notes) == 1
 
 
@@ -79,7 +93,8 @@ def test_occ3d_masks_what_no_camera_sees(tmp_path):
     write_scene(tmp_path / "in", frames=1)
     (place,) = (tmp_path / "in").glob("**/small/000000.label")
     counts = np.fromfile(place.with_suffix(".bin"), np.float32)
-    bits = np.where(np.arange(len(counts)) < len(counts) // 2, 5, 0)  # two cameras see all voxels of one half along x
+    # two cameras see all voxels of one half along x
+    bits = np.where(np.arange(len(counts)) < len(counts) // 2, 5, 0)
     place.with_suffix(".seen").write_bytes(bits.astype(np.uint8).tobytes())
     result = export("occ3d", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     annotations, arrays = read_occ3d(tmp_path / "out", NAME)
@@ -106,8 +121,14 @@ def test_structure_without_a_class_of_its_own_is_said_to_become_something(tmp_pa
     np.where((labels > 0) & (labels != 10), 3, labels).astype(np.uint32).tofile(place)
     result = export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     (note,) = [note for note in result.notes if "without a class of its own" in note]
-    becomes = {"occ3d": "class 0 of occ3d", "openoccupancy": "class 0 of openoccupancy", "sscbench": "sscbench"}[name]
-    assert re.search(rf"small: 6\d% of the occupied voxels are Other, .* they become .*{becomes}$", note)
+    becomes = {
+        "occ3d": "class 0 of occ3d",
+        "openoccupancy": "class 0 of openoccupancy",
+        "sscbench": "sscbench",
+    }[name]
+    assert re.search(
+        rf"small: 6\d% of the occupied voxels are Other, .* they become .*{becomes}$", note
+    )
 
 
 def test_occ3d_names_scenes_frames_and_poses(occ3d):
@@ -136,7 +157,9 @@ def test_clouds_without_rays_are_not_sent_to_regrid_which_refuses_them(source, t
     (poses,) = (tmp_path / "tiles").rglob("poses.txt")
     metadata = {"format": 2, "axes": "left", "classes": "carla", "rays": False}
     poses.with_name("carlasc.json").write_text(json.dumps(metadata))
-    notes = " ".join(export("occ3d", tmp_path / "tiles", tmp_path / "out", run=Run(workers=1)).notes)
+    notes = " ".join(
+        export("occ3d", tmp_path / "tiles", tmp_path / "out", run=Run(workers=1)).notes
+    )
     assert "the grid small covers 3 % of the volume" in notes
     assert "regrid" not in notes
 
@@ -168,7 +191,9 @@ def test_scenes_of_earlier_exports_stay_in_the_annotations(source, tmp_path):
         ({"axes": "left", "sensors": [{"name": "top"}]}, {"height_m": 1.4}, 1.4),
     ],
 )
-def test_the_height_of_the_sensor_is_taken_from_where_it_is_known(tmp_path, metadata, options, height):
+def test_the_height_of_the_sensor_is_taken_from_where_it_is_known(
+    tmp_path, metadata, options, height
+):
     write_scene(tmp_path / "in", frames=1, metadata=metadata)
     result = export("occ3d", tmp_path / "in", tmp_path / "out", options=options, run=Run(workers=1))
     _, arrays = read_occ3d(tmp_path / "out", NAME)
@@ -222,11 +247,15 @@ def test_sscbench_has_raw_ids_and_a_byte_for_each_invalid_voxel(source, tmp_path
         assert labels[invalid == 1].max() == 0
         assert occupied[cells[CAR]] == 1
         assert occupied.sum() == 2
-    assert evaluate(folder, folder, convention="sscbench").class_iou["car"] == pytest.approx(1.0, abs=1e-4)
+    assert evaluate(folder, folder, convention="sscbench").class_iou["car"] == pytest.approx(
+        1.0, abs=1e-4
+    )
 
 
 def test_sscbench_takes_as_many_frames_as_asked_for(source, tmp_path):
-    assert export("sscbench", source, tmp_path, options={"every": "2"}, run=Run(workers=1)).made == 3
+    assert (
+        export("sscbench", source, tmp_path, options={"every": "2"}, run=Run(workers=1)).made == 3
+    )
     with pytest.raises(ArgumentError, match="every: expected 1 or more, found 0"):
         export("sscbench", source, tmp_path, options={"every": 0}, run=Run(workers=1))
     with pytest.raises(ArgumentError, match="every: expected a whole number, found 'often'"):
@@ -240,7 +269,9 @@ def test_a_sequence_without_a_frame_to_export_is_named(tmp_path):
     (tmp_path / "in" / PATH / "small" / "000000.label").unlink()
     result = export("sscbench", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert result.made == 0
-    assert any(note.endswith("Town07_Light/cartesian has no frame to export") for note in result.notes)
+    assert any(
+        note.endswith("Town07_Light/cartesian has no frame to export") for note in result.notes
+    )
 
 
 def test_sscbench_keeps_the_numbers_of_kitti_360(tmp_path):
@@ -256,12 +287,16 @@ def test_sscbench_keeps_the_numbers_of_kitti_360(tmp_path):
 def test_the_exact_grid_is_exported_voxel_for_voxel(tmp_path, name):
     exact = {
         "occ3d": GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -2.8), (40.0, 40.0, 3.6)),
-        "openoccupancy": GridSpec("cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0)),
+        "openoccupancy": GridSpec(
+            "cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0)
+        ),
         "sscbench": GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4)),
     }[name]
     exact = exact.with_bounds(exact.lower, exact.upper)  # float32, as regrid writes them
     rng = np.random.default_rng(0)
-    labels = np.where(rng.random(exact.size) < 0.01, rng.choice([7, 8, 10], exact.size), 0).astype(np.uint32)
+    labels = np.where(rng.random(exact.size) < 0.01, rng.choice([7, 8, 10], exact.size), 0).astype(
+        np.uint32
+    )
     counts = (rng.random(exact.size) < 0.5) | (labels > 0)
     write_scene(tmp_path / "in", frames=1)
     writer = FolderSink(tmp_path / "in").sequence(PATH)
@@ -275,17 +310,22 @@ def test_the_exact_grid_is_exported_voxel_for_voxel(tmp_path, name):
         (array,) = read_occ3d(tmp_path / "out", NAME)[1].values()
         assert np.array_equal(array["mask_lidar"], known)
         assert np.array_equal(
-            array["semantics"], np.select([mirrored == 7, mirrored == 8, mirrored == 10], [11, 13, 4], 17)
+            array["semantics"],
+            np.select([mirrored == 7, mirrored == 8, mirrored == 10], [11, 13, 4], 17),
         )
     elif name == "openoccupancy":
         (file,) = (tmp_path / "out").glob("*/occupancy/*.npy")
         right_forward = labels.transpose(1, 0, 2)  # y is to the right in the layout
-        expected = np.select([right_forward == 7, right_forward == 8, right_forward == 10], [11, 13, 4], 255)
+        expected = np.select(
+            [right_forward == 7, right_forward == 8, right_forward == 10], [11, 13, 4], 255
+        )
         assert np.array_equal(read_openoccupancy(file), expected)
     else:
         (folder,) = (tmp_path / "out").glob("*/*/voxels")
         raw, invalid, _ = read_sscbench(folder, 0)
-        assert np.array_equal(raw, np.select([mirrored == 7, mirrored == 8, mirrored == 10], [40, 48, 10], 0))
+        assert np.array_equal(
+            raw, np.select([mirrored == 7, mirrored == 8, mirrored == 10], [40, 48, 10], 0)
+        )
         assert np.array_equal(invalid, ~known)
 
 
@@ -321,27 +361,48 @@ def test_predictions_need_no_counts(tmp_path, name):
     with pytest.raises(MissingDataError, match="small: expected counts, .*`predictions=True`"):
         export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert not (tmp_path / "out").exists()
-    assert export(name, tmp_path / "in", tmp_path / "out", options={"predictions": True}, run=Run(workers=1)).made == 1
+    assert (
+        export(
+            name,
+            tmp_path / "in",
+            tmp_path / "out",
+            options={"predictions": True},
+            run=Run(workers=1),
+        ).made
+        == 1
+    )
 
 
 @pytest.mark.parametrize("name", GRID_FORMATS)
 def test_what_cannot_be_exported_is_named_in_one_line(tmp_path, name):
     write_scene(tmp_path / "in", frames=1)
     with pytest.raises(MissingDataError, match="expected the grid fine, found small"):
-        export(name, tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1))
+        export(
+            name, tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1)
+        )
     with pytest.raises(ArgumentError, match="options: expected one of grid, .*, found nonsense"):
         export(name, tmp_path / "in", tmp_path / "out", options={"nonsense": 1}, run=Run(workers=1))
     writer = FolderSink(tmp_path / "in").sequence(PATH)
     round_ = GridSpec("cylindrical", (4, 4, 2), (0.0, -3.0, -2.0), (8.0, 3.0, 0.5))
     writer.write_document("round/params.json", to_json(round_.to_params()))
     writer.write("round/labels", 0, np.zeros(round_.size, np.uint32))
-    with pytest.raises(ArgumentError, match="grid: expected a Cartesian grid, found .*round, which is cylindrical"):
-        export(name, tmp_path / "in", tmp_path / "out", options={"grid": "round"}, run=Run(workers=1))
+    with pytest.raises(
+        ArgumentError, match="grid: expected a Cartesian grid, found .*round, which is cylindrical"
+    ):
+        export(
+            name, tmp_path / "in", tmp_path / "out", options={"grid": "round"}, run=Run(workers=1)
+        )
     scans = FolderSink(tmp_path / "scans").sequence(PATH)
     scans.write("points", 0, np.ones((1, 4), np.float32))
-    with pytest.raises(MissingDataError, match="expected a Cartesian grid, found none: make one: `carlasc regrid`"):
+    with pytest.raises(
+        MissingDataError, match="expected a Cartesian grid, found none: make one: `carlasc regrid`"
+    ):
         export(name, tmp_path / "scans", tmp_path / "out", run=Run(workers=1))
-    table = {"name": "lab", "names": {"0": "free", "1": "road"}, "colors": {"0": [0, 0, 0], "1": [1, 1, 1]}}
+    table = {
+        "name": "lab",
+        "names": {"0": "free", "1": "road"},
+        "colors": {"0": [0, 0, 0], "1": [1, 1, 1]},
+    }
     (tmp_path / "in" / PATH / layout.METADATA).write_bytes(to_json({"classes": table}))
     with pytest.raises(FormatError, match="expected classes with a map: carla, .*, found lab"):
         export(name, tmp_path / "in", tmp_path / "out", run=Run(workers=1))
@@ -359,7 +420,9 @@ def test_what_cannot_be_exported_is_named_in_one_line(tmp_path, name):
 )
 def test_class_tables_have_maps(tmp_path, classes, ids, semantics):
     write_scene(tmp_path / "in", frames=1, metadata={"classes": classes})
-    labels = np.resize(np.array(ids, np.uint32), SPEC.size[0])[:, None, None] * np.ones(SPEC.size, np.uint32)
+    labels = np.resize(np.array(ids, np.uint32), SPEC.size[0])[:, None, None] * np.ones(
+        SPEC.size, np.uint32
+    )
     labels = np.repeat(labels[::2], 2, axis=0)  # alike in both voxels of one of the target
     FolderSink(tmp_path / "in").sequence(PATH).write("small/labels", 0, labels)
     export("occ3d", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
@@ -376,4 +439,7 @@ def test_an_id_beyond_the_table_fails_its_frame(tmp_path):
     writer.write("small/labels", 1, labels)
     result = export("occ3d", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     assert [failure.frame for failure in result.failures] == [1]
-    assert "small of frame 1: expected class ids of carla, found 24 (1 times)" in result.failures[0].message
+    assert (
+        "small of frame 1: expected class ids of carla, found 24 (1 times)"
+        in result.failures[0].message
+    )

@@ -36,7 +36,9 @@ def write_carlasc(root, frame_name="carlasc", classes="carla"):
     writer.write_document(layout.TIMES, layout.encode_times(np.zeros(1)))
     writer.write_document("carlasc.json", to_json({"frame": frame_name, "classes": classes}))
     writer.write_document("small/params.json", to_json(SPEC.to_params()))
-    labels = np.where(rng.random(SPEC.size) < 0.1, rng.integers(1, 23, SPEC.size), 0).astype(np.uint32)
+    labels = np.where(rng.random(SPEC.size) < 0.1, rng.integers(1, 23, SPEC.size), 0).astype(
+        np.uint32
+    )
     counts = np.where(labels > 0, 3, rng.integers(0, 2, SPEC.size)).astype(np.float32)
     writer.write("small/labels", 0, labels)
     writer.write("small/counts", 0, counts)
@@ -49,7 +51,10 @@ def test_a_grid_of_carlasc_gets_masks_by_the_rules(tmp_path):
     voxels = tmp_path / "out" / "sequences" / "00" / "voxels"
     expected = REMAPS["carla_to_semantickitti"](labels)[:, ::-1]
     assert np.array_equal(np.fromfile(voxels / "000000.label", "<u2").reshape(SPEC.size), expected)
-    bits = {s: unpack_bits((voxels / f"000000.{s}").read_bytes(), SPEC.size, s) for s in ("bin", "invalid", "occluded")}
+    bits = {
+        s: unpack_bits((voxels / f"000000.{s}").read_bytes(), SPEC.size, s)
+        for s in ("bin", "invalid", "occluded")
+    }
     assert np.array_equal(bits["invalid"], (counts == 0)[:, ::-1])
     cells = np.floor((points[:, :3] * [1, -1, 1] - [-2, -4, -2]) / [1, 1, 0.5]).astype(int)
     inside = ((cells >= 0) & (cells < SPEC.size)).all(axis=1)
@@ -70,7 +75,9 @@ def write_points(root, labels, classes="carla", **fields):
 
 def exported_labels(root, out, **options):
     result = export("kitti", root, out, options=options, run=Run(workers=1))
-    return result, np.fromfile(out / "sequences/00/labels/000000.label", "<u4") if result.made else None
+    return result, np.fromfile(
+        out / "sequences/00/labels/000000.label", "<u4"
+    ) if result.made else None
 
 
 def test_points_that_move_get_classes_that_move_and_actors_keep_their_numbers(tmp_path):
@@ -85,24 +92,39 @@ def test_points_that_move_get_classes_that_move_and_actors_keep_their_numbers(tm
 
 
 def test_classes_that_move_are_kept_whatever_the_flow_says(tmp_path):
-    write_points(tmp_path / "in", [252, 10, 1], "semantickitti", flow=np.zeros((3, 3), np.float32) + [[0], [9], [0]])
+    write_points(
+        tmp_path / "in",
+        [252, 10, 1],
+        "semantickitti",
+        flow=np.zeros((3, 3), np.float32) + [[0], [9], [0]],
+    )
     assert list(exported_labels(tmp_path / "in", tmp_path / "out")[1]) == [252, 10, 1]
-    assert list(exported_labels(tmp_path / "in", tmp_path / "moving", labels="moving")[1]) == [251, 9, 0]
+    assert list(exported_labels(tmp_path / "in", tmp_path / "moving", labels="moving")[1]) == [
+        251,
+        9,
+        0,
+    ]
 
 
 def test_numbers_of_actors_that_do_not_fit_are_named(tmp_path):
     write_points(tmp_path / "in", [10, 10], instances=np.array([1, 70_000], np.uint32))
     result, _ = exported_labels(tmp_path / "in", tmp_path / "out")
     (failure,) = result.failures
-    assert "instances of frame 0: expected numbers of at most 16 bits, found 70000" in failure.message
-    with pytest.raises(ArgumentError, match="labels: expected one of semantic, moving, found 'binary'"):
+    assert (
+        "instances of frame 0: expected numbers of at most 16 bits, found 70000" in failure.message
+    )
+    with pytest.raises(
+        ArgumentError, match="labels: expected one of semantic, moving, found 'binary'"
+    ):
         exported_labels(tmp_path / "in", tmp_path / "other", labels="binary")
 
 
 def test_right_handed_sequences_are_not_mirrored(tmp_path):
     _, labels, _ = write_carlasc(tmp_path / "in", "kitti")
     export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
-    written = np.fromfile(tmp_path / "out" / "sequences" / "00" / "voxels" / "000000.label", "<u2").reshape(SPEC.size)
+    written = np.fromfile(
+        tmp_path / "out" / "sequences" / "00" / "voxels" / "000000.label", "<u2"
+    ).reshape(SPEC.size)
     assert np.array_equal(written, REMAPS["carla_to_semantickitti"](labels))
 
 
@@ -123,13 +145,25 @@ def test_bits_come_back_first_voxel_in_the_highest_bit(mask):
 )
 def test_predictions_go_where_the_evaluator_looks(tmp_path, classes, labels, raw):
     writer = FolderSink(tmp_path / "in").sequence("Val/KITTI_08/cartesian")
-    writer.write_document("evaluation/params.json", to_json(SPEC.to_params() | {"carlasc": {"classes": classes}}))
+    writer.write_document(
+        "evaluation/params.json", to_json(SPEC.to_params() | {"carlasc": {"classes": classes}})
+    )
     grid = np.resize(np.array(labels, np.uint32), SPEC.size)
     writer.write("evaluation/labels", 5, grid)
-    export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": True}, run=Run(workers=1))
-    written = np.fromfile(tmp_path / "out" / "sequences" / "08" / "predictions" / "000005.label", "<u2")
+    export(
+        "kitti",
+        tmp_path / "in",
+        tmp_path / "out",
+        options={"predictions": True},
+        run=Run(workers=1),
+    )
+    written = np.fromfile(
+        tmp_path / "out" / "sequences" / "08" / "predictions" / "000005.label", "<u2"
+    )
     assert np.array_equal(written.reshape(SPEC.size)[:, ::-1], np.resize(np.array(raw), SPEC.size))
-    assert [path.name for path in (tmp_path / "out" / "sequences" / "08").iterdir()] == ["predictions"]
+    assert [path.name for path in (tmp_path / "out" / "sequences" / "08").iterdir()] == [
+        "predictions"
+    ]
 
 
 def test_sequences_get_numbers_by_the_whole_source_and_kittis_keep_theirs(tmp_path):
@@ -137,9 +171,16 @@ def test_sequences_get_numbers_by_the_whole_source_and_kittis_keep_theirs(tmp_pa
     writer = FolderSink(tmp_path / "in").sequence("Train/KITTI_00/cartesian")
     writer.write("points", 0, np.ones((1, 4), np.float32))
     result = export(
-        "kitti", tmp_path / "in", tmp_path / "out", sequences=["KITTI_00", "Town01_Light"], run=Run(workers=1)
+        "kitti",
+        tmp_path / "in",
+        tmp_path / "out",
+        sequences=["KITTI_00", "Town01_Light"],
+        run=Run(workers=1),
     )
-    assert result.sequences == {SEQUENCE: "sequences/00", "Train/Town01_Light/cartesian": "sequences/02"}
+    assert result.sequences == {
+        SEQUENCE: "sequences/00",
+        "Train/Town01_Light/cartesian": "sequences/02",
+    }
 
 
 def test_a_second_export_goes_on(tmp_path):
@@ -157,11 +198,14 @@ def test_what_cannot_be_exported_is_named(tmp_path):
     with pytest.raises(MissingDataError, match="expected the sequences Town99"):
         export("kitti", tmp_path / "in", tmp_path / "out", sequences=["Town99"], run=Run(workers=1))
     with pytest.raises(MissingDataError, match="expected the grid fine, found small"):
-        export("kitti", tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1))
+        export(
+            "kitti", tmp_path / "in", tmp_path / "out", options={"grid": "fine"}, run=Run(workers=1)
+        )
     with pytest.raises(ArgumentError, match="name: expected one of kitti, .*, found 'poss'"):
         export("poss", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     with pytest.raises(
-        ArgumentError, match="options: expected one of grid, predictions, labels, check, zip, found every"
+        ArgumentError,
+        match="options: expected one of grid, predictions, labels, check, zip, found every",
     ):
         export("kitti", tmp_path / "in", tmp_path / "out", options={"every": 5}, run=Run(workers=1))
     assert not (tmp_path / "out").exists()
@@ -175,7 +219,10 @@ def test_frames_are_written_again_only_if_asked_for(tmp_path):
     scan.write_bytes(b"changed")
     assert export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1)).made == 0
     assert scan.read_bytes() == b"changed"
-    assert export("kitti", tmp_path / "in", tmp_path / "out", overwrite=True, run=Run(workers=1)).made == 1
+    assert (
+        export("kitti", tmp_path / "in", tmp_path / "out", overwrite=True, run=Run(workers=1)).made
+        == 1
+    )
     assert scan.read_bytes() == written
 
 
@@ -204,8 +251,16 @@ def test_the_finest_grid_is_taken_and_a_cylindrical_one_is_refused(tmp_path):
     assert labels.stat().st_size == 2 * SPEC.num_voxels
     round_ = GridSpec("cylindrical", (4, 4, 2), (0.0, -3.0, -2.0), (8.0, 3.0, 0.5))
     writer.write_document("round/params.json", to_json(round_.to_params()))
-    with pytest.raises(ArgumentError, match="grid: expected a Cartesian grid, found .*round, which is cylindrical"):
-        export("kitti", tmp_path / "in", tmp_path / "other", options={"grid": "round"}, run=Run(workers=1))
+    with pytest.raises(
+        ArgumentError, match="grid: expected a Cartesian grid, found .*round, which is cylindrical"
+    ):
+        export(
+            "kitti",
+            tmp_path / "in",
+            tmp_path / "other",
+            options={"grid": "round"},
+            run=Run(workers=1),
+        )
 
 
 @pytest.mark.parametrize("order", [("cartesian", "cylindrical"), ("cylindrical", "cartesian")])
@@ -219,7 +274,32 @@ def test_of_two_coordinates_the_cartesian_sequence_is_exported(tmp_path, order):
 
 REFUSED = (1, 52, 99)
 """The ids that SemanticKITTI's own table maps to 0, but 0 itself."""
-SCORED = {0, 10, 11, 13, 15, 16, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 60, 70, 71, 72, 80, 81, *range(252, 260)}
+SCORED = {
+    0,
+    10,
+    11,
+    13,
+    15,
+    16,
+    18,
+    20,
+    30,
+    31,
+    32,
+    40,
+    44,
+    48,
+    49,
+    50,
+    51,
+    60,
+    70,
+    71,
+    72,
+    80,
+    81,
+    *range(252, 260),
+}
 
 
 def test_predictions_hold_only_ids_that_the_evaluator_scores():
@@ -228,18 +308,26 @@ def test_predictions_hold_only_ids_that_the_evaluator_scores():
         assert set(mapping.values()) <= SCORED
         changed = {label for label, raw in mapping.items() if raw != TO_RAW[name][label]}
         assert changed <= {label for label, raw in TO_RAW[name].items() if raw in REFUSED}
-        assert all(mapping[label] for label in changed if TO_RAW[name][label] != 1)  # what is occupied stays so
+        # what is occupied stays so
+        assert all(mapping[label] for label in changed if TO_RAW[name][label] != 1)
 
 
 def test_ground_truth_keeps_the_ids_that_predictions_may_not_have(tmp_path):
     writer = FolderSink(tmp_path / "in").sequence("Val/KITTI_08/cartesian")
     writer.write_document("evaluation/params.json", to_json(SPEC.to_params()))
-    grid = np.resize(np.array([0, 3, 11, 15, 19, 20], np.uint32), SPEC.size)  # Other, Wall, Bridge, Static, Dynamic
+    # Other, Wall, Bridge, Static, Dynamic
+    grid = np.resize(np.array([0, 3, 11, 15, 19, 20], np.uint32), SPEC.size)
     writer.write("evaluation/labels", 0, grid)
     writer.write("evaluation/counts", 0, np.ones(SPEC.size, np.float32))
     folder = tmp_path / "out" / "sequences" / "08"
     for predictions, raw in ((False, (0, 99, 52, 52, 52, 99)), (True, (0, 50, 51, 50, 50, 50))):
-        export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": predictions}, run=Run(workers=1))
+        export(
+            "kitti",
+            tmp_path / "in",
+            tmp_path / "out",
+            options={"predictions": predictions},
+            run=Run(workers=1),
+        )
         name = "predictions" if predictions else "voxels"
         written = np.fromfile(folder / name / "000000.label", "<u2").reshape(SPEC.size)[:, ::-1]
         assert np.array_equal(written, np.resize(np.array(raw), SPEC.size))
@@ -248,16 +336,36 @@ def test_ground_truth_keeps_the_ids_that_predictions_may_not_have(tmp_path):
 def test_an_export_with_other_options_is_not_mixed_with_an_earlier_one(tmp_path):
     write_carlasc(tmp_path / "in")
     export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
-    with pytest.raises(ConflictError, match="expected frames that were exported with grid=small, .*found grid=None"):
-        export("kitti", tmp_path / "in", tmp_path / "out", options={"grid": "small"}, run=Run(workers=1))
+    with pytest.raises(
+        ConflictError, match="expected frames that were exported with grid=small, .*found grid=None"
+    ):
+        export(
+            "kitti",
+            tmp_path / "in",
+            tmp_path / "out",
+            options={"grid": "small"},
+            run=Run(workers=1),
+        )
     assert (
         export(
-            "kitti", tmp_path / "in", tmp_path / "out", overwrite=True, options={"grid": "small"}, run=Run(workers=1)
+            "kitti",
+            tmp_path / "in",
+            tmp_path / "out",
+            overwrite=True,
+            options={"grid": "small"},
+            run=Run(workers=1),
         ).made
         == 1
     )
     assert (
-        export("kitti", tmp_path / "in", tmp_path / "out", options={"grid": "small"}, run=Run(workers=1)).skipped == 1
+        export(
+            "kitti",
+            tmp_path / "in",
+            tmp_path / "out",
+            options={"grid": "small"},
+            run=Run(workers=1),
+        ).skipped
+        == 1
     )
 
 
@@ -266,7 +374,9 @@ def test_a_folder_that_holds_another_sequence_is_not_continued(tmp_path):
     export("kitti", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     other = FolderSink(tmp_path / "other").sequence("Test/Town10_Light/cartesian")
     other.write("points", 0, np.ones((1, 4), np.float32))
-    with pytest.raises(ConflictError, match="expected the sequence Test/Town10_Light.*, found Val/Town07_Light"):
+    with pytest.raises(
+        ConflictError, match="expected the sequence Test/Town10_Light.*, found Val/Town07_Light"
+    ):
         export("kitti", tmp_path / "other", tmp_path / "out", run=Run(workers=1))
 
 
@@ -284,24 +394,48 @@ def test_an_interrupted_export_gives_the_same_bytes(tmp_path):
 
 @pytest.mark.parametrize("predictions", [False, True])
 def test_classes_without_a_map_are_named_before_anything_is_written(tmp_path, predictions):
-    table = {"name": "lab", "names": {"0": "free", "1": "road"}, "colors": {"0": [0, 0, 0], "1": [1, 1, 1]}}
+    table = {
+        "name": "lab",
+        "names": {"0": "free", "1": "road"},
+        "colors": {"0": [0, 0, 0], "1": [1, 1, 1]},
+    }
     write_scene(tmp_path / "in", frames=1, metadata={"classes": table})
     with pytest.raises(FormatError, match="expected classes with a map: carla, .*, found lab"):
-        export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": predictions}, run=Run(workers=1))
+        export(
+            "kitti",
+            tmp_path / "in",
+            tmp_path / "out",
+            options={"predictions": predictions},
+            run=Run(workers=1),
+        )
     assert not (tmp_path / "out").exists()
 
 
 def test_predictions_without_a_grid_are_refused(tmp_path):
-    FolderSink(tmp_path / "in").sequence("Val/A/cartesian").write("points", 0, np.ones((1, 4), np.float32))
+    FolderSink(tmp_path / "in").sequence("Val/A/cartesian").write(
+        "points", 0, np.ones((1, 4), np.float32)
+    )
     with pytest.raises(MissingDataError, match="expected a Cartesian grid, found none"):
-        export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": True}, run=Run(workers=1))
+        export(
+            "kitti",
+            tmp_path / "in",
+            tmp_path / "out",
+            options={"predictions": True},
+            run=Run(workers=1),
+        )
 
 
 def test_what_is_exported_is_scored_as_the_benchmark_scores_it(tmp_path):
     """Predictions in CarlaSC's classes, and the same ones as the benchmark's evaluator reads them."""
     write_scene(tmp_path / "in", frames=2)
     for predictions in (False, True):
-        export("kitti", tmp_path / "in", tmp_path / "out", options={"predictions": predictions}, run=Run(workers=1))
+        export(
+            "kitti",
+            tmp_path / "in",
+            tmp_path / "out",
+            options={"predictions": predictions},
+            run=Run(workers=1),
+        )
     result = evaluate(tmp_path / "out", tmp_path / "out")
     assert (result.convention.name, result.frames, result.failures) == ("semantickitti", 2, [])
     scored = {name: value for name, value in result.class_iou.items() if not np.isnan(value)}

@@ -1,4 +1,6 @@
-"""Occluded voxels: the compiled walk of columns beside a walk of single voxels, and beside finely sampled lines."""
+"""Occluded voxels: the compiled walk of columns beside a walk of single voxels, and beside finely
+sampled lines.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ from carlasc.core.grids import GridSpec
 
 
 def plain_walk(occupied, spec):
-    """Walk from the centre of every voxel to the sensor, from voxel to voxel: the face that comes first, x before y before z."""
+    """Walk from the centre of every voxel to the sensor, from voxel to voxel: the face that comes
+    first, x before y before z.
+    """
     sensor = -np.array(spec.lower) / spec.voxel_size
     occluded = np.zeros(spec.size, bool)
     for start in np.ndindex(spec.size):
@@ -45,16 +49,21 @@ def sampled_lines(occupied, spec):
 
 @st.composite
 def grids(draw):
-    """Return a small grid whose sensor is inside or outside its bounds on any axis, in the centre, on the face or beside it."""
+    """Return a small grid whose sensor is inside or outside its bounds on any axis, in the centre,
+    on the face or beside it.
+    """
     size = draw(st.tuples(st.integers(1, 9), st.integers(1, 9), st.integers(1, 12)))
     steps = draw(st.tuples(*[st.sampled_from([0.2, 0.5, 1.0])] * 3))
     places = [
-        draw(st.one_of(st.integers(-2 * n, 4 * n).map(lambda half: half / 2), st.floats(-n, 2 * n))) for n in size
+        draw(st.one_of(st.integers(-2 * n, 4 * n).map(lambda half: half / 2), st.floats(-n, 2 * n)))
+        for n in size
     ]
     lower = tuple(-place * step for place, step in zip(places, steps, strict=True))
     upper = tuple(low + n * step for low, n, step in zip(lower, size, steps, strict=True))
     seed, share = draw(st.integers(0, 2**32 - 1)), draw(st.sampled_from([0.01, 0.05, 0.2, 0.7]))
-    return np.random.default_rng(seed).random(size) < share, GridSpec("cartesian", size, lower, upper)
+    return np.random.default_rng(seed).random(size) < share, GridSpec(
+        "cartesian", size, lower, upper
+    )
 
 
 @given(grids())
@@ -80,7 +89,11 @@ def test_a_wall_hides_what_is_behind_it_and_nothing_else(axis):
     np.moveaxis(occupied, axis, 0)[8] = True
     np.moveaxis(hidden, axis, 0)[8:] = True
     found = occluded_voxels(occupied, GridSpec("cartesian", size, lower, upper))
-    assert np.array_equal(found[5], hidden[5]) if axis else np.array_equal(found[:, 5, 5], hidden[:, 5, 5])
+    assert (
+        np.array_equal(found[5], hidden[5])
+        if axis
+        else np.array_equal(found[:, 5, 5], hidden[:, 5, 5])
+    )
     assert not (found & ~hidden).any()
 
 
@@ -100,4 +113,6 @@ def test_the_order_of_the_mask_in_memory_does_not_matter():
     occupied = np.random.default_rng(2).random(spec.size) < 0.1
     mirrored = occupied[:, ::-1]
     assert np.array_equal(occluded_voxels(mirrored, spec), occluded_voxels(mirrored.copy(), spec))
-    assert np.array_equal(occluded_voxels(np.asfortranarray(occupied), spec), occluded_voxels(occupied, spec))
+    assert np.array_equal(
+        occluded_voxels(np.asfortranarray(occupied), spec), occluded_voxels(occupied, spec)
+    )

@@ -1,4 +1,6 @@
-"""Scans and flow as OpenSceneFlow has them, read again by the facts of its format and compared with the truth of a simulated drive."""
+"""Scans and flow as OpenSceneFlow has them, read again by the facts of its format and compared with
+the truth of a simulated drive.
+"""
 
 import numpy as np
 import pytest
@@ -24,11 +26,20 @@ FIRST, LAST = TIMES[0], TIMES[-1]
 THINGS = dict(enumerate((thing for thing in DRIVE.things if thing.kind in MOVABLE), 1))
 
 
-def write_drive(root, *, axes="left", leave_out=(), path="Train/Street.1/cartesian", drop=(), drive=DRIVE):
-    """Write the drive as a sequence; `leave_out` are fields and documents, `drop` (frame, track) of boxes that are left out."""
+def write_drive(
+    root, *, axes="left", leave_out=(), path="Train/Street.1/cartesian", drop=(), drive=DRIVE
+):
+    """Write the drive as a sequence; `leave_out` are fields and documents, `drop` (frame, track) of
+    boxes that are left out.
+    """
     writer = FolderSink(root).sequence(path)
     left = axes == "left"
-    poses = np.stack([invert(world_T_sensor(drive, 0)) @ world_T_sensor(drive, frame) for frame in range(drive.frames)])
+    poses = np.stack(
+        [
+            invert(world_T_sensor(drive, 0)) @ world_T_sensor(drive, frame)
+            for frame in range(drive.frames)
+        ]
+    )
     documents = {
         layout.POSES: layout.encode_poses(mirror_poses(poses) if left else poses),
         layout.TIMES: layout.encode_times(drive.times),
@@ -44,14 +55,20 @@ def write_drive(root, *, axes="left", leave_out=(), path="Train/Street.1/cartesi
         velocity = np.zeros((len(scan.instances), 3))
         for track, thing in THINGS.items():
             world = thing.speed * np.array([np.cos(thing.heading), np.sin(thing.heading), 0])
-            velocity[scan.instances == track] = rotate_vectors(invert(world_T_sensor(drive, frame)), world[None])[0]
+            velocity[scan.instances == track] = rotate_vectors(
+                invert(world_T_sensor(drive, frame)), world[None]
+            )[0]
         boxes = drive.boxes(frame, CARLA).transform(scan_T_vehicle)
-        boxes = boxes.select(np.array([(frame, track) not in drop for track in boxes.tracks.tolist()], bool))
+        boxes = boxes.select(
+            np.array([(frame, track) not in drop for track in boxes.tracks.tolist()], bool)
+        )
         content = {
             "points": mirror_points(scan.deskewed) if left else scan.deskewed,
             "labels": np.array([CARLA[kind] for kind in KINDS], np.uint32)[scan.kinds],
             "instances": scan.instances + np.uint32(70_000) * (scan.instances > 0),
-            "flow": mirror_points(velocity.astype(np.float32)) if left else velocity.astype(np.float32),
+            "flow": mirror_points(velocity.astype(np.float32))
+            if left
+            else velocity.astype(np.float32),
             "seconds": scan.seconds.astype(np.float32),
             "sensor": (np.arange(len(scan.points)) % 2).astype(np.uint8),
             "boxes": renumber(mirror_boxes(boxes) if left else boxes, 70_000).to_table(),
@@ -64,7 +81,12 @@ def write_drive(root, *, axes="left", leave_out=(), path="Train/Street.1/cartesi
 
 def renumber(boxes, more):
     return Boxes(
-        boxes.tracks + np.uint32(more), boxes.labels, boxes.centers, boxes.quaternions, boxes.sizes, boxes.annotated
+        boxes.tracks + np.uint32(more),
+        boxes.labels,
+        boxes.centers,
+        boxes.quaternions,
+        boxes.sizes,
+        boxes.annotated,
     )
 
 
@@ -75,12 +97,16 @@ def read_log(file):
 
 
 def true_flow(frame, drive=DRIVE):
-    """Return where each point is in the next sensor's frame, less where it is now, by the motion of what it lies on."""
+    """Return where each point is in the next sensor's frame, less where it is now, by the motion of
+    what it lies on.
+    """
     scan, now, later = drive.scan(frame), drive.times[frame], drive.times[frame + 1]
     world = transform_points(world_T_sensor(drive, frame), scan.deskewed[:, :3])
     for track, thing in THINGS.items():
         on_it = scan.instances == track
-        world[on_it] = transform_points(thing.world_T_box(later) @ invert(thing.world_T_box(now)), world[on_it])
+        world[on_it] = transform_points(
+            thing.world_T_box(later) @ invert(thing.world_T_box(now)), world[on_it]
+        )
     return transform_points(invert(world_T_sensor(drive, frame + 1)), world) - scan.deskewed[:, :3]
 
 
@@ -134,7 +160,9 @@ def test_a_scan_has_the_types_of_the_format(tmp_path):
     kinds = np.array(KINDS)[scan.kinds]
     assert np.array_equal(group["ground_mask"], kinds == "road")
     categories = {"car": 19, "van": 19, "pedestrian": 17, "cyclist": 17}
-    assert np.array_equal(group["flow_category_indices"], [categories.get(kind, 0) for kind in kinds])
+    assert np.array_equal(
+        group["flow_category_indices"], [categories.get(kind, 0) for kind in kinds]
+    )
     assert np.array_equal(group["lidar_id"], np.arange(len(kinds)) % 2)
     assert np.array_equal(group["lidar_dt"], scan.seconds.astype(np.float32))
 
@@ -142,8 +170,15 @@ def test_a_scan_has_the_types_of_the_format(tmp_path):
 def test_more_objects_than_16_bits_hold_are_named(tmp_path):
     with opensceneflow._LogFile(tmp_path / "log.h5", {0: "1"}) as log:
         found = log._number(np.arange(32_768, dtype=np.uint32)[::-1] << 5)
-        assert (found.dtype, found.min(), found.max(), len(np.unique(found))) == (np.int16, 0, 32_767, 32_768)
-        with pytest.raises(FormatError, match=r"log.h5: expected at most 32767 objects, found 32768"):
+        assert (found.dtype, found.min(), found.max(), len(np.unique(found))) == (
+            np.int16,
+            0,
+            32_767,
+            32_768,
+        )
+        with pytest.raises(
+            FormatError, match=r"log.h5: expected at most 32767 objects, found 32768"
+        ):
             log.add(0, {"flow_instance_id": np.array([3], np.uint32)})
 
 
@@ -153,8 +188,16 @@ def test_objects_keep_their_numbers_although_the_source_has_larger_ones(tmp_path
     log = read_log(tmp_path / "out" / "train" / "Street_1.h5")
     pairs = set()
     for frame, time in enumerate(sorted(log, key=int)):
-        pairs |= set(zip(DRIVE.scan(frame).instances.tolist(), log[time]["flow_instance_id"].tolist(), strict=True))
-    assert len(pairs) == len({track for track, _ in pairs}) == len({number for _, number in pairs}) > 3
+        pairs |= set(
+            zip(
+                DRIVE.scan(frame).instances.tolist(),
+                log[time]["flow_instance_id"].tolist(),
+                strict=True,
+            )
+        )
+    assert (
+        len(pairs) == len({track for track, _ in pairs}) == len({number for _, number in pairs}) > 3
+    )
     assert (0, 0) in pairs
 
 
@@ -179,7 +222,10 @@ def test_nothing_is_known_of_scans_without_annotations_and_flow(tmp_path):
 def test_without_labels_the_ground_is_found_and_what_does_not_exist_is_absent(tmp_path):
     write_drive(tmp_path / "in", leave_out=("labels", "instances", "seconds", "sensor"))
     result = export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
-    assert any("has no labels: the ground is found by the shape of each scan" in note for note in result.notes)
+    assert any(
+        "has no labels: the ground is found by the shape of each scan" in note
+        for note in result.notes
+    )
     group = read_log(tmp_path / "out" / "train" / "Street_1.h5")[FIRST]
     assert not {"flow_category_indices", "flow_instance_id", "lidar_dt"} & set(group)
     assert not group["lidar_id"].any()
@@ -196,13 +242,21 @@ def test_the_index_lists_all_logs_of_a_folder(tmp_path):
     export("opensceneflow", tmp_path / "more", tmp_path / "out", run=Run(workers=1))
     index = read_index(tmp_path / "out" / "train" / "index_total.pkl")
     assert index == [[log, time] for log in ("Second", "Street_1") for time in TIMES]
-    assert read_index(tmp_path / "out" / "val" / "index_total.pkl") == [["Other", time] for time in TIMES]
+    assert read_index(tmp_path / "out" / "val" / "index_total.pkl") == [
+        ["Other", time] for time in TIMES
+    ]
     flows = read_index(tmp_path / "out" / "train" / "index_flow.pkl")
-    assert flows == [[log, time] for log in ("Second", "Street_1") for time in TIMES[:3]]  # the last scan has none
-    assert read_index(tmp_path / "out" / "train" / "index_eval.pkl") == [["Second", FIRST], ["Street_1", FIRST]]
+    # the last scan has none
+    assert flows == [[log, time] for log in ("Second", "Street_1") for time in TIMES[:3]]
+    assert read_index(tmp_path / "out" / "train" / "index_eval.pkl") == [
+        ["Second", FIRST],
+        ["Street_1", FIRST],
+    ]
 
 
-def test_every_fifth_scan_with_flow_is_evaluated_where_points_are_near_and_not_on_the_ground(tmp_path, monkeypatch):
+def test_every_fifth_scan_with_flow_is_evaluated_where_points_are_near_and_not_on_the_ground(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(opensceneflow, "_EVALUATED", 2)
     monkeypatch.setattr(opensceneflow, "_EVALUATED_M", 15.0)
     write_drive(tmp_path / "in", drop=((1, 1),))
@@ -210,9 +264,8 @@ def test_every_fifth_scan_with_flow_is_evaluated_where_points_are_near_and_not_o
     index = read_index(tmp_path / "out" / "train" / "index_eval.pkl")
     assert index == [["Street_1", TIMES[0]], ["Street_1", TIMES[2]]]
     total = read_index(tmp_path / "out" / "train" / "index_total.pkl")
-    assert all(
-        entry in total and total.index(entry) < len(total) - 1 for entry in index
-    )  # the loader reads the next scan too
+    # the loader reads the next scan too
+    assert all(entry in total and total.index(entry) < len(total) - 1 for entry in index)
     group = read_log(tmp_path / "out" / "train" / "Street_1.h5")[FIRST]
     near = (np.abs(group["lidar"][:, :2]) <= 15).all(axis=1)
     assert np.array_equal(group["eval_mask"], near & ~group["ground_mask"] & group["flow_is_valid"])
@@ -239,7 +292,9 @@ def test_a_run_that_is_interrupted_leaves_no_file(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1, progress=stop))
+        export(
+            "opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1, progress=stop)
+        )
     assert not list((tmp_path / "out" / "train").iterdir())
     assert export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1)).made == 4
 
@@ -277,15 +332,23 @@ def test_what_cannot_be_exported_is_named_in_one_line(tmp_path):
         with pytest.raises(MissingDataError, match=message):
             export("opensceneflow", tmp_path / field, tmp_path / "out", run=Run(workers=1))
     write_drive(tmp_path / "still", leave_out=("flow", "boxes"))
-    with pytest.raises(MissingDataError, match="expected flow or boxes, for the motion of objects, found none"):
+    with pytest.raises(
+        MissingDataError, match="expected flow or boxes, for the motion of objects, found none"
+    ):
         export("opensceneflow", tmp_path / "still", tmp_path / "out", run=Run(workers=1))
     write_drive(tmp_path / "in")
     folder = tmp_path / "in" / "Train/Street.1/cartesian"
     (folder / layout.TIMES).write_bytes(layout.encode_times(np.array([0.0, 0.1, 0.1, 0.3])))
-    with pytest.raises(FormatError, match="times.txt: expected times that increase, found 0.1 s at frame 2"):
+    with pytest.raises(
+        FormatError, match="times.txt: expected times that increase, found 0.1 s at frame 2"
+    ):
         export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     (folder / layout.TIMES).write_bytes(layout.encode_times(DRIVE.times))
-    table = {"name": "lab", "names": {"0": "free", "1": "road"}, "colors": {"0": [0, 0, 0], "1": [1, 1, 1]}}
+    table = {
+        "name": "lab",
+        "names": {"0": "free", "1": "road"},
+        "colors": {"0": [0, 0, 0], "1": [1, 1, 1]},
+    }
     (folder / layout.METADATA).write_bytes(to_json({"classes": table}))
     with pytest.raises(FormatError, match="expected classes with a map: carla, .*, found lab"):
         export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
@@ -296,6 +359,13 @@ def test_a_file_that_is_no_log_is_named(tmp_path):
     write_drive(tmp_path / "in")
     (tmp_path / "out" / "train").mkdir(parents=True)
     (tmp_path / "out" / "train" / "Street_1.h5").write_bytes(b"something else")
-    with pytest.raises(FormatError, match="Street_1.h5: expected an HDF5 file of scans.*`overwrite=True`"):
+    with pytest.raises(
+        FormatError, match="Street_1.h5: expected an HDF5 file of scans.*`overwrite=True`"
+    ):
         export("opensceneflow", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
-    assert export("opensceneflow", tmp_path / "in", tmp_path / "out", overwrite=True, run=Run(workers=1)).made == 4
+    assert (
+        export(
+            "opensceneflow", tmp_path / "in", tmp_path / "out", overwrite=True, run=Run(workers=1)
+        ).made
+        == 4
+    )

@@ -14,7 +14,9 @@ def spec_of(size, lower, upper):
 
 
 def plain_resample(labels, known, source, target):
-    """The rule in a loop: voxels of the source by their centres along coarser axes, the one at its centre along finer ones."""
+    """The rule in a loop: voxels of the source by their centres along coarser axes, the one at its
+    centre along finer ones.
+    """
     result, seen = np.zeros(target.size, labels.dtype), np.zeros(target.size, bool)
     steps = source.voxel_size, target.voxel_size
     for cell in np.ndindex(target.size):
@@ -26,7 +28,11 @@ def plain_resample(labels, known, source, target):
                 inside = (centers >= low - 1e-7) & (centers < low + steps[1][axis] - 1e-7)
                 ranges.append(np.flatnonzero(inside))
             else:
-                at = int(np.floor((low + steps[1][axis] / 2 - source.lower[axis]) / steps[0][axis] + 1e-7))
+                at = int(
+                    np.floor(
+                        (low + steps[1][axis] / 2 - source.lower[axis]) / steps[0][axis] + 1e-7
+                    )
+                )
                 ranges.append(np.array([at]) if 0 <= at < source.size[axis] else np.empty(0, int))
         block, sure = labels[np.ix_(*ranges)], known[np.ix_(*ranges)]
         occupied = block[sure & (block > 0)]
@@ -43,7 +49,9 @@ def plain_resample(labels, known, source, target):
 )
 def test_resampling_follows_the_rule(seed, fine, coarse, offset):
     rng = np.random.default_rng(seed)
-    source = spec_of((6, 5, 4), (0.0, 0.0, 0.0), tuple(n * s for n, s in zip((6, 5, 4), fine, strict=True)))
+    source = spec_of(
+        (6, 5, 4), (0.0, 0.0, 0.0), tuple(n * s for n, s in zip((6, 5, 4), fine, strict=True))
+    )
     lower = tuple(offset)
     upper = tuple(low + n * s for low, n, s in zip(lower, (4, 5, 3), coarse, strict=True))
     target = spec_of((4, 5, 3), lower, upper)
@@ -101,7 +109,10 @@ def test_notes_say_what_is_lost():
     (coarse,) = resampling_notes(target.with_size((20, 20, 5)), target, "coarse")
     assert (
         coarse
-        == "the voxels of the grid coarse are larger than those that are written: 0.2 x 0.2 x 0.4 m, not 0.2 x 0.2 x 0.2 m"
+        == "the voxels of the grid coarse are larger than those that are written: 0.2 x 0.2 x 0.4 "
+        "m, not 0.2 x 0.2 x 0.2 m"
     )
-    (small,) = resampling_notes(spec_of((10, 20, 10), (0.0, -2.0, -1.0), (2.0, 2.0, 1.0)), target, "half")
+    (small,) = resampling_notes(
+        spec_of((10, 20, 10), (0.0, -2.0, -1.0), (2.0, 2.0, 1.0)), target, "half"
+    )
     assert small == "the grid half covers 50 % of the volume that is written: the rest is unknown"

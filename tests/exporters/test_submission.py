@@ -17,10 +17,16 @@ FIRST = "sequences/11/predictions/000000.label"
 
 @pytest.fixture(params=["completion", "segmentation"])
 def case(request, tmp_path):
-    """Return the task, the benchmark's data with two inputs in each test sequence, and a right folder of predictions."""
+    """Return the task, the benchmark's data with two inputs in each test sequence, and a right
+    folder of predictions.
+    """
     task, kind = request.param, "<u2" if request.param == "completion" else "<u4"
     for number in range(11, 22):
-        inputs = tmp_path / f"data/sequences/{number}" / ("voxels" if task == "completion" else "velodyne")
+        inputs = (
+            tmp_path
+            / f"data/sequences/{number}"
+            / ("voxels" if task == "completion" else "velodyne")
+        )
         predictions = tmp_path / f"out/sequences/{number}/predictions"
         inputs.mkdir(parents=True)
         predictions.mkdir(parents=True)
@@ -49,8 +55,13 @@ def test_a_right_folder_passes_and_is_packed_whole(case, tmp_path):
     with zipfile.ZipFile(tmp_path / "new" / "ours.zip") as archive:
         names = archive.namelist()
         assert archive.read(FIRST) == (case[2] / FIRST).read_bytes()
-    files = [f"sequences/{n}/predictions/{frame:06d}.label" for n in range(11, 22) for frame in (0, 5)]
-    folders = ["sequences/", *(f"sequences/{n}/{part}" for n in range(11, 22) for part in ("", "predictions/"))]
+    files = [
+        f"sequences/{n}/predictions/{frame:06d}.label" for n in range(11, 22) for frame in (0, 5)
+    ]
+    folders = [
+        "sequences/",
+        *(f"sequences/{n}/{part}" for n in range(11, 22) for part in ("", "predictions/")),
+    ]
     assert sorted(names) == sorted([*files, *folders, "description.txt"])
 
 
@@ -61,7 +72,9 @@ def test_a_missing_file_and_a_missing_folder_are_named(case, tmp_path):
         check(case, zip=str(tmp_path / "ours.zip"))
     assert not (tmp_path / "ours.zip").exists()
     (case[2] / "sequences/14/predictions").rename(case[2] / "sequences/14/labels")
-    with pytest.raises(MissingDataError, match="expected a prediction for each of 2 inputs, found none"):
+    with pytest.raises(
+        MissingDataError, match="expected a prediction for each of 2 inputs, found none"
+    ):
         check(case)
 
 
@@ -69,7 +82,9 @@ def test_a_file_of_another_size_is_named(case):
     path = case[2] / FIRST
     path.write_bytes(path.read_bytes()[:-2])
     expected = "128 bytes: 64 voxels, 2" if case[0] == "completion" else "20 bytes: 5 points, 4"
-    with pytest.raises(FormatError, match=f"{FIRST}: expected {expected} bytes each, found (126|18) bytes"):
+    with pytest.raises(
+        FormatError, match=f"{FIRST}: expected {expected} bytes each, found (126|18) bytes"
+    ):
         check(case)
 
 
@@ -79,10 +94,13 @@ def test_an_id_that_the_evaluator_does_not_take_is_named(case, bad):
     labels = np.frombuffer(path.read_bytes(), "<u2" if case[0] == "completion" else "<u4").copy()
     labels[:2] = bad
     path.write_bytes(labels.tobytes())
-    if case[0] == "segmentation" and bad == 52:  # other-structure: the evaluator of points maps it to unlabeled
+    # other-structure: the evaluator of points maps it to unlabeled
+    if case[0] == "segmentation" and bad == 52:
         assert check(case).skipped == 22
         return
-    with pytest.raises(FormatError, match=rf"{FIRST}: expected class ids .*, found {bad} \(2 times\)"):
+    with pytest.raises(
+        FormatError, match=rf"{FIRST}: expected class ids .*, found {bad} \(2 times\)"
+    ):
         check(case)
 
 
@@ -91,9 +109,14 @@ def test_files_that_are_not_needed_are_an_error_in_completion_and_are_not_packed
     more.write_bytes((case[2] / FIRST).read_bytes())
     if case[0] == "segmentation":
         check(case, zip=str(tmp_path / "ours.zip"))
-        assert "sequences/11/predictions/000001.label" not in zipfile.ZipFile(tmp_path / "ours.zip").namelist()
+        assert (
+            "sequences/11/predictions/000001.label"
+            not in zipfile.ZipFile(tmp_path / "ours.zip").namelist()
+        )
         return
-    with pytest.raises(FormatError, match="expected no more than 2 files, found 1 more: 000001.label"):
+    with pytest.raises(
+        FormatError, match="expected no more than 2 files, found 1 more: 000001.label"
+    ):
         check(case)
     more.unlink()
     (case[2] / "sequences/08").mkdir()
@@ -107,7 +130,9 @@ def test_data_without_the_test_sequences_are_named(case):
 
 
 def test_the_zip_is_checked_before_anything_is_read(tmp_path):
-    with pytest.raises(ArgumentError, match="zip: expected a name that ends in .zip, found 'ours.tar'"):
+    with pytest.raises(
+        ArgumentError, match="zip: expected a name that ends in .zip, found 'ours.tar'"
+    ):
         export("kitti", tmp_path, tmp_path, options={"check": "completion", "zip": "ours.tar"})
     with pytest.raises(ArgumentError, match="zip: expected `check` too"):
         export("kitti", tmp_path, tmp_path, options={"zip": "ours.zip"})

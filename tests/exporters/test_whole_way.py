@@ -17,7 +17,14 @@ import carlasc
 from carlasc import Run
 from carlasc.captures import Lidar, simulate
 from carlasc.cli import app
-from carlasc.converting import LayoutOptions, convert, converter_names, export, load_converter, remaps_to_carla
+from carlasc.converting import (
+    LayoutOptions,
+    convert,
+    converter_names,
+    export,
+    load_converter,
+    remaps_to_carla,
+)
 from carlasc.core.benchmarks import TO_OCC3D
 from carlasc.core.geometry import invert, transform_points
 from carlasc.testing.drives import MOVABLE, SimulatedDrive, world_T_sensor
@@ -53,7 +60,9 @@ def test_boxes_become_flow_in_the_frame_of_the_next_scan(tmp_path):
             world = transform_points(world_T_sensor(drive, frame), points)
             for track, thing in tracks.items():
                 on_it = scan.instances == track
-                now, later = (thing.world_T_box(drive.times[number]) for number in (frame, frame + 1))
+                now, later = (
+                    thing.world_T_box(drive.times[number]) for number in (frame, frame + 1)
+                )
                 world[on_it] = transform_points(later @ invert(now), world[on_it])
             truth = transform_points(invert(world_T_sensor(drive, frame + 1)), world) - points
             wrong = np.linalg.norm(group["flow"][()] - truth, axis=1)
@@ -99,12 +108,42 @@ def test_every_converter_of_ours_has_classes_that_can_be_exported(name):
     [
         (
             "nuscenes",
-            {"vehicle.bus.rigid": (3, 13, 7), "movable_object.trafficcone": (8, 99, 9), "flat.other": (12, 49, 0)},
+            {
+                "vehicle.bus.rigid": (3, 13, 7),
+                "movable_object.trafficcone": (8, 99, 9),
+                "flat.other": (12, 49, 0),
+            },
         ),
-        ("nuscenes", {"vehicle.car": (4, 10, 19), "flat.terrain": (14, 72, 0), "static.vegetation": (16, 70, 0)}),
-        ("carlaocc", {"Truck": (10, 18, 25), "Train": (9, 16, 18), "Rider": (7, 30, 17), "Rock": (14, 72, 0)}),
-        ("kitti360", {"caravan": (9, 20, 27), "bicycle": (2, 11, 3), "parking": (11, 44, 0), "wall": (15, 52, 0)}),
-        ("argoverse2", {"SCHOOL_BUS": (3, 13, 20), "REGULAR_VEHICLE": (4, 10, 19), "DOG": (0, 99, 10)}),
+        (
+            "nuscenes",
+            {
+                "vehicle.car": (4, 10, 19),
+                "flat.terrain": (14, 72, 0),
+                "static.vegetation": (16, 70, 0),
+            },
+        ),
+        (
+            "carlaocc",
+            {
+                "Truck": (10, 18, 25),
+                "Train": (9, 16, 18),
+                "Rider": (7, 30, 17),
+                "Rock": (14, 72, 0),
+            },
+        ),
+        (
+            "kitti360",
+            {
+                "caravan": (9, 20, 27),
+                "bicycle": (2, 11, 3),
+                "parking": (11, 44, 0),
+                "wall": (15, 52, 0),
+            },
+        ),
+        (
+            "argoverse2",
+            {"SCHOOL_BUS": (3, 13, 20), "REGULAR_VEHICLE": (4, 10, 19), "DOG": (0, 99, 10)},
+        ),
         ("kitti-raw", {"Tram": (9, 16, 18), "Van": (4, 10, 19), "Cyclist": (7, 30, 17)}),
     ],
 )
@@ -119,7 +158,10 @@ def test_classes_that_carlasc_does_not_have_keep_their_kind(name, classes):
 
 
 def test_kinds_are_named_as_in_their_tables():
-    tables = {load_converter(name).classes.name: load_converter(name).classes for name in converter_names()}
+    tables = {
+        load_converter(name).classes.name: load_converter(name).classes
+        for name in converter_names()
+    }
     for table, kinds in KINDS.items():
         assert set(kinds) <= set(tables[table].names.values())
 
@@ -127,13 +169,23 @@ def test_kinds_are_named_as_in_their_tables():
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("capture") / "Val" / "Town07_Light"
-    simulate(folder, count=2, sensors=3, lidar=Lidar(channels=16, points=8_000), bev=False, run=Run(workers=1))
+    simulate(
+        folder,
+        count=2,
+        sensors=3,
+        lidar=Lidar(channels=16, points=8_000),
+        bev=False,
+        run=Run(workers=1),
+    )
     return folder
 
 
 def test_the_command_that_is_advised_makes_the_exact_grid(capture, tmp_path):
     root = capture.parents[1]
-    assert runner.invoke(app, ["regrid", str(root), "--preset", "coarse", "--workers", "1"]).exit_code == 0
+    assert (
+        runner.invoke(app, ["regrid", str(root), "--preset", "coarse", "--workers", "1"]).exit_code
+        == 0
+    )
     first = export("occ3d", root, tmp_path / "first", run=Run(workers=1))
     (advice,) = (note for note in first.notes if "carlasc regrid" in note)
     command = shlex.split(re.search(r"`carlasc (.*?)`", advice)[1])
@@ -154,7 +206,8 @@ def test_the_command_that_is_advised_makes_the_exact_grid(capture, tmp_path):
     fine = next(iter(arrays.values()))
     both = (coarse["mask_lidar"] == 1) & (fine["mask_lidar"] == 1)
     assert both.sum() > 1000
-    assert (coarse["semantics"] == fine["semantics"])[both].mean() > 0.9  # other voxels, the same places
+    # other voxels, the same places
+    assert (coarse["semantics"] == fine["semantics"])[both].mean() > 0.9
     assert fine["semantics"][occ3d_cell(6, 0, 0.1)] in (11, 17)
 
 
@@ -169,14 +222,18 @@ def test_flow_of_a_real_sample_is_that_of_its_data_set(real, tmp_path):
         pytest.skip(f"{archive} is not there")
     with tarfile.open(archive) as file:
         file.extractall(tmp_path, filter="data")
-    convert("argoverse2", tmp_path / "av2" / "val", tmp_path / "layout", grids=None, run=Run(workers=1))
+    convert(
+        "argoverse2", tmp_path / "av2" / "val", tmp_path / "layout", grids=None, run=Run(workers=1)
+    )
     export("opensceneflow", tmp_path / "layout", tmp_path / "out", run=Run(workers=1))
     (log,) = (tmp_path / "av2" / "val").iterdir()
     truth = feather.read_table(log / "flow_labels.feather")
     lasers = feather.read_table(sorted(log.glob("sensors/lidar/*"))[0])["laser_number"].to_numpy()
     order = np.argsort(lasers >= 32, kind="stable")  # sensor by sensor, as in the layout
     flow = np.column_stack([truth[f"flow_t{axis}_m"].to_numpy() for axis in "xyz"])[order]
-    moving, ground = (truth[name].to_numpy().astype(bool)[order] for name in ("dynamic", "is_ground_0"))
+    moving, ground = (
+        truth[name].to_numpy().astype(bool)[order] for name in ("dynamic", "is_ground_0")
+    )
     with h5py.File(next((tmp_path / "out").rglob("*.h5"))) as file:
         group = {name: array[()] for name, array in file[min(file, key=int)].items()}
     error = np.linalg.norm(group["flow"] - flow, axis=1)

@@ -18,7 +18,9 @@ ALL, REAR_AND_LOW = (True,) * 4, (True, False, True, False)
 def body(faces=ALL, half=HALF):
     extent = Extent(-half, half, faces, 100)
     poses = np.eye(4)[None]
-    return Track(10, 0, {}, 0, poses, np.zeros((1, 3)), -half - BODY_MARGIN_M, half + BODY_MARGIN_M, extent)
+    return Track(
+        10, 0, {}, 0, poses, np.zeros((1, 3)), -half - BODY_MARGIN_M, half + BODY_MARGIN_M, extent
+    )
 
 
 def regions_of(pose, track):
@@ -30,7 +32,9 @@ def test_a_body_has_all_voxels_that_its_box_touches_wherever_it_is_turned(turn):
     pose = translation((1.3, -2.1, 0.1)) @ rotation_z(turn)
     regions = regions_of(pose, body())
     assert regions.actors == {1: 7}
-    inside = transform_points(pose, np.random.default_rng(0).uniform(-1, 1, (5000, 3)) * (HALF + BODY_MARGIN_M))
+    inside = transform_points(
+        pose, np.random.default_rng(0).uniform(-1, 1, (5000, 3)) * (HALF + BODY_MARGIN_M)
+    )
     assert (regions.of_voxel[SPEC.flat_index(inside)] == 1).all()
     apart = transform_points(np.linalg.inv(pose), CENTERS[regions.of_voxel == 1])
     assert (np.abs(apart) < HALF + BODY_MARGIN_M + 0.2 * np.sqrt(2) + 1e-6).all()
@@ -62,7 +66,9 @@ def test_the_sides_are_those_of_the_actor_and_not_of_the_grid():
     pose = rotation_z(np.pi)
     plain, turned = (regions_of(place, body(REAR_AND_LOW)) for place in (np.eye(4), pose))
     one, other = CENTERS[plain.hidden], transform_points(pose, CENTERS[turned.hidden])
-    assert np.allclose(one[np.lexsort(one.round(3).T)], other[np.lexsort(other.round(3).T)], atol=1e-5)
+    assert np.allclose(
+        one[np.lexsort(one.round(3).T)], other[np.lexsort(other.round(3).T)], atol=1e-5
+    )
 
 
 def test_points_without_a_body_have_a_region_of_their_own():
@@ -73,7 +79,8 @@ def test_points_without_a_body_have_a_region_of_their_own():
     assert regions.of_voxel[SPEC.flat_index(points[2:3])].tolist() == [1]  # a body keeps its voxels
     assert np.count_nonzero(regions.of_voxel != with_body.of_voxel) == 1
     assert regions.actors == {1: 7}  # no actor is carried into the new region
-    assert not with_body.of_voxel[SPEC.flat_index(points[:1])].any()  # the first regions stay as they were
+    # the first regions stay as they were
+    assert not with_body.of_voxel[SPEC.flat_index(points[:1])].any()
     alone = BodyRegions.of_bodies(SPEC, np.eye(4), []).with_points(SPEC, points[:1])
     assert alone.of_voxel[SPEC.flat_index(points[:1])] != STATIC
 

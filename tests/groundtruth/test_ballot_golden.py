@@ -1,4 +1,6 @@
-"""The authors' generator made these grids: they come out again byte for byte, from the kernel and from the plain version."""
+"""The authors' generator made these grids: they come out again byte for byte, from the kernel and
+from the plain version.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +32,14 @@ def observe(capture: Path, frame: int) -> list[Observation]:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("frame", range(3))
-def test_golden_grids_come_out_byte_for_byte(golden_capture: Path, variant: str, frame: int) -> None:
+def test_golden_grids_come_out_byte_for_byte(
+    golden_capture: Path, variant: str, frame: int
+) -> None:
     folder = golden_capture / variant / "evaluation"
     spec = GridSpec.from_params(json.loads((folder / "params.json").read_text()))
-    grid = count_votes(observe(golden_capture, 100 + frame), spec, free_step_m=VARIANTS[variant]).to_grid()
+    grid = count_votes(
+        observe(golden_capture, 100 + frame), spec, free_step_m=VARIANTS[variant]
+    ).to_grid()
     assert grid.counts is not None
     assert grid.labels.astype("<u4").tobytes() == (folder / f"{frame:06d}.label").read_bytes()
     assert grid.counts.astype("<f4").tobytes() == (folder / f"{frame:06d}.bin").read_bytes()
@@ -43,6 +49,8 @@ def test_golden_grids_come_out_byte_for_byte(golden_capture: Path, variant: str,
 def test_the_plain_version_makes_the_golden_grids_too(golden_capture: Path, variant: str) -> None:
     folder = golden_capture / variant / "evaluation"
     spec = GridSpec.from_params(json.loads((folder / "params.json").read_text()))
-    labels, counts = plain_grid(plain_votes(observe(golden_capture, 101), spec, free_step_m=VARIANTS[variant]), spec)
+    labels, counts = plain_grid(
+        plain_votes(observe(golden_capture, 101), spec, free_step_m=VARIANTS[variant]), spec
+    )
     assert labels.astype("<u4").tobytes() == (folder / "000001.label").read_bytes()
     assert counts.astype("<f4").tobytes() == (folder / "000001.bin").read_bytes()

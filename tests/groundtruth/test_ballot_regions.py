@@ -107,7 +107,9 @@ def test_regions_that_do_not_fit_are_refused():
         Ballot(SPEC, regions=np.zeros(3, np.uint16))
     with pytest.raises(ArgumentError, match="regions: expected"):
         Ballot(SPEC, rule="ray", regions=np.zeros(SPEC.num_voxels + 1, np.uint16))
-    with pytest.raises(ArgumentError, match="observation: expected no region, as the ballot has none"):
+    with pytest.raises(
+        ArgumentError, match="observation: expected no region, as the ballot has none"
+    ):
         count_votes([observation(free_region=0)], SPEC)
 
 
@@ -116,7 +118,11 @@ def test_samples_outside_of_a_region_are_put_back_or_not_counted(few):
     regions = np.zeros(SPEC.num_voxels, np.uint16)
     regions[:: 20 if few else 3] = 1
     free = [tally([observation(seed)], "ray").free.reshape(-1) for seed in range(3)]
-    regional = tally([observation(0), observation(1, free_region=0), observation(2, free_region=1)], "ray", regions)
+    regional = tally(
+        [observation(0), observation(1, free_region=0), observation(2, free_region=1)],
+        "ray",
+        regions,
+    )
     expected = free[0] + np.where(regions == 0, free[1], 0) + np.where(regions == 1, free[2], 0)
     assert (regional.free.reshape(-1) == expected).all()
 
@@ -128,7 +134,9 @@ def test_a_ray_that_stands_for_others_has_their_votes(region):
     one, regions = observation(sure=sure), np.arange(SPEC.num_voxels, dtype=np.uint16) % 40 // 39
     many = [np.repeat(values, weights, axis=0) for values in (one.points, one.labels, sure)]
     weighed = tally([observation(sure=sure, weights=weights, free_region=region)], "ray", regions)
-    repeated = tally([Observation(many[0], many[1], np.eye(4), sure=many[2], free_region=region)], "ray", regions)
+    repeated = tally(
+        [Observation(many[0], many[1], np.eye(4), sure=many[2], free_region=region)], "ray", regions
+    )
     assert (weighed.free == repeated.free).all() and weighed.free.any()
     assert (weighed.occupied == repeated.occupied).all() and weighed.occupied["votes"].max() > 4
 
@@ -142,7 +150,10 @@ def test_voters_of_one_observation_vote_as_observations_do():
         for pose, a, b in zip(poses, [0, *ends[:-1]], ends, strict=True)
     ]
     for rule in ("sensor", "ray"):
-        together, apart = tally([Observation(one.points, one.labels, poses, ends=ends)], rule), tally(parts, rule)
+        together, apart = (
+            tally([Observation(one.points, one.labels, poses, ends=ends)], rule),
+            tally(parts, rule),
+        )
         assert (together.free == apart.free).all() and (together.occupied == apart.occupied).all()
 
 

@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, FormatError
-from carlasc.groundtruth.voting.ballot import OCCUPIED_DTYPE, Ballot, Observation, Votes, count_votes
+from carlasc.groundtruth.voting.ballot import (
+    OCCUPIED_DTYPE,
+    Ballot,
+    Observation,
+    Votes,
+    count_votes,
+)
 from carlasc.storage.field_files import VOTES_DTYPE
 
 POINTS, LABELS, POSE = np.ones((4, 3), np.float32), np.full(4, 7, np.uint8), np.eye(4)
@@ -67,7 +73,9 @@ def test_an_observation_without_points_is_a_voter_without_votes() -> None:
 
 def test_sparse_votes_are_sorted_and_those_that_do_not_fit_are_kept_as_the_most_that_does() -> None:
     spec = GridSpec("cartesian", (2, 1, 1), (0.0, 0.0, 0.0), (2.0, 1.0, 1.0))
-    occupied = np.array([(0, 7, 70_000, 1, 1), (1, 3, 65_535, 1, 1), (1, 9, 5, 1, 1)], OCCUPIED_DTYPE)
+    occupied = np.array(
+        [(0, 7, 70_000, 1, 1), (1, 3, 65_535, 1, 1), (1, 9, 5, 1, 1)], OCCUPIED_DTYPE
+    )
     votes = Votes(spec, CARLA, np.array([0, 100_000], np.int64).reshape(spec.size), occupied)
     sparse = votes.to_sparse()
     assert sparse.dtype == VOTES_DTYPE
@@ -80,7 +88,10 @@ def test_sparse_votes_are_sorted_and_those_that_do_not_fit_are_kept_as_the_most_
 @given(st.integers(0, 2**32 - 1))
 def test_rows_are_sorted_and_decide_what_a_table_of_all_classes_decides(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    spec, channels = GridSpec("cartesian", (3, 2, 2), (0.0, 0.0, 0.0), (3.0, 2.0, 2.0)), CARLA.num_channels
+    spec, channels = (
+        GridSpec("cartesian", (3, 2, 2), (0.0, 0.0, 0.0), (3.0, 2.0, 2.0)),
+        CARLA.num_channels,
+    )
     ballot = Ballot(spec, rule="sample", free_step_m=0.4)
     table = np.zeros((spec.num_voxels, channels), np.int64)
     for _ in range(rng.integers(0, 4)):
@@ -93,7 +104,9 @@ def test_rows_are_sorted_and_decide_what_a_table_of_all_classes_decides(seed: in
     pairs = votes.occupied["voxel"].astype(np.int64) * channels + votes.occupied["label"]
     assert (np.diff(pairs) > 0).all()
     labels, counts = votes.elect_occupied()
-    np.testing.assert_array_equal(labels, np.where(table[:, 1:].any(axis=1), table[:, 1:].argmax(axis=1) + 1, 0))
+    np.testing.assert_array_equal(
+        labels, np.where(table[:, 1:].any(axis=1), table[:, 1:].argmax(axis=1) + 1, 0)
+    )
     np.testing.assert_array_equal(counts, table[:, 1:].sum(axis=1))
     np.testing.assert_array_equal(ballot.hit, table[:, 1:].any(axis=1))
     np.testing.assert_array_equal(ballot.seen(), table.any(axis=1))
@@ -102,13 +115,18 @@ def test_rows_are_sorted_and_decide_what_a_table_of_all_classes_decides(seed: in
     np.testing.assert_array_equal(grid.labels.reshape(-1), table.argmax(axis=1))
     np.testing.assert_array_equal(grid.counts.reshape(-1), table.sum(axis=1))
     voxels, classes = np.nonzero(table)
-    expected = list(zip(voxels.tolist(), classes.tolist(), table[voxels, classes].tolist(), strict=True))
+    expected = list(
+        zip(voxels.tolist(), classes.tolist(), table[voxels, classes].tolist(), strict=True)
+    )
     assert votes.to_sparse().tolist() == expected
 
 
 def test_ballots_of_several_threads_do_not_meet() -> None:
     frame = street_frame(sensors=4, channels=16, columns=256, distinct=2)
-    specs = [GridSpec.published(name) for name in ("cartesian", "cylindrical", "cartesian", "cylindrical")]
+    specs = [
+        GridSpec.published(name)
+        for name in ("cartesian", "cylindrical", "cartesian", "cylindrical")
+    ]
     alone = [count_votes(frame, spec).to_sparse() for spec in specs]
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda spec: count_votes(frame, spec).to_sparse(), specs))

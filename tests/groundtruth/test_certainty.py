@@ -21,7 +21,9 @@ EVERY = list(Matter)
 
 
 def posterior(hits, free_m, matter, spec=COARSE, in_body=None):
-    hits, free_m = np.broadcast_arrays(np.atleast_1d(hits), np.atleast_1d(np.asarray(free_m, float)))
+    hits, free_m = np.broadcast_arrays(
+        np.atleast_1d(hits), np.atleast_1d(np.asarray(free_m, float))
+    )
     body = matter in (Matter.BODY, Matter.MIRRORED) if in_body is None else in_body
     kinds = np.full(len(hits), matter, np.int8)
     return probability(hits, free_m, kinds, np.full(len(hits), body), spec, 1.5).astype(float)
@@ -92,9 +94,14 @@ def test_free_space_within_a_body_is_less_sure_than_outside():
 def test_each_voxel_has_the_probability_that_it_has_alone_however_many_there_are():
     rng = np.random.default_rng(1)
     count = 40_000
-    hits, samples = rng.integers(0, 4, count) * rng.integers(0, 50, count), rng.integers(0, 200, count)
+    hits, samples = (
+        rng.integers(0, 4, count) * rng.integers(0, 50, count),
+        rng.integers(0, 200, count),
+    )
     matter, body = rng.integers(0, len(EVERY), count).astype(np.int8), rng.random(count) < 0.1
     whole = probability(hits, samples * 1.5, matter, body, FINE, 1.5)
     for chosen in (slice(None, 3), slice(16_380, 16_390), slice(-1, None), slice(7, None, 1999)):
-        part = probability(hits[chosen], samples[chosen] * 1.5, matter[chosen], body[chosen], FINE, 1.5)
+        part = probability(
+            hits[chosen], samples[chosen] * 1.5, matter[chosen], body[chosen], FINE, 1.5
+        )
         assert whole[chosen].tobytes() == part.tobytes()

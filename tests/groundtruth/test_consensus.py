@@ -1,4 +1,6 @@
-"""What scans agree on: labels that are wrong at random, in patches, or always in the same way, on a street of which the classes are known."""
+"""What scans agree on: labels that are wrong at random, in patches, or always in the same way, on a
+street of which the classes are known.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +10,9 @@ from carlasc.core.tables import CARLA
 from carlasc.groundtruth.voting.ballot import OCCUPIED_DTYPE
 from carlasc.groundtruth.voting.consensus import agree
 
-ROAD, SIDEWALK, BUILDING, POLE, OTHER = (CARLA.id_of(n) for n in ("Road", "Sidewalk", "Building", "Pole", "Other"))
+ROAD, SIDEWALK, BUILDING, POLE, OTHER = (
+    CARLA.id_of(n) for n in ("Road", "Sidewalk", "Building", "Pole", "Other")
+)
 SPEC = GridSpec("cartesian", (60, 40, 8), (-30, -20, -2), (30, 20, 2))
 CLASSES = (ROAD, SIDEWALK, BUILDING, POLE, OTHER)
 
@@ -23,7 +27,9 @@ def street():
 
 
 def votes_of(truth, wrong, seed=0, scans=(1, 1, 2, 5, 20)):
-    """Return the votes of scans, each with 1 to 4 points in a voxel; `wrong(rng, labels)` returns the labels that they have."""
+    """Return the votes of scans, each with 1 to 4 points in a voxel; `wrong(rng, labels)` returns
+    the labels that they have.
+    """
     rng = np.random.default_rng(seed)
     voxels = np.flatnonzero(truth)
     count = rng.choice(scans, len(voxels))
@@ -43,7 +49,8 @@ def votes_of(truth, wrong, seed=0, scans=(1, 1, 2, 5, 20)):
 
 def majority(votes):
     labels = np.zeros(SPEC.num_voxels, np.int64)
-    order = np.lexsort((-votes["label"].astype(int), votes["votes"]))  # the last one written has most
+    # the last one written has most
+    order = np.lexsort((-votes["label"].astype(int), votes["votes"]))
     labels[votes["voxel"][order]] = votes["label"][order]
     return labels
 
@@ -77,7 +84,8 @@ def test_right_labels_stay_and_are_certain(street):
 def test_how_often_labels_are_wrong_is_estimated_and_most_of_it_is_repaired(street, share):
     votes = votes_of(street, at_random(share))
     found = agree(votes, SPEC, CARLA)
-    assert found.wrong == pytest.approx(0.8 * share, abs=0.03)  # one in five random classes is the right one
+    # one in five random classes is the right one
+    assert found.wrong == pytest.approx(0.8 * share, abs=0.03)
     before, after = right(majority(votes), street), right(found.labels, street)
     assert 1 - after < 0.25 * (1 - before)
 
@@ -102,7 +110,9 @@ def test_shares_say_how_often_the_class_is_right(street):
     top = np.zeros(SPEC.num_voxels)
     np.maximum.at(top, found.shares["voxel"], found.shares["votes"] / 65535)
     seen = street.reshape(-1) > 0
-    assert top[seen].mean() == pytest.approx((found.labels == street.reshape(-1))[seen].mean(), abs=0.08)
+    assert top[seen].mean() == pytest.approx(
+        (found.labels == street.reshape(-1))[seen].mean(), abs=0.08
+    )
     assert np.bincount(found.shares["voxel"], found.shares["votes"]).max() <= 65535
 
 
@@ -111,7 +121,9 @@ def test_a_voxel_with_two_things_keeps_the_shares_of_both(street):
     place = SPEC.num_voxels - 1  # far from everything
     mixed = np.array([(place, BUILDING, 60, 20, 60), (place, POLE, 40, 20, 40)], OCCUPIED_DTYPE)
     found = agree(np.concatenate([votes, mixed]), SPEC, CARLA)
-    shares = {int(row["label"]): row["votes"] / 65535 for row in found.shares if row["voxel"] == place}
+    shares = {
+        int(row["label"]): row["votes"] / 65535 for row in found.shares if row["voxel"] == place
+    }
     assert found.labels[place] == BUILDING
     assert shares == pytest.approx({BUILDING: 0.6, POLE: 0.4}, abs=0.1)
 
@@ -135,13 +147,17 @@ def test_no_votes_and_one_class():
 
 
 def test_votes_of_which_a_network_is_not_sure_count_less(street):
-    """Half of the points are wrong, and a network says of them, and of one in four right ones, that it is not sure."""
+    """Half of the points are wrong, and a network says of them, and of one in four right ones, that
+    it is not sure.
+    """
     rng = np.random.default_rng(3)
     voxels = np.flatnonzero(street)
     rows = np.zeros(2 * len(voxels), OCCUPIED_DTYPE)
     rows["voxel"], rows["votes"], rows["voters"] = np.repeat(voxels, 2), 5, 5
     own = street.reshape(-1)[voxels]
-    other = np.array(CLASSES)[(np.searchsorted(np.sort(CLASSES), own) + rng.integers(1, 5, len(own))) % 5]
+    other = np.array(CLASSES)[
+        (np.searchsorted(np.sort(CLASSES), own) + rng.integers(1, 5, len(own))) % 5
+    ]
     other = np.where(other == own, np.where(own == ROAD, OTHER, ROAD), other)
     pair = np.sort(np.stack([own, other], axis=1), axis=1)
     rows["label"] = pair.reshape(-1)

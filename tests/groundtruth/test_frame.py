@@ -20,7 +20,8 @@ from carlasc.storage import FolderSink, FolderSource, layout
 ROAD, BUILDING, VEHICLE = CARLA.id_of("Road"), CARLA.id_of("Building"), CARLA.id_of("Vehicle")
 SPEC = GridSpec("cartesian", (100, 50, 15), (-20, -10, -2.5), (20, 10, 3.5))
 PLACE = (8.2, 0.2, 0.1)
-BEHIND = tuple(np.array(PLACE) * (1 + 7.5 / np.linalg.norm(PLACE)))  # five free samples back on its ray is the place
+# five free samples back on its ray is the place
+BEHIND = tuple(np.array(PLACE) * (1 + 7.5 / np.linalg.norm(PLACE)))
 ELSEWHERE = (-8.2, 5.0, 0.1)
 NOW, FRAMES = 10, range(21)
 
@@ -34,10 +35,13 @@ def feed_of(folder, scans, pose=lambda frame: np.eye(4), **options):
         local[:, 3] = 0
         writer.write("points", frame, local.astype(np.float32))
         writer.write("labels", frame, np.array([label for _, label in points], np.uint32))
-    writer.write_document(layout.POSES, layout.encode_poses(np.stack([pose(f) for f in range(max(scans) + 1)])))
+    writer.write_document(
+        layout.POSES, layout.encode_poses(np.stack([pose(f) for f in range(max(scans) + 1)]))
+    )
     (sequence,) = FolderSource(folder).sequences().values()
     return ScanFeed(
-        sequence, FromScans(**{"motion": MotionOptions("none"), "poses": PoseOptions(force=True), **options})
+        sequence,
+        FromScans(**{"motion": MotionOptions("none"), "poses": PoseOptions(force=True), **options}),
     )
 
 
@@ -51,7 +55,11 @@ def at(merged, place):
     """Return the label and the count of the voxel at a place, and its flags."""
     voxel = SPEC.flat_index(np.array([place]))[0]
     flags = VoxelFlag(int(merged.evidence.flags.reshape(-1)[voxel]))
-    return int(merged.grid.labels.reshape(-1)[voxel]), int(merged.grid.counts.reshape(-1)[voxel]), flags
+    return (
+        int(merged.grid.labels.reshape(-1)[voxel]),
+        int(merged.grid.counts.reshape(-1)[voxel]),
+        flags,
+    )
 
 
 class TestWhereTrafficPasses:
@@ -61,7 +69,10 @@ class TestWhereTrafficPasses:
         scans = {
             frame: [(PLACE, VEHICLE), (ELSEWHERE, BUILDING)]
             if frame > 15
-            else [(BEHIND, BUILDING) if looked_at(frame) else (ELSEWHERE, BUILDING), (ELSEWHERE, BUILDING)]
+            else [
+                (BEHIND, BUILDING) if looked_at(frame) else (ELSEWHERE, BUILDING),
+                (ELSEWHERE, BUILDING),
+            ]
             for frame in FRAMES
         }
         feed = feed_of(folder, scans, **options)
@@ -95,7 +106,9 @@ class TestTheFramesOwnActor:
     """A point moves, and only the frame itself sees it; all other scans see through its place."""
 
     def make(self, folder, dynamic, actors=None):
-        scans = {frame: [(PLACE, VEHICLE) if frame == NOW else (BEHIND, BUILDING)] for frame in FRAMES}
+        scans = {
+            frame: [(PLACE, VEHICLE) if frame == NOW else (BEHIND, BUILDING)] for frame in FRAMES
+        }
         feed = feed_of(folder, scans, dynamic=dynamic)
         return merge(feed, MovingActors(moving={NOW: np.array([0])}) if actors is None else actors)
 
@@ -117,15 +130,32 @@ class TestBodies:
     HALF = np.array([2.0, 1.0, 0.8])
 
     def make(self, folder, spec=SPEC, evidence=True, beyond=(), **options):
-        side = [((x, 3.1, z), VEHICLE) for x in np.arange(-1.9, 2.0, 0.2) for z in (-0.5, -0.1, 0.3, 0.5)]
+        side = [
+            ((x, 3.1, z), VEHICLE)
+            for x in np.arange(-1.9, 2.0, 0.2)
+            for z in (-0.5, -0.1, 0.3, 0.5)
+        ]
         ground = [((0.1, 4.1, -0.7), ROAD), ((0.1, 4.9, -0.7), ROAD)]  # seen under the car
-        feed = feed_of(folder, dict.fromkeys(FRAMES, side + ground + list(beyond)), own_path=False, **options)
+        feed = feed_of(
+            folder, dict.fromkeys(FRAMES, side + ground + list(beyond)), own_path=False, **options
+        )
         members = {frame: np.arange(len(side), dtype=np.int32) for frame in FRAMES}
         poses = np.tile(translation((0.0, 4.0, 0.0)), (len(FRAMES), 1, 1))
         lower, upper = -self.HALF - 0.1, self.HALF + 0.1
         extent = Extent(-self.HALF, self.HALF, (False, False, True, False), 1000, (0.0, -4.0))
         surface = usual_shell(lower, upper, extent)
-        track = Track(VEHICLE, 0, members, 0, poses, np.zeros((len(FRAMES), 3)), lower, upper, extent, surface=surface)
+        track = Track(
+            VEHICLE,
+            0,
+            members,
+            0,
+            poses,
+            np.zeros((len(FRAMES), 3)),
+            lower,
+            upper,
+            extent,
+            surface=surface,
+        )
         return merge(feed, MovingActors({3: track}), spec=spec, evidence=evidence)
 
     def test_the_side_that_no_scan_saw_is_taken_from_the_other_one_and_marked(self, tmp_path):
@@ -182,20 +212,26 @@ class TestBodies:
         self.make(tmp_path / "fine", spec=spec, evidence=False)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        assert peak / spec.num_voxels < 32  # bytes: the ballot has 10, the grid 5, the votes for free space 4
+        # bytes: the ballot has 10, the grid 5, the votes for free space 4
+        assert peak / spec.num_voxels < 32
 
 
 class TestOwnPath:
-    """The vehicle drives 1 m per frame along x; something was seen ahead, where it drives through later."""
+    """The vehicle drives 1 m per frame along x; something was seen ahead, where it drives through
+    later.
+    """
 
     TRACE, GROUND, BESIDE = (6.1, 0.1, -0.6), (6.1, 0.1, -1.1), (6.1, 1.3, -0.6)
 
     def make(self, folder, seen_now=False, **options):
         things = [(self.TRACE, VEHICLE), (self.GROUND, ROAD), (self.BESIDE, BUILDING)]
         scans = {
-            frame: things if 0 < frame < 3 or (seen_now and frame == 0) else [((0.1, 9, 0), 1)] for frame in range(11)
+            frame: things if 0 < frame < 3 or (seen_now and frame == 0) else [((0.1, 9, 0), 1)]
+            for frame in range(11)
         }
-        feed = feed_of(folder, scans, lambda frame: translation((float(frame), 0.0, 0.0)), **options)
+        feed = feed_of(
+            folder, scans, lambda frame: translation((float(frame), 0.0, 0.0)), **options
+        )
         return merge(feed, MovingActors(), 0)
 
     def test_it_clears_a_trace_and_neither_the_ground_nor_what_is_beside(self, tmp_path):
@@ -204,7 +240,9 @@ class TestOwnPath:
         assert label == 0 and count > 0
         assert at(merged, self.GROUND)[0] == ROAD
         assert at(merged, self.BESIDE)[0] == BUILDING
-        assert merged.evidence.occupied.reshape(-1)[SPEC.flat_index(np.array([self.TRACE]))[0]] < 0.05
+        assert (
+            merged.evidence.occupied.reshape(-1)[SPEC.flat_index(np.array([self.TRACE]))[0]] < 0.05
+        )
 
     def test_without_it_the_trace_stays(self, tmp_path):
         assert at(self.make(tmp_path, own_path=False), self.TRACE)[0] == VEHICLE
@@ -215,7 +253,10 @@ class TestOwnPath:
 
 def test_labels_of_which_a_network_is_not_sure_count_less(tmp_path):
     names, likely = [BUILDING] * 3 + [ROAD] * 2, [0.3] * 3 + [0.9] * 2
-    scans = {frame: [((8.1, 0.2 + 0.02 * i, 0.1), name) for i, name in enumerate(names)] for frame in FRAMES}
+    scans = {
+        frame: [((8.1, 0.2 + 0.02 * i, 0.1), name) for i, name in enumerate(names)]
+        for frame in FRAMES
+    }
     feed = feed_of(tmp_path / "sure", scans, own_path=False)
     assert at(merge(feed, MovingActors()), (8.1, 0.2, 0.1))[0] == BUILDING
     writer = FolderSink(tmp_path / "unsure").sequence("Val/Street/cartesian")
@@ -228,20 +269,30 @@ def test_labels_of_which_a_network_is_not_sure_count_less(tmp_path):
 
 
 class TestOwnReturns:
-    """A thing of two points that only the frame's own scan hit; the rays of the other scans go through it."""
+    """A thing of two points that only the frame's own scan hit; the rays of the other scans go
+    through it.
+    """
 
     THING = ((8.1, 0.2, 0.1), (8.1, 0.3, 0.1))
 
     def make(self, folder, things=THING, label=BUILDING, through=1, **options):
-        behind = [(tuple(np.array(place) * (1 + 7.5 / np.linalg.norm(place))), BUILDING) for place in self.THING]
-        scans = {frame: behind * through if frame != NOW else [(place, label) for place in things] for frame in FRAMES}
+        behind = [
+            (tuple(np.array(place) * (1 + 7.5 / np.linalg.norm(place))), BUILDING)
+            for place in self.THING
+        ]
+        scans = {
+            frame: behind * through if frame != NOW else [(place, label) for place in things]
+            for frame in FRAMES
+        }
         return merge(feed_of(folder, scans, own_path=False, **options), MovingActors())
 
     @pytest.mark.parametrize("dynamic", ["align", "current", "drop"])
     def test_they_are_occupied_whatever_other_scans_say(self, tmp_path, dynamic):
         merged = self.make(tmp_path, dynamic=dynamic)
         assert at(merged, self.THING[0])[0] == BUILDING
-        assert merged.evidence.occupied.reshape(-1)[SPEC.flat_index(np.array(self.THING[:1]))[0]] > 0.5
+        assert (
+            merged.evidence.occupied.reshape(-1)[SPEC.flat_index(np.array(self.THING[:1]))[0]] > 0.5
+        )
 
     def test_one_alone_is_an_outlier(self, tmp_path):
         assert at(self.make(tmp_path, self.THING[:1]), self.THING[0])[0] == 0

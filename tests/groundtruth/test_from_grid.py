@@ -44,7 +44,11 @@ def test_sizes_that_do_not_divide_go_by_the_centres_of_cells():
 
 def test_cylindrical_grids_resample_too():
     spec = GridSpec.published("cylindrical")
-    fine = Grid(spec.with_size((16, 16, 4)), np.full((16, 16, 4), 7, np.uint8), np.ones((16, 16, 4), np.float32))
+    fine = Grid(
+        spec.with_size((16, 16, 4)),
+        np.full((16, 16, 4), 7, np.uint8),
+        np.ones((16, 16, 4), np.float32),
+    )
     coarse = resample(fine, spec.with_size((8, 8, 2)), CARLA)
     assert (coarse.labels == 7).all()
     assert (coarse.counts == 8).all()
@@ -64,7 +68,8 @@ def test_what_hides_in_a_coarse_voxel_are_its_occupied_fine_cells():
 def test_a_finer_or_larger_grid_is_refused():
     fine = random_grid(2)
     with pytest.raises(
-        ArgumentError, match="expected voxels of at least 1 x 1 x 1.*found 0.5 x 1 x 1.*new measurements"
+        ArgumentError,
+        match="expected voxels of at least 1 x 1 x 1.*found 0.5 x 1 x 1.*new measurements",
     ):
         resample(fine, fine.spec.with_size((16, 8, 4)), CARLA)
     with pytest.raises(ArgumentError, match="expected a cartesian grid"):
@@ -76,14 +81,22 @@ def test_a_finer_or_larger_grid_is_refused():
 def test_the_finest_grid_of_the_same_coordinates_is_resampled_unless_another_is_named(tmp_path):
     writer = FolderSink(tmp_path).sequence("Val/Street/cartesian")
     writer.write("points", 0, np.ones((1, 4), np.float32))
-    for seed, (name, size) in enumerate({"middle": (8, 8, 4), "fine": (16, 16, 8), "last": (8, 8, 4)}.items()):
+    for seed, (name, size) in enumerate(
+        {"middle": (8, 8, 4), "fine": (16, 16, 8), "last": (8, 8, 4)}.items()
+    ):
         grid = random_grid(seed, size)
         writer.write_document(layout.params_file(name), to_json(grid.spec.to_params()))
         writer.write(f"{name}/labels", 0, grid.labels.astype(np.uint32))
         writer.write(f"{name}/counts", 0, grid.counts)
     for observe, chosen in ((FromGrid(), "fine"), (FromGrid("last"), "last")):
         regrid(
-            tmp_path, random_grid(0).spec.with_size((4, 4, 2)), observe=observe, name=f"of_{chosen}", run=Run(workers=1)
+            tmp_path,
+            random_grid(0).spec.with_size((4, 4, 2)),
+            observe=observe,
+            name=f"of_{chosen}",
+            run=Run(workers=1),
         )
-        params = json.loads((tmp_path / f"Val/Street/cartesian/of_{chosen}/params.json").read_bytes())
+        params = json.loads(
+            (tmp_path / f"Val/Street/cartesian/of_{chosen}/params.json").read_bytes()
+        )
         assert params["carlasc"]["grid"] == chosen

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from carlasc.groundtruth.maps.growing_cells import STATIC, GrowingCells, cells_of, rows_of_scan, split
+from carlasc.groundtruth.maps.growing_cells import (
+    STATIC,
+    GrowingCells,
+    cells_of,
+    rows_of_scan,
+    split,
+)
 
 CELL_M = 0.05
 
@@ -39,7 +45,9 @@ def test_memory_is_bounded_and_changes_nothing(tmp_path):
 def test_each_cell_has_one_point_inside_it_wherever_it_is(tmp_path):
     far = [(points + (9000.0, -9000.0, 300.0), labels) for points, labels in scans(3)]
     made, _ = filled(tmp_path / "a", far, 10**9)
-    expected = np.unique(np.floor(np.concatenate([points for points, _ in far]) / CELL_M).astype(int), axis=0)
+    expected = np.unique(
+        np.floor(np.concatenate([points for points, _ in far]) / CELL_M).astype(int), axis=0
+    )
     assert_array_equal(np.unique(cells_of(made, CELL_M), axis=0), expected)
     assert len(made) == len(expected)
 
@@ -48,7 +56,9 @@ def test_scans_vote_once_and_the_lowest_of_equal_classes_wins(tmp_path):
     here = np.full((4, 3), 0.01)
     many = (np.repeat(here[:1], 9, axis=0), np.full(9, 2, np.uint16))
     made, _ = filled(
-        tmp_path / "a", [(here, np.array([3, 3, 1, 3], np.uint16)), many, (here, np.full(4, 3, np.uint16))], 10
+        tmp_path / "a",
+        [(here, np.array([3, 3, 1, 3], np.uint16)), many, (here, np.full(4, 3, np.uint16))],
+        10,
     )
     assert made["label"] == 3 and made["seen"] == 3
     assert made["confidence"] == pytest.approx((0.75 + 1) / 4, abs=1e-4)
@@ -59,7 +69,9 @@ def test_scans_vote_once_and_the_lowest_of_equal_classes_wins(tmp_path):
 def test_probabilities_weigh_votes(tmp_path):
     here, groups = np.full((2, 3), 0.01), np.full(2, STATIC)
     rows = [
-        rows_of_scan(here, np.full(2, label, np.uint16), np.full(2, sure, np.float32), groups, CELL_M)
+        rows_of_scan(
+            here, np.full(2, label, np.uint16), np.full(2, sure, np.float32), groups, CELL_M
+        )
         for label, sure in ((1, 0.3), (1, 0.3), (2, 0.9))
     ]
     (tmp_path / "a").mkdir()
@@ -72,5 +84,7 @@ def test_probabilities_weigh_votes(tmp_path):
 
 
 def test_a_scan_without_points_adds_nothing(tmp_path):
-    made = split(*rows_of_scan(np.empty((0, 3)), np.empty(0, np.uint16), None, np.empty(0, np.int64), CELL_M))
+    made = split(
+        *rows_of_scan(np.empty((0, 3)), np.empty(0, np.uint16), None, np.empty(0, np.int64), CELL_M)
+    )
     assert made == []

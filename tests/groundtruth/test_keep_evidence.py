@@ -46,11 +46,15 @@ def drive(tmp_path):
 def known_evidence(monkeypatch):
     """Make every frame give the same evidence."""
     make = ScanFrame.make
-    monkeypatch.setattr(ScanFrame, "make", lambda self, plan: replace(make(self, plan), evidence=EVIDENCE))
+    monkeypatch.setattr(
+        ScanFrame, "make", lambda self, plan: replace(make(self, plan), evidence=EVIDENCE)
+    )
 
 
 def run(drive, **settings):
-    return carlasc.regrid(drive, SPEC, observe=FromScans(), voting=Voting(**settings), run=Run(workers=1))
+    return carlasc.regrid(
+        drive, SPEC, observe=FromScans(), voting=Voting(**settings), run=Run(workers=1)
+    )
 
 
 def the_sequence(drive):
@@ -71,7 +75,9 @@ def test_evidence_is_written_beside_the_grid_also_of_one_that_is_there(drive):
         field = f"evaluation_8x8x4/{part}"
         assert sequence.frames(field).tolist() == [0, 1, 2]
         wanted = getattr(EVIDENCE, part)
-        assert np.array_equal(sequence.read(field, 1), wanted.astype("<f2") if part == "occupied" else wanted)
+        assert np.array_equal(
+            sequence.read(field, 1), wanted.astype("<f2") if part == "occupied" else wanted
+        )
     assert np.array_equal(sequence.grid("evaluation_8x8x4", 1).labels, before.labels)
     assert run(drive, keep_evidence=True).skipped == 3
     (drive / GRID / "000001.flags.bin").unlink()
@@ -95,7 +101,12 @@ def test_voxels_that_are_not_certain_enough_become_unknown(drive):
     with pytest.raises(ConflictError, match=r"carlasc.min_confidence null where this run has 0.8"):
         run(drive, min_confidence=0.8)
     carlasc.regrid(
-        drive, SPEC, observe=FromScans(), voting=Voting(min_confidence=0.8), run=Run(workers=1), overwrite=True
+        drive,
+        SPEC,
+        observe=FromScans(),
+        voting=Voting(min_confidence=0.8),
+        run=Run(workers=1),
+        overwrite=True,
     )
     sequence = the_sequence(drive)
     grid = sequence.grid("evaluation_8x8x4", 1)
@@ -111,7 +122,9 @@ def test_voxels_that_are_not_certain_enough_become_unknown(drive):
 @pytest.mark.parametrize("settings", [{"keep_evidence": True}, {"min_confidence": 0.8}])
 def test_a_frame_that_cannot_say_how_certain_it_is_fails(drive, monkeypatch, settings):
     make = ScanFrame.make
-    monkeypatch.setattr(ScanFrame, "make", lambda self, plan: replace(make(self, plan), evidence=None))
+    monkeypatch.setattr(
+        ScanFrame, "make", lambda self, plan: replace(make(self, plan), evidence=None)
+    )
     failures = run(drive, **settings).failures
     assert [failure.message for failure in failures] == [
         f"frame {frame}: expected how certain each voxel is, found nothing" for frame in range(3)
@@ -120,7 +133,9 @@ def test_a_frame_that_cannot_say_how_certain_it_is_fails(drive, monkeypatch, set
 
 @pytest.mark.parametrize("min_confidence", [-0.1, 1, float("nan")])
 def test_a_confidence_is_a_probability_below_1(min_confidence):
-    with pytest.raises(ArgumentError, match="min_confidence: expected a probability from 0 to below 1"):
+    with pytest.raises(
+        ArgumentError, match="min_confidence: expected a probability from 0 to below 1"
+    ):
         Voting(min_confidence=min_confidence)
 
 
@@ -139,32 +154,47 @@ def test_only_rays_of_scans_say_how_certain_a_voxel_is(drive, observe, rule, fou
     with pytest.raises(ArgumentError) as error:
         carlasc.regrid(drive, SPEC, observe=observe, voting=voting, run=Run(workers=1))
     assert str(error.value).startswith(f"{name}: expected grids from scans with the rule")
-    assert str(error.value).endswith(f"found {found}: make the grid from scans, or leave out `{name}`")
+    assert str(error.value).endswith(
+        f"found {found}: make the grid from scans, or leave out `{name}`"
+    )
 
 
 def test_the_command_names_its_options(tmp_path):
     write_capture(tmp_path)
-    result = CliRunner().invoke(app, ["regrid", str(tmp_path), "--preset", "coarse", "--keep-evidence"])
+    result = CliRunner().invoke(
+        app, ["regrid", str(tmp_path), "--preset", "coarse", "--keep-evidence"]
+    )
     assert result.exit_code == 2
     assert result.stderr.startswith("carlasc: --keep-evidence: expected grids from scans")
-    assert result.stderr.strip().endswith("make the grid from scans, or leave out `--keep-evidence`")
-    result = CliRunner().invoke(app, ["regrid", str(tmp_path), "--preset", "coarse", "--min-confidence", "2"])
+    assert result.stderr.strip().endswith(
+        "make the grid from scans, or leave out `--keep-evidence`"
+    )
+    result = CliRunner().invoke(
+        app, ["regrid", str(tmp_path), "--preset", "coarse", "--min-confidence", "2"]
+    )
     assert result.exit_code == 2 and "--min-confidence: expected a probability" in result.stderr
 
 
 def test_fields_of_different_shapes_are_refused():
-    with pytest.raises(FormatError, match=r"evidence views: expected shape \(8, 8, 4\), found \(8, 8\)"):
+    with pytest.raises(
+        FormatError, match=r"evidence views: expected shape \(8, 8, 4\), found \(8, 8\)"
+    ):
         replace(EVIDENCE, views=np.zeros((8, 8), np.uint16))
 
 
 @pytest.mark.parametrize(
-    "classes, dtype", [(CARLA, field_files.VOTES_DTYPE), (SEMANTICKITTI, field_files.WIDE_VOTES_DTYPE)]
+    "classes, dtype",
+    [(CARLA, field_files.VOTES_DTYPE), (SEMANTICKITTI, field_files.WIDE_VOTES_DTYPE)],
 )
 def test_the_probability_of_a_class_is_its_share_of_the_votes(classes, dtype):
     rng = np.random.default_rng(0)
     labels = [label for label in classes.names if label]
     rows = np.zeros(500, OCCUPIED_DTYPE)
-    rows["voxel"], rows["label"] = rng.integers(0, 40, 500), rng.choice(labels, 500)  # many pairs twice and more
+    # many pairs twice and more
+    rows["voxel"], rows["label"] = (
+        rng.integers(0, 40, 500),
+        rng.choice(labels, 500),
+    )
     rows["votes"] = rng.integers(1, 100_000, 500)
     found = class_shares(rows, classes)
     assert found.dtype == dtype

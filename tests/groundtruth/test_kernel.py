@@ -11,7 +11,9 @@ from carlasc.core.grids import GridSpec
 
 SPECS = {
     "cartesian": GridSpec.published().with_size((16, 16, 8)),
-    "away from the sensor": GridSpec("cartesian", (20, 15, 6), (8.0, -3.0, -4.0), (28.0, 12.0, 2.0)),
+    "away from the sensor": GridSpec(
+        "cartesian", (20, 15, 6), (8.0, -3.0, -4.0), (28.0, 12.0, 2.0)
+    ),
     "cylindrical": GridSpec.published("cylindrical").with_size((16, 20, 8)),
     "a sector": GridSpec("cylindrical", (16, 9, 4), (2.0, 2.5, -2.0), (30.0, 4.0, 1.0)),
 }
@@ -27,13 +29,18 @@ def by_the_rule(points, grid_T_points, spec):
 def test_the_voxels_are_those_of_the_rule(spec, seed):
     rng = np.random.default_rng(seed)
     points = np.concatenate([rng.uniform(-32, 32, (80, 3)) * (1, 1, 0.1), np.zeros((1, 3))])
-    for axis in (
-        range(3) if spec.coordinates == "cartesian" else (2,)
-    ):  # an azimuth is exact to one unit in the last place
+    # an azimuth is exact to one unit in the last place
+    for axis in range(3) if spec.coordinates == "cartesian" else (2,):
         points[20 * axis : 20 * axis + 40, axis] = rng.choice(spec.edges(axis), 40)
-    pose = translation(rng.uniform(-5, 5, 3)) @ rotation_z(rng.uniform(-np.pi, np.pi)) if seed % 2 else np.eye(4)
+    pose = (
+        translation(rng.uniform(-5, 5, 3)) @ rotation_z(rng.uniform(-np.pi, np.pi))
+        if seed % 2
+        else np.eye(4)
+    )
     for given_points in (points, points.astype(np.float32)):
-        np.testing.assert_array_equal(count_points(given_points, pose, spec), by_the_rule(given_points, pose, spec))
+        np.testing.assert_array_equal(
+            count_points(given_points, pose, spec), by_the_rule(given_points, pose, spec)
+        )
 
 
 def test_points_are_added_to_those_that_were_counted():
@@ -41,4 +48,6 @@ def test_points_are_added_to_those_that_were_counted():
     marked = np.zeros(spec.num_voxels, np.int32)
     for place in ((1.0, 2.0, 0.0), (-3.0, 0.5, -1.0), (99.0, 0.0, 0.0)):
         assert count_points(np.array([place]), np.eye(4), spec, marked) is marked
-    assert np.flatnonzero(marked).tolist() == sorted(spec.flat_index(np.array([(1.0, 2.0, 0.0), (-3.0, 0.5, -1.0)])))
+    assert np.flatnonzero(marked).tolist() == sorted(
+        spec.flat_index(np.array([(1.0, 2.0, 0.0), (-3.0, 0.5, -1.0)]))
+    )

@@ -28,12 +28,16 @@ def street_camera(yaw_deg):
     place = optical_axes((np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))), "left")
     place[:3, 3] = 0.4, 0.0, -0.2
     matrix = np.array([[110.0, 0, (WIDTH - 1) / 2], [0, 110, (HEIGHT - 1) / 2], [0, 0, 1]])
-    return CameraModel(name=f"at{yaw_deg}", width=WIDTH, height=HEIGHT, matrix=matrix, sensor_T_camera=place)
+    return CameraModel(
+        name=f"at{yaw_deg}", width=WIDTH, height=HEIGHT, matrix=matrix, sensor_T_camera=place
+    )
 
 
 @pytest.fixture(scope="module")
 def labelled(tmp_path_factory):
-    """A drive without labels, the classes of the pixels of two cameras, and what `label_images` makes of them."""
+    """A drive without labels, the classes of the pixels of two cameras, and what `label_images`
+    makes of them.
+    """
     folder, poses, street = tmp_path_factory.mktemp("street"), drive(FRAMES), Street.random(SEED)
     write_drive(folder / "in/Train/A/cartesian", poses, labelled=False, seed=SEED)
     write_drive(folder / "truth/Train/A/cartesian", poses, seed=SEED)
@@ -90,7 +94,14 @@ def test_what_is_hidden_by_voxels_is_not_seen_and_the_ground_is():
         [30.0, 0.3, 0.5],
         [30.0, 9.0, 0.5],
     ]
-    assert see_points(np.array(points), occupied, spec, eye).tolist() == [True, False, True, True, False, True]
+    assert see_points(np.array(points), occupied, spec, eye).tolist() == [
+        True,
+        False,
+        True,
+        True,
+        False,
+        True,
+    ]
 
 
 def test_probabilities_of_pixels_and_the_command(labelled, tmp_path):
@@ -102,10 +113,21 @@ def test_probabilities_of_pixels_and_the_command(labelled, tmp_path):
         out = tmp_path / "net" / path.parent.name / f"{path.stem}.npy"
         out.parent.mkdir(parents=True, exist_ok=True)
         np.save(out, np.eye(23, dtype=np.float16)[np.asarray(Image.open(path))])
-    call = ["label", folder / "in", "-o", tmp_path / "out", "--from", "images", "--pixels", tmp_path / "net"]
+    call = [
+        "label",
+        folder / "in",
+        "-o",
+        tmp_path / "out",
+        "--from",
+        "images",
+        "--pixels",
+        tmp_path / "net",
+    ]
     done = CliRunner().invoke(app, [*map(str, call), "--workers", "1", "--json"])
     assert done.exit_code == 0 and json.loads(done.stdout)["by"] == "net"
-    first, second = (the_sequence(one).read("labels", 2) for one in (folder / "out", tmp_path / "out"))
+    first, second = (
+        the_sequence(one).read("labels", 2) for one in (folder / "out", tmp_path / "out")
+    )
     assert (first == second).mean() > 0.999
 
 
@@ -115,7 +137,9 @@ def test_bad_input_is_one_line(labelled, tmp_path):
 
     def refused(error, match, pixels, source=source, **more):
         with pytest.raises(error, match=match) as found:
-            carlasc.label_images(source, tmp_path / f"out{abs(hash(match))}", pixels=pixels, run=ONE, **more)
+            carlasc.label_images(
+                source, tmp_path / f"out{abs(hash(match))}", pixels=pixels, run=ONE, **more
+            )
         assert "\n" not in str(found.value)
 
     def changed(name, change):
@@ -124,20 +148,28 @@ def test_bad_input_is_one_line(labelled, tmp_path):
         return tmp_path / name
 
     def other_size(camera):
-        (camera / "000000.png").write_bytes(encode_image(np.zeros((HEIGHT, 20), np.uint8), "PNG").tobytes())
+        (camera / "000000.png").write_bytes(
+            encode_image(np.zeros((HEIGHT, 20), np.uint8), "PNG").tobytes()
+        )
 
     def cut_short(camera):
         (camera / "000000.png").write_bytes((camera / "000000.png").read_bytes()[:50])
 
     def unknown_class(camera):
-        (camera / "000000.png").write_bytes(encode_image(np.full((HEIGHT, WIDTH), 99, np.uint8), "PNG").tobytes())
+        (camera / "000000.png").write_bytes(
+            encode_image(np.full((HEIGHT, WIDTH), 99, np.uint8), "PNG").tobytes()
+        )
 
     def other_array(camera):
         (camera / "000000.png").unlink()
         np.save(camera / "000000.npy", np.zeros((HEIGHT, 20), np.uint8))
 
     refused(FormatError, "200 x 100 pixels.*found 20 x 100", changed("size", other_size))
-    refused(FormatError, r"\(100, 200\) integers.*found uint8 of shape \(100, 20\)", changed("array", other_array))
+    refused(
+        FormatError,
+        r"\(100, 200\) integers.*found uint8 of shape \(100, 20\)",
+        changed("array", other_array),
+    )
     refused(FormatError, "a whole JPEG or PNG", changed("short", cut_short))
     refused(FormatError, "ids of the class table carla.*found 99", changed("class", unknown_class))
     refused(
@@ -149,7 +181,17 @@ def test_bad_input_is_one_line(labelled, tmp_path):
     refused(MissingDataError, "cameras in cameras.json, found none", good, source=folder / "truth")
     refused(ArgumentError, "a name in one line", good, by="\n")
     for more in (["--frames", "1:"], ["--logits"]):
-        call = ["label", source, "-o", tmp_path / "out", "--from", "images", "--pixels", good, *more]
+        call = [
+            "label",
+            source,
+            "-o",
+            tmp_path / "out",
+            "--from",
+            "images",
+            "--pixels",
+            good,
+            *more,
+        ]
         done = CliRunner().invoke(app, list(map(str, call)))
         assert done.exit_code == 2 and f"no {more[0]} with --from images" in done.stderr
     done = CliRunner().invoke(

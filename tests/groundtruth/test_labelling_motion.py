@@ -34,7 +34,10 @@ def check_car(sequence, frames, number, tolerance):
         _, _, moving = scan(frame, sensor_pose(frame))
         flow, instances = sequence.read("flow", frame), sequence.read("instances", frame)
         fast = np.linalg.norm(flow, axis=1) > 0.5
-        assert set(np.unique(instances[fast]).tolist()) <= {number} and fast.sum() == (instances == number).sum()
+        assert (
+            set(np.unique(instances[fast]).tolist()) <= {number}
+            and fast.sum() == (instances == number).sum()
+        )
         assert np.abs(flow[fast] - [SPEED_M_S, 0, 0]).max(initial=0) < tolerance
         counts += ((fast & moving).sum(), moving.sum(), fast.sum())
     assert counts[0] > 0.97 * counts[1] and counts[0] > 0.97 * counts[2]
@@ -71,8 +74,12 @@ def test_the_exporter_of_kitti_makes_the_classes_that_move_of_it(numbered):
     assert set(np.unique(labels >> 16).tolist()) == {0, 4, 9}
 
 
-def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_files_of_kitti(numbered, tmp_path):
-    """SemanticKITTI's: the passing car becomes 252, the parked one stays 10; the number that it gets is nobody else's in a file either."""
+def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_files_of_kitti(
+    numbered, tmp_path
+):
+    """SemanticKITTI's: the passing car becomes 252, the parked one stays 10; the number that it
+    gets is nobody else's in a file either.
+    """
     folder, result = numbered
     assert any("the classes carla do not separate moving" in note for note in result.notes)
     given = the_sequence(folder / "in")
@@ -83,14 +90,24 @@ def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_f
     for frame in range(8):
         labels, instances = given.read("labels", frame), given.read("instances", frame)
         writer.write("points", frame, given.read("points", frame))
-        writer.write("labels", frame, np.select([labels == 10, labels == 7], [10, 40], 50).astype(np.uint32))
-        writer.write("instances", frame, np.where(instances == 4, 10 << 16 | 4, 0).astype(np.uint32) * (frame < 4))
+        writer.write(
+            "labels", frame, np.select([labels == 10, labels == 7], [10, 40], 50).astype(np.uint32)
+        )
+        writer.write(
+            "instances",
+            frame,
+            np.where(instances == 4, 10 << 16 | 4, 0).astype(np.uint32) * (frame < 4),
+        )
         here = street(frame)  # from the fourth scan on, the parked car has a box only
         pose = invert(sensor_pose(frame)) @ translation((here.lower[-2] + here.upper[-2]) / 2)
         size, track = (here.upper - here.lower)[-2:-1] + 0.1, np.array([10 << 16 | 4], np.uint32)
-        writer.write("boxes", frame, Boxes.from_poses(track, np.array([10]), pose[None], size).to_table())
+        writer.write(
+            "boxes", frame, Boxes.from_poses(track, np.array([10]), pose[None], size).to_table()
+        )
         _, _, moving = scan(frame, sensor_pose(frame))
-        writer.write("flow", frame, (moving[:, None] * np.array([SPEED_M_S, 0, 0])).astype(np.float32))
+        writer.write(
+            "flow", frame, (moving[:, None] * np.array([SPEED_M_S, 0, 0])).astype(np.float32)
+        )
     observe = FromScans(motion=MotionOptions("flow"))
     result = carlasc.label_motion(tmp_path / "in", tmp_path / "out", observe=observe, run=ONE)
     assert result.actors == 1 and not any("do not tell" in note for note in result.notes)
@@ -98,10 +115,13 @@ def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_f
     (file,) = (tmp_path / "kitti").rglob("labels/000004.label")
     both, (_, _, moving) = np.fromfile(file, "<u4"), scan(4, sensor_pose(4))
     labels, numbers = both & 0xFFFF, both >> 16
-    assert (labels == 252).sum() == pytest.approx(moving.sum(), rel=0.03) and (labels[~moving] != 252).mean() > 0.999
+    assert (labels == 252).sum() == pytest.approx(moving.sum(), rel=0.03) and (
+        labels[~moving] != 252
+    ).mean() > 0.999
     assert np.unique(numbers[labels == 252]).tolist() == [5]
     parked = labels == 10
-    assert (numbers[parked] == 4).mean() > 0.97 and not numbers[~parked & (labels != 252)].any()  # by its box
+    # by its box
+    assert (numbers[parked] == 4).mean() > 0.97 and not numbers[~parked & (labels != 252)].any()
 
 
 def test_what_exists_is_replaced_only_if_this_made_it(numbered, tmp_path):
@@ -112,7 +132,9 @@ def test_what_exists_is_replaced_only_if_this_made_it(numbered, tmp_path):
         carlasc.label_motion(folder / "out", folder / "in", overwrite=True, run=ONE)
 
 
-@pytest.mark.parametrize("options", [{"dynamic": "drop"}, {"motion": MotionOptions("none")}], ids=["drop", "none"])
+@pytest.mark.parametrize(
+    "options", [{"dynamic": "drop"}, {"motion": MotionOptions("none")}], ids=["drop", "none"]
+)
 def test_something_must_show_what_moves(numbered, options):
     folder, _ = numbered
     with pytest.raises(ArgumentError, match="observe: expected dynamic"):
@@ -131,7 +153,9 @@ def test_something_must_show_what_moves(numbered, options):
 )
 def test_the_command_says_what_does_not_fit(numbered, given, message):
     folder, _ = numbered
-    result = CliRunner().invoke(app, ["label", str(folder / "in"), "-o", str(folder / "other"), *given])
+    result = CliRunner().invoke(
+        app, ["label", str(folder / "in"), "-o", str(folder / "other"), *given]
+    )
     assert result.exit_code in (1, 2) and message in " ".join(result.output.split())
     assert not (folder / "other").exists()
 
@@ -139,7 +163,17 @@ def test_the_command_says_what_does_not_fit(numbered, given, message):
 @pytest.mark.slow
 def test_the_command_finds_what_moves_from_points_alone(tmp_path):
     write_sequence(tmp_path / "in", ())
-    given = ["label", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--from", "motion", "--workers", "2", "--json"]
+    given = [
+        "label",
+        str(tmp_path / "in"),
+        "-o",
+        str(tmp_path / "out"),
+        "--from",
+        "motion",
+        "--workers",
+        "2",
+        "--json",
+    ]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["actors"] == 1
@@ -148,7 +182,9 @@ def test_the_command_finds_what_moves_from_points_alone(tmp_path):
 
 @pytest.mark.slow
 def test_a_real_drive_without_labels(tmp_path):
-    """KITTI tracking 0000: a van ahead and a cyclist beside move, a parked van does not, and each has one number."""
+    """KITTI tracking 0000: a van ahead and a cyclist beside move, a parked van does not, and each
+    has one number.
+    """
     archive = REAL / "kitti_tracking_0000.tar.xz"
     if not archive.exists():
         pytest.skip("the archive of the real drive is absent")
@@ -164,17 +200,26 @@ def test_a_real_drive_without_labels(tmp_path):
         (Path(boxed.location) / name).rename(bare / name)
     carlasc.label_motion(tmp_path / "bare", tmp_path / "out", run=ONE)
     found = the_sequence(tmp_path / "out")
-    moving, all_points, numbers = dict.fromkeys((1, 2, 4), 0), dict.fromkeys((1, 2, 4), 0), {1: [], 2: []}
+    moving, all_points, numbers = (
+        dict.fromkeys((1, 2, 4), 0),
+        dict.fromkeys((1, 2, 4), 0),
+        {1: [], 2: []},
+    )
     for frame in boxed.frames("boxes").tolist():
         boxes, points = boxed.boxes(frame), found.read("points", frame)[:, :3]
         fast = np.linalg.norm(found.read("flow", frame), axis=1) > 0.5
         for row, track in enumerate(boxes.tracks.tolist()):
-            local, half = transform_points(invert(boxes.sensor_T_box[row]), points), boxes.sizes[row] / 2
+            local, half = (
+                transform_points(invert(boxes.sensor_T_box[row]), points),
+                boxes.sizes[row] / 2,
+            )
             own = (np.abs(local) < half).all(axis=1) & (local[:, 2] > 0.3 - half[2])
             moving[track] += int((own & fast).sum())
             all_points[track] += int(own.sum())
             if track in numbers and (own & fast).any():
-                numbers[track].append(int(np.bincount(found.read("instances", frame)[own & fast]).argmax()))
+                numbers[track].append(
+                    int(np.bincount(found.read("instances", frame)[own & fast]).argmax())
+                )
     assert moving[1] > 0.95 * all_points[1] and moving[2] > 0.95 * all_points[2]
     assert moving[4] == 0 and all_points[4] > 10_000
     assert len(set(numbers[1])) == len(set(numbers[2])) == 1

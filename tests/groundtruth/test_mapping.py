@@ -1,4 +1,6 @@
-"""Maps of drives: one point per cell, as a few lines of plain Python say, without what moves; their files, and what is refused."""
+"""Maps of drives: one point per cell, as a few lines of plain Python say, without what moves; their
+files, and what is refused.
+"""
 
 import json
 
@@ -31,7 +33,14 @@ def drive(tmp_path_factory):
     """A car passes while the sensor moves slowly."""
     folder = write_sequence(tmp_path_factory.mktemp("drive"), frames=FRAMES)
     voting = Voting(rule="sensor")
-    carlasc.regrid(folder, SPEC, observe=carlasc.FromScans(dynamic="tube"), voting=voting, frames="3", run=ALONE)
+    carlasc.regrid(
+        folder,
+        SPEC,
+        observe=carlasc.FromScans(dynamic="tube"),
+        voting=voting,
+        frames="3",
+        run=ALONE,
+    )
     return folder
 
 
@@ -41,11 +50,17 @@ def make(drive, out, **options):
 
 
 def world_points(frame):
-    """Return the points of a scan in the frame of the first one, y to the left, their labels, and which are on the car."""
+    """Return the points of a scan in the frame of the first one, y to the left, their labels, and
+    which are on the car.
+    """
     pose = sensor_pose(frame)
     points, labels, moving = scan(frame, pose)
     pose = relative_to(sensor_pose(0), pose[None])[0]
-    return transform_points(pose, points.astype(np.float32).astype(np.float64)) * (1, -1, 1), labels, moving
+    return (
+        transform_points(pose, points.astype(np.float32).astype(np.float64)) * (1, -1, 1),
+        labels,
+        moving,
+    )
 
 
 def plain_map(cell_m, frames):
@@ -55,7 +70,9 @@ def plain_map(cell_m, frames):
         points, labels, _ = world_points(frame)
         here = {}
         for point, label in zip(points, labels.tolist(), strict=True):
-            here.setdefault(tuple(np.floor(point / cell_m).astype(int).tolist()), []).append((point, label))
+            here.setdefault(tuple(np.floor(point / cell_m).astype(int).tolist()), []).append(
+                (point, label)
+            )
         for cell, found in here.items():
             counts = np.bincount([label for _, label in found])
             vote = (int(counts.argmax()), counts.max() / len(found))
@@ -74,11 +91,16 @@ def test_a_map_is_what_plain_python_makes(drive, tmp_path):
     order = [expected[tuple(cell)] for cell in cells.tolist()]  # KeyError: a cell without points
     inside = np.array([np.mean(points, axis=0) for points, _ in order]) / 0.1 - cells
     assert_allclose(made["points"], 0.1 * (np.clip(inside, 1 / 64, 63 / 64) + cells), atol=1e-4)
-    shares = [np.bincount([label for label, _ in votes], [share for _, share in votes]) for _, votes in order]
+    shares = [
+        np.bincount([label for label, _ in votes], [share for _, share in votes])
+        for _, votes in order
+    ]
     assert_array_equal(made["label"], [votes.argmax() for votes in shares])
     assert_array_equal(made["seen"], [len(votes) for _, votes in order])
     assert_allclose(
-        made["confidence"], [v.max() / (len(votes) + 1) for v, (_, votes) in zip(shares, order, strict=True)], atol=1e-4
+        made["confidence"],
+        [v.max() / (len(votes) + 1) for v, (_, votes) in zip(shares, order, strict=True)],
+        atol=1e-4,
     )
     assert dict(made["classes"].tolist())[1] == CARLA.names[1]
 
@@ -96,7 +118,11 @@ def test_what_moves_leaves_no_trace_and_what_stands_stays(drive, tmp_path):
     assert np.mean(kept) > 0.99
 
     actor, *parts = json.loads((tmp_path / "map_actors" / "actors.json").read_text())
-    assert result.actors == 1 + len(parts) and actor["class"] == "Vehicle" and actor["frames"] == list(range(FRAMES))
+    assert (
+        result.actors == 1 + len(parts)
+        and actor["class"] == "Vehicle"
+        and actor["frames"] == list(range(FRAMES))
+    )
     places = np.array(actor["map_T_actor"]).reshape(-1, 3, 4)[:, :, 3]
     assert_allclose(np.diff(places[:, 0]), SPEED_M_S * 0.1, atol=0.1)
     with np.load(tmp_path / "map_actors" / actor["file"]) as body:
@@ -116,7 +142,11 @@ def test_all_files_of_points_hold_the_same_points(drive, tmp_path):
     made = {}
     for ending in (".npz", ".ply", ".pcd", ".las"):
         make(drive, tmp_path / f"map{ending}", frames="0:2")
-        made[ending] = read_columns(tmp_path / f"map{ending}") if ending != ".npz" else np.load(tmp_path / "map.npz")
+        made[ending] = (
+            read_columns(tmp_path / f"map{ending}")
+            if ending != ".npz"
+            else np.load(tmp_path / "map.npz")
+        )
     expected = made.pop(".npz")
     for ending, columns in made.items():
         places = np.stack([columns[axis] for axis in "xyz"], axis=1)
@@ -137,7 +167,8 @@ def test_other_programs_read_the_map_and_its_mesh(drive, tmp_path):
     cloud, scene = trimesh.load(tmp_path / "map.ply"), trimesh.load(tmp_path / "map.glb")
     assert len(cloud.vertices) == result.points and cloud.colors.shape == (result.points, 4)
     (mesh,) = scene.geometry.values()
-    turned = np.stack([mesh.bounds[:, 0], -mesh.bounds[::-1, 2], mesh.bounds[:, 1]], axis=1)  # in glTF, y is up
+    # in glTF, y is up
+    turned = np.stack([mesh.bounds[:, 0], -mesh.bounds[::-1, 2], mesh.bounds[:, 1]], axis=1)
     assert_allclose(turned, cloud.bounds, atol=0.1)
     assert len(mesh.faces) > 10 * result.points ** (1 / 2) and mesh.volume > 0
     colors = {tuple(color[:3]) for color in np.unique(mesh.visual.vertex_colors, axis=0).tolist()}
@@ -193,7 +224,9 @@ def test_wrong_arguments_are_refused_before_anything_is_written(drive, tmp_path,
 
 def test_a_map_without_poses_is_one_line(tmp_path):
     folder = write_sequence(tmp_path / "drive", frames=3, poses=False)
-    with pytest.raises(MissingDataError, match=r"poses.txt: expected poses, which merging scans needs, found none"):
+    with pytest.raises(
+        MissingDataError, match=r"poses.txt: expected poses, which merging scans needs, found none"
+    ):
         make(folder, tmp_path / "map.ply")
 
 
@@ -202,7 +235,9 @@ def test_several_sequences_have_no_one_frame(tmp_path):
     (tmp_path / "b").mkdir()
     (tmp_path / "a").rename(tmp_path / "b" / "one")
     write_sequence(tmp_path / "b" / "two", frames=2)
-    with pytest.raises(ArgumentError, match=r"source: expected one sequence, as a map has one frame, found 2"):
+    with pytest.raises(
+        ArgumentError, match=r"source: expected one sequence, as a map has one frame, found 2"
+    ):
         make(tmp_path / "b", tmp_path / "map.ply")
 
 
@@ -210,11 +245,16 @@ def test_what_exists_stays_unless_it_is_to_be_replaced(drive, tmp_path):
     out = tmp_path / "map.npz"
     make(drive, out, frames="0:1", actors=True)
     before = out.read_bytes()
-    with pytest.raises(ConflictError, match="expected nothing, found a file: give `overwrite=True`"):
+    with pytest.raises(
+        ConflictError, match="expected nothing, found a file: give `overwrite=True`"
+    ):
         make(drive, out, frames="0:2")
     assert out.read_bytes() == before
     make(drive, out, frames="0:2", actors=True, overwrite=True)
-    assert out.read_bytes() != before and sorted(path.name for path in tmp_path.iterdir()) == ["map.npz", "map_actors"]
+    assert out.read_bytes() != before and sorted(path.name for path in tmp_path.iterdir()) == [
+        "map.npz",
+        "map_actors",
+    ]
 
 
 @pytest.mark.parametrize("steps", [0, 1, 2])
@@ -231,7 +271,11 @@ def test_an_interrupted_run_leaves_nothing(drive, tmp_path, steps):
 @pytest.mark.parametrize(
     ("lower", "size", "message"),
     [
-        ((0, 0, 0), (0.4, 0.4, 0.375), r"out: expected cubic voxels for OctoMap, found 0.4 x 0.4 x 0.375 m"),
+        (
+            (0, 0, 0),
+            (0.4, 0.4, 0.375),
+            r"out: expected cubic voxels for OctoMap, found 0.4 x 0.4 x 0.375 m",
+        ),
         (
             (0.1, 0, 0),
             (0.4, 0.4, 0.4),
@@ -240,7 +284,9 @@ def test_an_interrupted_run_leaves_nothing(drive, tmp_path, steps):
     ],
 )
 def test_octomap_holds_only_cubes_at_multiples_of_their_size(tmp_path, lower, size, message):
-    cells = MapCells(np.zeros((1, 3), np.int64), np.ones(1, np.uint8), np.array(lower, float), np.array(size))
+    cells = MapCells(
+        np.zeros((1, 3), np.int64), np.ones(1, np.uint8), np.array(lower, float), np.array(size)
+    )
     with pytest.raises(ArgumentError, match=message):
         cells.write_octomap(tmp_path / "map.bt")
     assert not (tmp_path / "map.bt").exists()
@@ -258,7 +304,9 @@ def test_octomaps_library_reads_maps_and_grids(drive, tmp_path):
     found = [tree.search(center.tolist()) for center in centers]
     known, occupied = grid.known.reshape(-1), (grid.labels > 0).reshape(-1)
     assert_array_equal([node is not None for node in found], known)
-    assert_array_equal([tree.isNodeOccupied(node) for node in found if node is not None], occupied[known])
+    assert_array_equal(
+        [tree.isNodeOccupied(node) for node in found if node is not None], occupied[known]
+    )
 
     make(drive, tmp_path / "map.bt", frames="0:2")
     make(drive, tmp_path / "map.npz", frames="0:2")

@@ -36,12 +36,16 @@ def instant(frame):
 
 
 def scan(frame, label=VEHICLE):
-    """A scan of three points: one of the road, one of the actor, and one of a wall behind the actor."""
+    """A scan of three points: one of the road, one of the actor, and one of a wall behind the
+    actor.
+    """
     actor = actor_pose(frame)[:3, 3]
     world = np.array([[3.0, 8.0, -1.5], actor, 2 * actor])
     points = transform_points(invert(sensor_pose(frame)), world).astype(np.float32)
     labels = np.array([ROAD, label, 1], np.uint16)
-    return PreparedScan.of(frame, points, labels, sensor_pose(frame), seconds=0.1 * frame, moving=np.array([1]))
+    return PreparedScan.of(
+        frame, points, labels, sensor_pose(frame), seconds=0.1 * frame, moving=np.array([1])
+    )
 
 
 def track(label=VEHICLE, half=(1.0, 0.5, 1.0), frames=FRAMES, faces=(True, True, True, True)):
@@ -51,7 +55,16 @@ def track(label=VEHICLE, half=(1.0, 0.5, 1.0), frames=FRAMES, faces=(True, True,
     lower, upper = -np.array(half), np.array(half)
     extent = Extent(lower, upper, faces, 100)
     return Track(
-        label, 0, members, frames[0], poses, velocity, lower, upper, extent, rigid=label not in CARLA.deformable
+        label,
+        0,
+        members,
+        frames[0],
+        poses,
+        velocity,
+        lower,
+        upper,
+        extent,
+        rigid=label not in CARLA.deformable,
     )
 
 
@@ -68,14 +81,23 @@ def regions_of(merging, frame=15):
 def observe(merging, frame=15, window=FRAMES):
     """Return the observations of the static scene and of the actor."""
     now = instant(frame)
-    seen = list(merging.observations(now, window, BodyRegions.at(merging, now, window, SPEC).actors))
+    seen = list(
+        merging.observations(now, window, BodyRegions.at(merging, now, window, SPEC).actors)
+    )
     return seen[: len(window)], each_voter(seen[len(window) :])
 
 
 def each_voter(observations):
     """Return the observations of each voter apart."""
     return [
-        replace(one, points=one.points[a:b], labels=one.labels[a:b], hits=one.hits[a:b], grid_T_sensor=pose, ends=None)
+        replace(
+            one,
+            points=one.points[a:b],
+            labels=one.labels[a:b],
+            hits=one.hits[a:b],
+            grid_T_sensor=pose,
+            ends=None,
+        )
         for one in observations
         for pose, a, b in zip(one.grid_T_sensor, [0, *one.ends[:-1]], one.ends, strict=True)
     ]
@@ -107,13 +129,20 @@ def test_rays_that_miss_the_box_are_not_carried():
 
 def test_the_frames_own_rays_count_everywhere_those_of_others_outside_the_actors():
     static, _ = observe(merger())
-    assert [observation.free_region for observation in static] == [None if f == 15 else STATIC for f in FRAMES]
+    assert [observation.free_region for observation in static] == [
+        None if f == 15 else STATIC for f in FRAMES
+    ]
     assert all(observation.hit_region is None for observation in static)
 
 
 @pytest.mark.parametrize(
     ("dynamic", "own", "others"),
-    [("align", True, False), ("current", True, False), ("drop", False, False), ("tube", True, True)],
+    [
+        ("align", True, False),
+        ("current", True, False),
+        ("drop", False, False),
+        ("tube", True, True),
+    ],
 )
 def test_which_moving_points_vote(dynamic, own, others):
     static, _ = observe(merger(dynamic=dynamic))
@@ -124,14 +153,24 @@ def test_which_moving_points_vote(dynamic, own, others):
 
 def test_points_of_a_track_that_were_not_known_to_move_are_left_out_too():
     unmarked = {frame: replace(scan(frame), moving=np.empty(0, np.int64)) for frame in FRAMES}
-    assert Merger(unmarked.__getitem__, MovingActors(), CARLA, "align").static(3).tolist() == [True, True, True]
-    assert Merger(unmarked.__getitem__, MovingActors.of([track()]), CARLA, "align").static(3).tolist() == [
+    assert Merger(unmarked.__getitem__, MovingActors(), CARLA, "align").static(3).tolist() == [
+        True,
+        True,
+        True,
+    ]
+    assert Merger(unmarked.__getitem__, MovingActors.of([track()]), CARLA, "align").static(
+        3
+    ).tolist() == [
         True,
         False,
         True,
     ]
     untracked = MovingActors(moving={3: np.array([2])})
-    assert Merger(unmarked.__getitem__, untracked, CARLA, "align").static(3).tolist() == [True, True, False]
+    assert Merger(unmarked.__getitem__, untracked, CARLA, "align").static(3).tolist() == [
+        True,
+        True,
+        False,
+    ]
 
 
 def test_points_on_the_recording_vehicle_are_left_out_of_every_frame():
@@ -155,7 +194,9 @@ def test_a_region_has_the_voxels_that_the_body_touches_at_the_frame():
     centers = SPEC.centers().reshape(-1, 3)
     merging = merger()
     for frame in (0, 15, 30):
-        offset = np.abs(centers - transform_points(invert(sensor_pose(frame)), actor_pose(frame)[None, :3, 3]))
+        offset = np.abs(
+            centers - transform_points(invert(sensor_pose(frame)), actor_pose(frame)[None, :3, 3])
+        )
         expected = (offset < np.array([1.0, 0.5, 1.0]) + 0.25).all(axis=1)
         assert np.array_equal(regions_of(merging, frame).of_voxel == 1, expected)
     assert not regions_of(merger(tracks=[track(frames=range(10, 20))]), 25).actors
@@ -166,7 +207,9 @@ def test_where_bodies_overlap_the_smaller_one_takes_precedence():
     small, large = track(PEDESTRIAN, (0.3, 0.3, 0.3)), track(VEHICLE, (2.0, 2.0, 1.0))
     for tracks, number in (([small, large], 0), ([large, small], 1)):
         regions = regions_of(merger(tracks=tracks))
-        voxel = SPEC.flat_index(transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3]))
+        voxel = SPEC.flat_index(
+            transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3])
+        )
         (region,) = regions.of_voxel[voxel].tolist()
         assert regions.actors[region] == number
         assert sorted(regions.actors.values()) == [0, 1]
@@ -174,7 +217,9 @@ def test_where_bodies_overlap_the_smaller_one_takes_precedence():
 
 
 @pytest.mark.parametrize("dynamic", ["align", "current"])
-def test_moving_points_without_a_body_have_a_region_in_which_the_frames_own_rays_alone_vote(dynamic):
+def test_moving_points_without_a_body_have_a_region_in_which_the_frames_own_rays_alone_vote(
+    dynamic,
+):
     merging = merger(dynamic=dynamic, tracks=[])
     regions = regions_of(merging)
     place = transform_points(invert(sensor_pose(15)), actor_pose(15)[None, :3, 3])
@@ -182,7 +227,9 @@ def test_moving_points_without_a_body_have_a_region_in_which_the_frames_own_rays
     assert np.flatnonzero(regions.of_voxel != STATIC).tolist() == SPEC.flat_index(place).tolist()
     static, actors = observe(merging)
     assert not actors
-    assert [one.free_region for one in static] == [None if frame == 15 else STATIC for frame in FRAMES]
+    assert [one.free_region for one in static] == [
+        None if frame == 15 else STATIC for frame in FRAMES
+    ]
 
 
 @pytest.mark.parametrize("dynamic", ["drop", "tube"])
@@ -191,7 +238,9 @@ def test_other_rules_have_no_regions(dynamic):
 
 
 def test_a_frame_without_its_own_scan_has_bodies_and_no_points():
-    regions = BodyRegions.at(merger(), instant(15), [frame for frame in FRAMES if frame != 15], SPEC)
+    regions = BodyRegions.at(
+        merger(), instant(15), [frame for frame in FRAMES if frame != 15], SPEC
+    )
     assert list(regions.actors.values()) == [0]
     assert not BodyRegions.at(merger(tracks=[]), instant(15), [14, 16], SPEC).of_voxel.any()
 
@@ -210,7 +259,11 @@ def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
         other = transform_points(actor_T_grid @ mirrored.grid_T_sensor, mirrored.points)
         assert np.abs(one * [1, -1, 1] - other).max() < 1e-5
         assert mirrored.hit_region == mirrored.free_region == 1
-    assert not list(merger(PEDESTRIAN).in_bodies(now, FRAMES, regions_of(merger(PEDESTRIAN)).actors, mirror=True))
+    assert not list(
+        merger(PEDESTRIAN).in_bodies(
+            now, FRAMES, regions_of(merger(PEDESTRIAN)).actors, mirror=True
+        )
+    )
 
 
 def test_what_passes_is_where_it_was_seen_and_frees_nothing():
@@ -229,10 +282,16 @@ def test_the_scans_of_an_instant_are_those_within_a_quarter_of_a_second():
 
 
 def around(turn, points):
-    """A scan of points that are turned around the sensor by an angle, and the box that stays 4 m away in this direction."""
+    """A scan of points that are turned around the sensor by an angle, and the box that stays 4 m
+    away in this direction.
+    """
     turned = transform_points(rotation_z(turn), np.array(points, float)).astype(np.float32)
     scan = PreparedScan.of(0, turned, np.ones(len(turned), np.uint16), np.eye(4))
-    return scan.rays[0].through(rotation_z(-turn), np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0])).tolist()
+    return (
+        scan.rays[0]
+        .through(rotation_z(-turn), np.array([4.0, -1.0, -1.0]), np.array([6.0, 1.0, 1.0]))
+        .tolist()
+    )
 
 
 @pytest.mark.parametrize("turn", np.linspace(-np.pi, np.pi, 9))
@@ -253,11 +312,17 @@ def test_rays_through_a_box_end_in_it_or_behind_it(turn):
 def test_a_box_around_below_or_beside_the_sensor_is_seen_whole():
     points = np.array([(5, 0, -2), (-5, 0, -2), (0, 5, -2), (0, -5, -2)], np.float32)
     scan = PreparedScan.of(0, points, np.ones(4, np.uint16), np.eye(4))
-    below = scan.rays[0].through(np.eye(4), np.array([-6.0, -6.0, -3.0]), np.array([6.0, 6.0, -1.0]))
+    below = scan.rays[0].through(
+        np.eye(4), np.array([-6.0, -6.0, -3.0]), np.array([6.0, 6.0, -1.0])
+    )
     assert sorted(below.tolist()) == [0, 1, 2, 3]
-    beside = scan.rays[0].through(np.eye(4), np.array([-6.0, 0.1, -3.0]), np.array([6.0, 6.0, -1.0]))
+    beside = scan.rays[0].through(
+        np.eye(4), np.array([-6.0, 0.1, -3.0]), np.array([6.0, 6.0, -1.0])
+    )
     assert beside.tolist() == [2]
-    corner = scan.rays[0].through(np.eye(4), np.array([-6.0, -0.1, -3.0]), np.array([-0.1, 0.1, -1.0]))
+    corner = scan.rays[0].through(
+        np.eye(4), np.array([-6.0, -0.1, -3.0]), np.array([-0.1, 0.1, -1.0])
+    )
     assert corner.tolist() == [1]
 
 
@@ -276,7 +341,8 @@ class TestFeed:
 
     def test_only_scans_that_reach_the_grid_are_read_for_it(self, tmp_path):
         feed = self.feed(tmp_path, window=(-59, 59))
-        spec = GridSpec("cartesian", (4, 4, 4), (-3, -4, 0), (3, 4, 0.1))  # its corners are 5 m away
+        # its corners are 5 m away
+        spec = GridSpec("cartesian", (4, 4, 4), (-3, -4, 0), (3, 4, 0.1))
         assert feed.reaching(0, spec) == list(range(36))  # 5 + 30 m
         cylinder = GridSpec("cylindrical", (4, 4, 4), (0, -3, -3), (4, 3, 0.1))
         assert feed.reaching(0, cylinder) == list(range(36))
@@ -284,7 +350,9 @@ class TestFeed:
     def test_with_a_distance_at_most_thirty_scans_a_side_are_merged(self, tmp_path):
         feed = self.feed(tmp_path, window=(-59, 59), window_m=59.0)
         assert feed.window_of(0) == [0, *range(2, 60, 2)]  # 1 m apart, and at least 59 / 30 m
-        assert self.feed(tmp_path / "near", window=(-59, 59), window_m=10.0).window_of(30) == list(range(20, 41))
+        assert self.feed(tmp_path / "near", window=(-59, 59), window_m=10.0).window_of(30) == list(
+            range(20, 41)
+        )
 
     def test_scans_without_labels_are_one_class_of_geometry_on_ground_that_is_found(self, tmp_path):
         x, y = np.meshgrid(np.arange(-20, 21.0), np.arange(-20, 21.0))
@@ -293,12 +361,16 @@ class TestFeed:
         labels = self.feed(tmp_path, range(6), points).read(0).labels
         assert labels[-1] == CARLA.id_of("Other")
         assert np.mean(np.isin(labels[:-1], sorted(CARLA.ground))) > 0.9
-        kitti = self.feed(tmp_path / "kitti", range(6), points, metadata=b'{"classes": "semantickitti"}')
+        kitti = self.feed(
+            tmp_path / "kitti", range(6), points, metadata=b'{"classes": "semantickitti"}'
+        )
         assert kitti.read(0).labels[-1] == SEMANTICKITTI.id_of("other-object")
 
     def test_unlabelled_points_are_left_out(self, tmp_path):
         feed = self.feed(tmp_path)
-        FolderSink(tmp_path).sequence("Val/Street/cartesian").write("labels", 3, np.array([0, ROAD], np.uint32))
+        FolderSink(tmp_path).sequence("Val/Street/cartesian").write(
+            "labels", 3, np.array([0, ROAD], np.uint32)
+        )
         (feed.sequence,) = FolderSource(tmp_path).sequences().values()
         assert feed.read(3).labels.tolist() == [ROAD]
 
@@ -334,13 +406,19 @@ def test_all_points_of_an_actor_vote_for_its_class():
     for frame in FRAMES:
         assert merger.labels(frame).tolist() == [ROAD, VEHICLE, 1]
     assert scans[1].labels.tolist() == [ROAD, PEDESTRIAN, 1]  # the scan keeps its own
-    assert Merger(scans.__getitem__, actors, CARLA, "tube").labels(1).tolist() == [ROAD, PEDESTRIAN, 1]
+    assert Merger(scans.__getitem__, actors, CARLA, "tube").labels(1).tolist() == [
+        ROAD,
+        PEDESTRIAN,
+        1,
+    ]
 
 
 def dense_scan(frame, count=40_000):
     rng = np.random.default_rng(7)
     directions = rng.normal(size=(count, 3)) * (1, 1, 0.1)
-    points = directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(2, 50, (count, 1))
+    points = (
+        directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(2, 50, (count, 1))
+    )
     return PreparedScan.of(frame, points.astype(np.float32), np.ones(count, np.uint16), np.eye(4))
 
 
@@ -349,9 +427,13 @@ def test_enough_rays_are_a_part_of_those_near_the_sensor_and_count_for_all():
     chosen, weights = one.enough
     distance = np.linalg.norm(one.points, axis=1)
     assert len(chosen) < 0.95 * len(distance)
-    assert np.array_equal(chosen[weights == 1], np.flatnonzero(distance > np.sqrt(len(distance) * 0.004 / 2)))
+    assert np.array_equal(
+        chosen[weights == 1], np.flatnonzero(distance > np.sqrt(len(distance) * 0.004 / 2))
+    )
     near = distance <= np.sqrt(len(distance) * 0.004 / 4)
-    assert (weights[near[chosen]] == 4).all() and near[chosen].sum() == pytest.approx(near.sum() / 4, rel=0.02)
+    assert (weights[near[chosen]] == 4).all() and near[chosen].sum() == pytest.approx(
+        near.sum() / 4, rel=0.02
+    )
     assert int(weights.sum()) == pytest.approx(len(distance), rel=0.01)
 
 

@@ -41,17 +41,25 @@ def assert_equal(one, other):
             b.extent.points,
             b.extent.seen_from,
         )
-        assert np.array_equal(a.extent.lower, b.extent.lower) and np.array_equal(a.extent.upper, b.extent.upper)
+        assert np.array_equal(a.extent.lower, b.extent.lower) and np.array_equal(
+            a.extent.upper, b.extent.upper
+        )
         assert list(a.members) == list(b.members)
         assert all(np.array_equal(a.members[frame], b.members[frame]) for frame in a.members)
     assert list(one.moving) == list(other.moving)
     assert all(np.array_equal(one.moving[frame], other.moving[frame]) for frame in one.moving)
     assert np.array_equal(one.own, other.own)
-    assert [dict(summary) for summary in one.summary] == [dict(summary) for summary in other.summary]
+    assert [dict(summary) for summary in one.summary] == [
+        dict(summary) for summary in other.summary
+    ]
 
 
 ACTORS = MovingActors.of(
-    [track(), track(speed=0.0), track(first=0, frames=4, label=4, instance=1 << 33, rigid=False, confidence=0.9999)],
+    [
+        track(),
+        track(speed=0.0),
+        track(first=0, frames=4, label=4, instance=1 << 33, rigid=False, confidence=0.9999),
+    ],
     {2: np.array([5, 9]), 4: np.array([], np.int64), 8: np.array([1])},
     [np.array([-3.0, 0.0, -1.0, -2.0, 1.0, 0.0])],
 )
@@ -72,7 +80,13 @@ class TestKept:
         assert ACTORS.summary[2]["confidence"] == 0.999  # 1 is for what the data say
 
     @pytest.mark.parametrize(
-        "actors", [ACTORS, MovingActors(), MovingActors.of([], {3: np.array([2])}), MovingActors.of([track()])]
+        "actors",
+        [
+            ACTORS,
+            MovingActors(),
+            MovingActors.of([], {3: np.array([2])}),
+            MovingActors.of([track()]),
+        ],
     )
     def test_what_is_kept_is_read_back_with_what_it_was_made_from(self, actors):
         back, key = MovingActors.from_bytes(actors.to_bytes("a key"), "here")
@@ -100,7 +114,10 @@ class TestKept:
             assert np.array_equal(near.tracks[0].pose(frame), ACTORS.tracks[0].pose(frame))
         assert near.tracks[0].pose(4) is near.tracks[0].pose(9) is None
         assert sorted(near.moving) == [8]
-        assert near.is_own(np.array([[-2.5, 0.5, -0.5], [-2.5, 0.5, 0.5]])).tolist() == [True, False]
+        assert near.is_own(np.array([[-2.5, 0.5, -0.5], [-2.5, 0.5, 0.5]])).tolist() == [
+            True,
+            False,
+        ]
         assert not ACTORS.between(30, 40).tracks and not ACTORS.between(30, 40).moving
 
 
@@ -130,10 +147,19 @@ def kept_in(street):
 
 def run(street, name="mine", frames=None, workers=1, **options):
     result = carlasc.regrid(
-        street, passing_car.SPEC, name=name, frames=frames, observe=FromScans(**options), run=Run(workers=workers)
+        street,
+        passing_car.SPEC,
+        name=name,
+        frames=frames,
+        observe=FromScans(**options),
+        run=Run(workers=workers),
     )
     assert result.failures == ()
-    return {file: data for file, data in read_tree(street / "cartesian" / name).items() if file[:1].isdigit()}
+    return {
+        file: data
+        for file, data in read_tree(street / "cartesian" / name).items()
+        if file[:1].isdigit()
+    }
 
 
 class TestPass:
@@ -162,8 +188,12 @@ class TestPass:
         run(street, "after", (4, 6))
         assert len(passes) == 2
 
-    @pytest.mark.parametrize("data", [b"", b"not an archive", MovingActors().to_bytes("of another drive")])
-    def test_it_is_made_again_if_what_is_kept_is_damaged_or_of_something_else(self, street, passes, data):
+    @pytest.mark.parametrize(
+        "data", [b"", b"not an archive", MovingActors().to_bytes("of another drive")]
+    )
+    def test_it_is_made_again_if_what_is_kept_is_damaged_or_of_something_else(
+        self, street, passes, data
+    ):
         run(street, "first", frames=(4, 5))
         kept_in(street).write_bytes(data)
         run(street, frames=(4, 5))

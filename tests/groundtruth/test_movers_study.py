@@ -1,4 +1,6 @@
-"""The study of movers: its street, its counts on grids of which everything is known, and one small drive from the recording to the tables."""
+"""The study of movers: its street, its counts on grids of which everything is known, and one small
+drive from the recording to the tables.
+"""
 
 import sys
 from dataclasses import replace
@@ -12,7 +14,16 @@ from carlasc.core.tables import CARLA
 
 VEHICLE, PEDESTRIAN, ROAD = (CARLA.id_of(name) for name in ("Vehicle", "Pedestrian", "Road"))
 SPEC = GridSpec("cartesian", (4, 4, 2), (0.0, 0.0, 0.0), (4.0, 4.0, 2.0))
-MODULES = ("study", "railed", "street", "movers", "movers_drives", "movers_rows", "movers_scores", "movers_tables")
+MODULES = (
+    "study",
+    "railed",
+    "street",
+    "movers",
+    "movers_drives",
+    "movers_rows",
+    "movers_scores",
+    "movers_tables",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +34,8 @@ def studies(monkeypatch):
         sys.modules.pop(name, None)
 
 
-# --- the street -----------------------------------------------------------------------------------------------------------------
+# --- the street
+# -----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -55,7 +67,9 @@ def test_nobody_drives_through_another_and_all_kinds_are_there(street):
             lower, upper = actor.mesh.vertices.min(axis=0)[:2], actor.mesh.vertices.max(axis=0)[:2]
             place = actor.world_T_actor[:2, 3]
             turned = actor.world_T_actor[0, 0] < 0
-            spans.append((place - upper, place - lower) if turned else (place + lower, place + upper))
+            spans.append(
+                (place - upper, place - lower) if turned else (place + lower, place + upper)
+            )
         vehicles = spans[:-28]  # people come last, and may pass each other closely
         for index, (low, high) in enumerate(vehicles):
             for other_low, other_high in vehicles[index + 1 :]:
@@ -66,15 +80,20 @@ def test_nobody_drives_through_another_and_all_kinds_are_there(street):
 
 def test_a_street_depends_on_its_seed_alone(street):
     one, same, other = street(3).actors(10), street(3).actors(10), street(4).actors(10)
-    assert all(np.array_equal(a.world_T_actor, b.world_T_actor) for a, b in zip(one, same, strict=True))
+    assert all(
+        np.array_equal(a.world_T_actor, b.world_T_actor) for a, b in zip(one, same, strict=True)
+    )
     assert not np.array_equal(one[2].world_T_actor, other[2].world_T_actor)
 
 
-# --- counts and figures ---------------------------------------------------------------------------------------------------------
+# --- counts and figures
+# ---------------------------------------------------------------------------------------------------------
 
 
 def scene():
-    """Return a grid and its reference: four voxels of a fast car (actor 5) and two of a walker (actor 6), on free space."""
+    """Return a grid and its reference: four voxels of a fast car (actor 5) and two of a walker
+    (actor 6), on free space.
+    """
     from movers_drives import Reference
 
     truth, owner = np.zeros(SPEC.size, np.uint8), np.zeros(SPEC.size, np.uint16)
@@ -96,9 +115,8 @@ def test_counts_of_a_known_scene():
     grid, reference = scene()
     counts = count(grid, reference, {5: 2})
     found = figures(counts + counts)
-    assert found["Vehicle IoU"] == pytest.approx(
-        2 / 4
-    )  # 2 right, 1 free, 1 wrongly; the voxel that is not judged does not count
+    # 2 right, 1 free, 1 wrongly; the voxel that is not judged does not count
+    assert found["Vehicle IoU"] == pytest.approx(2 / 4)
     assert found["Vehicle IoU, all"] == pytest.approx(2 / 5)
     assert (found["Vehicle found"], found["Vehicle free"]) == (0.5, 0.25)
     assert found["wrongly Vehicle"] == found["wrongly occupied"] == 1
@@ -126,13 +144,16 @@ def test_the_calibration_error_is_zero_for_true_probabilities_and_the_gap_for_ot
     p = rng.uniform(0, 1, 200_000)
     true = histogram(p, rng.uniform(size=len(p)) < p)
     assert calibration_error(true) < 0.01 and calibration_error(true, 0.05) < 0.01
-    assert calibration_error(histogram(np.full(1000, 0.9), np.zeros(1000, np.bool_))) == pytest.approx(0.9)
+    assert calibration_error(
+        histogram(np.full(1000, 0.9), np.zeros(1000, np.bool_))
+    ) == pytest.approx(0.9)
     mostly_sure = histogram(np.r_[np.full(900, 0.001), np.full(100, 0.5)], np.zeros(1000, np.bool_))
     assert calibration_error(mostly_sure, 0.05) == pytest.approx(0.5)
     assert calibration_error(mostly_sure) < 0.06
 
 
-# --- what the rows are given, and a run -----------------------------------------------------------------------------------------
+# --- what the rows are given, and a run
+# -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -142,7 +163,11 @@ def small(monkeypatch, tmp_path):
     pytest.importorskip("trimesh")
     import movers_drives
 
-    kinds = {"street": replace(movers_drives.KINDS["street"], frames=12, candidates=(3,), judged=1, sensors=3)}
+    kinds = {
+        "street": replace(
+            movers_drives.KINDS["street"], frames=12, candidates=(3,), judged=1, sensors=3
+        )
+    }
     monkeypatch.setattr(movers_drives, "KINDS", kinds)
     monkeypatch.setattr(movers_drives, "POINTS", {16: 4000, 32: 6000})
     return tmp_path
@@ -177,10 +202,17 @@ def test_rows_change_what_they_say(small):
     exact = drive.sequence
     moving = np.linalg.norm(exact.read("flow", 2), axis=1) > 1
     removed = without_movers(drive, 3)
-    assert len(removed.scan(2)) == (~moving).sum() < len(exact.scan(2)) and not removed.scan(2).flow.any()
+    assert (
+        len(removed.scan(2)) == (~moving).sum() < len(exact.scan(2))
+        and not removed.scan(2).flow.any()
+    )
     assert len(removed.scan(3)) == len(exact.scan(3))
     ids, wrong = exact.read("instances", 2), wrong_ids(drive, 0).read("instances", 2)
-    assert 0 < (ids != wrong).mean() < 0.4 and set(wrong) <= set(ids) and ((ids == 0) == (wrong == 0)).all()
+    assert (
+        0 < (ids != wrong).mean() < 0.4
+        and set(wrong) <= set(ids)
+        and ((ids == 0) == (wrong == 0)).all()
+    )
     boxes = noisy_boxes(drive, 0)
     assert set(boxes.frames("boxes")) < set(exact.frames("boxes"))
     frame = int(boxes.frames("boxes")[0])
@@ -189,7 +221,9 @@ def test_rows_change_what_they_say(small):
     turned = NoisyPoses(0.0, 0.5)(drive, 0).poses
     shifted = NoisyPoses(0.2, 0.0)(drive, 0).poses - exact.poses
     angles = np.arccos((np.einsum("fij,fij->f", turned[:, :3, :3], exact.poses[:, :3, :3]) - 1) / 2)
-    assert 0.1 < np.degrees(angles).mean() < 2 and np.array_equal(turned[:, :3, 3], exact.poses[:, :3, 3])
+    assert 0.1 < np.degrees(angles).mean() < 2 and np.array_equal(
+        turned[:, :3, 3], exact.poses[:, :3, 3]
+    )
     assert 0.1 < shifted[:, :3, 3].std() < 0.3 and not shifted[:, :3, :3].any()
 
 
@@ -198,7 +232,10 @@ def test_a_run_makes_rows_once_and_the_tables_show_them(small, capsys):
     from movers import Setting, Task, held_out, run, tables
     from movers_tables import write_tables
 
-    tasks = [Task(Setting("street", seed, 16), ("coarse",), ("tube", "align, flow"), small) for seed in (5, 6)]
+    tasks = [
+        Task(Setting("street", seed, 16), ("coarse",), ("tube", "align, flow"), small)
+        for seed in (5, 6)
+    ]
     for task in tasks:
         run(task)
     assert capsys.readouterr().out.count("Vehicle IoU") == 4
@@ -221,7 +258,12 @@ def test_the_tasks_cover_the_report(tmp_path):
 
     options = {"work": tmp_path, "part": None, **SEEDS}
     tasks = tasks_of(argparse.Namespace(parked=False, **options))
-    made = {(task.setting.channels, grid, row) for task in tasks for grid in task.grids for row in task.rows}
+    made = {
+        (task.setting.channels, grid, row)
+        for task in tasks
+        for grid in task.grids
+        for row in task.rows
+    }
     assert {(32, "coarse", row.name) for row in (*ROWS, *ABLATIONS)} <= made
     others = {(16, "coarse"), (64, "coarse"), (32, "0.2 m")}
     assert {(*other, "align, evidence") for other in others} <= made

@@ -1,4 +1,6 @@
-"""Scans whose rays do not all begin at the sensor: several LiDARs, and a LiDAR that turns while the vehicle moves."""
+"""Scans whose rays do not all begin at the sensor: several LiDARs, and a LiDAR that turns while the
+vehicle moves.
+"""
 
 import shutil
 
@@ -21,13 +23,21 @@ SPEED = 16.0
 
 
 class TwoPlaces(DriveConverter):
-    """Two LiDARs three metres apart beside a box that stands close to the vehicle: the front one looks behind it."""
+    """Two LiDARs three metres apart beside a box that stands close to the vehicle: the front one
+    looks behind it.
+    """
 
     drive = SimulatedDrive(
         frames=2,
         speed=0.0,
-        sensors=(Sensor("rear", translation((-1.5, 0.0, 1.7))), Sensor("front", translation((3.0, 0.0, 1.7)))),
-        things=(Thing("pole", (0.8, 1.6, 1.0), (1.0, 1.0, 2.0)), Thing("building", (0.0, 9.0, 2.0), (40.0, 2.0, 4.0))),
+        sensors=(
+            Sensor("rear", translation((-1.5, 0.0, 1.7))),
+            Sensor("front", translation((3.0, 0.0, 1.7))),
+        ),
+        things=(
+            Thing("pole", (0.8, 1.6, 1.0), (1.0, 1.0, 2.0)),
+            Thing("building", (0.0, 9.0, 2.0), (40.0, 2.0, 4.0)),
+        ),
         channels=40,
         columns=360,
     )
@@ -50,7 +60,9 @@ def grids_of(converter, folder):
         if name == "one":
             shutil.rmtree(f"{sequence.location}/origins")
         observe = FromScans(window=(0, 0), own_path=False, motion=MotionOptions("none"))
-        carlasc.regrid(sequence.location, SPEC, name=name, observe=observe, frames=(0, 1), run=Run(workers=1))
+        carlasc.regrid(
+            sequence.location, SPEC, name=name, observe=observe, frames=(0, 1), run=Run(workers=1)
+        )
         (again,) = carlasc.open(folder.parent / f"{folder.name}_out").sequences().values()
         found.append(again.grid(name, 0))
     return found
@@ -60,7 +72,8 @@ def test_free_space_is_cast_from_the_place_of_each_lidar(tmp_path):
     (tmp_path / "in").mkdir()
     own, one = grids_of(TwoPlaces, tmp_path / "in")
     assert _free_inside(own) == 0
-    assert _free_inside(one) > 20  # rays from one place to what the front LiDAR saw behind the box go through it
+    # rays from one place to what the front LiDAR saw behind the box go through it
+    assert _free_inside(one) > 20
 
 
 def _free_inside(grid):
@@ -80,10 +93,16 @@ def test_the_votes_of_a_scan_are_those_of_its_parts():
     order = sorted_by_origin(places[which])
     scan = PreparedScan.of(0, points[order], labels[order], np.eye(4), origins=places[which][order])
     assert len(scan.rays) == 3 and sum(len(rays.points) for rays in scan.rays) == 4000
-    together = count_votes([Observation(grid_T_sensor=scan.world_T_places, **scan.votes_of(scan.labels, None))], SPEC)
+    together = count_votes(
+        [Observation(grid_T_sensor=scan.world_T_places, **scan.votes_of(scan.labels, None))], SPEC
+    )
     expected = count_votes(
         [
-            Observation(points[which == k] - places[k], labels[which == k].astype(np.uint16), translation(places[k]))
+            Observation(
+                points[which == k] - places[k],
+                labels[which == k].astype(np.uint16),
+                translation(places[k]),
+            )
             for k in range(3)
         ],
         SPEC,
@@ -96,7 +115,10 @@ def test_origins_are_sorted_into_runs_and_keep_the_order_of_points():
     origins = np.array([[0, 0, 1], [0, 0, 0], [0, 0, 1], [0, 0, 0], [0, 0, 1]], np.float32)
     order = sorted_by_origin(origins)
     assert order.tolist() == [1, 3, 0, 2, 4]
-    assert [(part.start, part.stop, origin.tolist()) for part, origin in runs_of_origins(origins[order], 5)] == [
+    assert [
+        (part.start, part.stop, origin.tolist())
+        for part, origin in runs_of_origins(origins[order], 5)
+    ] == [
         (0, 2, [0, 0, 0]),
         (2, 5, [0, 0, 1]),
     ]
@@ -105,7 +127,9 @@ def test_origins_are_sorted_into_runs_and_keep_the_order_of_points():
 
 
 @pytest.mark.parametrize("rolling", [False, True])
-def test_a_lidar_that_turns_on_a_fast_vehicle_leaves_as_much_free_space_wrong_as_one_that_does_not(rolling, tmp_path):
+def test_a_lidar_that_turns_on_a_fast_vehicle_leaves_as_much_free_space_wrong_as_one_that_does_not(
+    rolling, tmp_path
+):
     class Fast(DriveConverter):
         drive = SimulatedDrive(
             frames=3,

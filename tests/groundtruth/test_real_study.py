@@ -1,4 +1,6 @@
-"""The study of a real drive: its measures on a street of which everything is known, and its reading of the archive where that is present."""
+"""The study of a real drive: its measures on a street of which everything is known, and its reading
+of the archive where that is present.
+"""
 
 import sys
 import tarfile
@@ -31,7 +33,9 @@ def surface(size, count):
     """Return random points on the sides, the front, the back and the top of a box, in its frame."""
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (count, 3))
     faces = np.random.default_rng(1).integers(0, 5, count)
-    points[np.arange(count), np.array([0, 0, 1, 1, 2])[faces]] = np.array([-0.5, 0.5, -0.5, 0.5, 0.5])[faces]
+    points[np.arange(count), np.array([0, 0, 1, 1, 2])[faces]] = np.array(
+        [-0.5, 0.5, -0.5, 0.5, 0.5]
+    )[faces]
     return points * size
 
 
@@ -41,7 +45,9 @@ def pose_of(frame):
 
 def van_at(frame):
     """A van ahead, which turns off to the left."""
-    return translation((6 + 0.7 * (frame - 20), 1 + 0.3 * (frame - 20), ROAD_Z + 0.75)) @ rotation_z(0.4)
+    return translation(
+        (6 + 0.7 * (frame - 20), 1 + 0.3 * (frame - 20), ROAD_Z + 0.75)
+    ) @ rotation_z(0.4)
 
 
 def follower_at(frame):
@@ -53,18 +59,27 @@ PARKED = translation((12, -8, ROAD_Z + 0.75))
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """A straight drive: a van that moves and a parked one with boxes, a follower without, a wall, and the road."""
+    """A straight drive: a van that moves and a parked one with boxes, a follower without, a wall,
+    and the road.
+    """
     folder = tmp_path_factory.mktemp("drive")
     rng = np.random.default_rng(0)
-    road = np.column_stack([rng.uniform(-40, 60, 60000), rng.uniform(-12, 12, 60000), np.full(60000, ROAD_Z)])
-    wall = np.column_stack([rng.uniform(-40, 60, 30000), np.full(30000, 12.05), rng.uniform(ROAD_Z, 2, 30000)])
+    road = np.column_stack(
+        [rng.uniform(-40, 60, 60000), rng.uniform(-12, 12, 60000), np.full(60000, ROAD_Z)]
+    )
+    wall = np.column_stack(
+        [rng.uniform(-40, 60, 30000), np.full(30000, 12.05), rng.uniform(ROAD_Z, 2, 30000)]
+    )
     with FolderSink(folder).sequence("cartesian") as writer:
         poses = np.stack([pose_of(frame) for frame in FRAMES])
         writer.write_document(layout.POSES, layout.encode_poses(poses))
         writer.write_document(layout.TIMES, layout.encode_times(np.arange(len(poses)) * 0.1))
         writer.write_document(layout.METADATA, Metadata("right", min_range_m=2.5).to_json())
         for frame in FRAMES:
-            bodies = [transform_points(p, surface(CAR, 900)) for p in (van_at(frame), PARKED, follower_at(frame))]
+            bodies = [
+                transform_points(p, surface(CAR, 900))
+                for p in (van_at(frame), PARKED, follower_at(frame))
+            ]
             points = transform_points(invert(pose_of(frame)), np.concatenate([road, wall, *bodies]))
             points = np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
             boxes = Boxes.from_poses(
@@ -103,7 +118,9 @@ def test_it_finds_what_moves_what_stands_and_the_follower(judge):
     assert [body.name for body in judge.standing] == ["track 4"]
     follower = judge.follower
     for frame in FRAMES:
-        found = transform_points(follower.poses[frame], (follower.lower + follower.upper)[None] / 2)[0]
+        found = transform_points(
+            follower.poses[frame], (follower.lower + follower.upper)[None] / 2
+        )[0]
         assert np.linalg.norm((found - follower_at(frame)[:3, 3])[:2]) < 0.35
     assert follower.upper[1] - follower.lower[1] == pytest.approx(1.8, abs=0.1)
 
@@ -166,7 +183,8 @@ def test_the_archive_is_read(real, tmp_path):
         labels, instances = label_points(scan, found)
         assert set(np.unique(instances)) == {0, 1, 2, 4}
         assert set(np.unique(labels)) == {CARLA.geometry_only, 4, 10}
-        for row in range(len(found)):  # a box stands on the road, and most of its points are on its surface
+        # a box stands on the road, and most of its points are on its surface
+        for row in range(len(found)):
             own = scan[instances == found.tracks[row]].astype(np.float64)
             body = transform_points(invert(found.sensor_T_box[row]), own)
             assert len(own) > 50 and (body[:, 2] + found.sizes[row, 2] / 2 > FLOOR_M).all()

@@ -1,4 +1,6 @@
-"""Grids of scans whose poses are wrong: poses are refined before, kept for the next run, and never overwritten."""
+"""Grids of scans whose poses are wrong: poses are refined before, kept for the next run, and never
+overwritten.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,17 @@ from carlasc.testing import KINDS, SimulatedDrive, wrong_poses
 
 FRAMES = 24
 SPEC = GridSpec("cartesian", (80, 80, 10), (-16.0, -16.0, -2.2), (16.0, 16.0, 1.8))
-NAMES = ("Free", "Road", "Building", "Vegetation", "Pole", "Vehicle", "Vehicle", "Pedestrian", "Pedestrian")
+NAMES = (
+    "Free",
+    "Road",
+    "Building",
+    "Vegetation",
+    "Pole",
+    "Vehicle",
+    "Vehicle",
+    "Pedestrian",
+    "Pedestrian",
+)
 LABELS = np.array([CARLA.id_of(name) for name in NAMES], np.uint32)
 assert len(LABELS) == len(KINDS)
 
@@ -82,7 +94,14 @@ def passes(monkeypatch):
 def make(folder, name="mine", out=None, frames=(12, 13), workers=1, refine="auto", **options):
     observe = FromScans(poses=PoseOptions(refine=refine), **options)
     result = carlasc.regrid(
-        folder, SPEC, out, name=name, frames=frames, observe=observe, run=Run(workers=workers), overwrite=False
+        folder,
+        SPEC,
+        out,
+        name=name,
+        frames=frames,
+        observe=observe,
+        run=Run(workers=workers),
+        overwrite=False,
     )
     assert result.failures == ()
     return result
@@ -117,7 +136,9 @@ def test_grids_under_wrong_poses_become_those_under_exact_ones(drive, wrong, tmp
     assert wrong_share > 0.06 and share < 0.3 * wrong_share
     assert not any("refined" in note for note in exact.notes)
     (note,) = [note for note in result.notes if "refined" in note]
-    assert "poses were refined: neighbouring scans disagreed by " in note and note.startswith(str(given))
+    assert "poses were refined: neighbouring scans disagreed by " in note and note.startswith(
+        str(given)
+    )
 
 
 def test_exact_poses_give_the_same_bytes_whether_they_may_be_refined_or_not(drive, tmp_path):
@@ -125,7 +146,9 @@ def test_exact_poses_give_the_same_bytes_whether_they_may_be_refined_or_not(driv
     for refine in ("auto", "never"):
         folder = write(drive, tmp_path / refine, drive[1])
         make(folder, refine=refine)
-        trees.append({n: d for n, d in read_tree(folder).items() if n.endswith((".label", ".bin", ".txt"))})
+        trees.append(
+            {n: d for n, d in read_tree(folder).items() if n.endswith((".label", ".bin", ".txt"))}
+        )
     assert trees[0] == trees[1]
 
 
@@ -134,12 +157,17 @@ def test_what_was_given_stays_and_the_record_says_how_poses_were_used(folder, wr
     make(folder)
     make(folder, "never", refine="never")
     assert (folder / "cartesian" / layout.POSES).read_bytes() == before
-    records = [json.loads((folder / "cartesian" / n / layout.PARAMS).read_text())["carlasc"] for n in ("mine", "never")]
+    records = [
+        json.loads((folder / "cartesian" / n / layout.PARAMS).read_text())["carlasc"]
+        for n in ("mine", "never")
+    ]
     assert [record.get("refine") for record in records] == ["auto", None]
     assert carlasc.validate(folder).ok
     (sequence,) = carlasc.open(folder).sequences().values()
     assert np.array_equal(sequence.poses, layout.decode_poses(before, "poses"))
-    assert not any(layout.DERIVED in name for name in (*sequence.documents(), *sequence.unknown_files()))
+    assert not any(
+        layout.DERIVED in name for name in (*sequence.documents(), *sequence.unknown_files())
+    )
 
 
 def test_refined_poses_are_kept_and_used_again(folder, passes):
@@ -148,7 +176,9 @@ def test_refined_poses_are_kept_and_used_again(folder, passes):
     make(folder, "again", window=(-3, 3))
     assert len(passes) == 1
     make(folder, "always", refine="always")
-    assert len(passes) == 2 and len(list((folder / "cartesian" / layout.DERIVED).glob("poses-*"))) == 2
+    assert (
+        len(passes) == 2 and len(list((folder / "cartesian" / layout.DERIVED).glob("poses-*"))) == 2
+    )
     for file in (folder / "cartesian" / layout.DERIVED).iterdir():
         file.unlink()
     make(folder, "anew")
@@ -182,7 +212,10 @@ def test_poses_that_cannot_be_refined_are_said_so(drive, tmp_path):
     move(other, np.arange(FRAMES)[:, None] * (0.0, 0.0, 0.0, 0.0, 0.0, 0.02), 0)
     result = make(write(drive, tmp_path / "other", other))
     (note,) = [note for note in result.notes if "refined" in note]
-    assert "scans do not fit each other under the poses of frames 0 to 23, which were not refined" in note
+    assert (
+        "scans do not fit each other under the poses of frames 0 to 23, which were not refined"
+        in note
+    )
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -234,7 +267,8 @@ def test_the_report_says_how_poses_were_refined(folder, drive, tmp_path):
     assert again == made
     text = dict(describe(made))["poses"]
     assert (
-        text.startswith("refined: neighbouring scans disagreed by ") and "degrees of roll, pitch, yaw per scan" in text
+        text.startswith("refined: neighbouring scans disagreed by ")
+        and "degrees of roll, pitch, yaw per scan" in text
     )
     make(folder, "never", refine="never")
     reports = carlasc.report(folder, run=Run(workers=1)).reports
@@ -255,7 +289,9 @@ def test_held_out_rays_get_better_and_are_measured_before_and_after(folder, driv
     found = holdout(folder, SPEC, every=8, run=run)
     (before,), (after,) = found.given_poses.values(), found.sequences.values()
     assert before.frames == after.frames > 0
-    wrong, right = ((scores.all.free or 0) + (scores.all.unknown or 0) for scores in (before, after))
+    wrong, right = (
+        (scores.all.free or 0) + (scores.all.unknown or 0) for scores in (before, after)
+    )
     assert right < 0.75 * wrong
     assert found.to_dict()["given_poses"] and steps[-1][0] == steps[-1][1]
     exact = holdout(write(drive, tmp_path / "exact", drive[1]), SPEC, every=8, run=Run(workers=1))
@@ -265,6 +301,8 @@ def test_held_out_rays_get_better_and_are_measured_before_and_after(folder, driv
     assert report.holdout["given_poses"]["returns"] == report.holdout["rays"]["returns"]
     assert next(iter(carlasc.report(folder).reports.values())) == report
     assert "under the given poses" in dict(describe(report))["held-out rays"]
-    result = CliRunner().invoke(app, ["validate", str(folder), "--holdout", "--every", "8", "--workers", "1"])
+    result = CliRunner().invoke(
+        app, ["validate", str(folder), "--holdout", "--every", "8", "--workers", "1"]
+    )
     assert "under the given poses: returns in " in result.output
     assert "scans agree within " in result.output

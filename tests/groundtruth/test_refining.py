@@ -1,4 +1,6 @@
-"""A data set with refined poses: motions nearer to the truth, everything else as it was, and a word of what was done to the poses."""
+"""A data set with refined poses: motions nearer to the truth, everything else as it was, and a word
+of what was done to the poses.
+"""
 
 import json
 import os
@@ -28,12 +30,18 @@ FRAMES = 20
 ONE, TWO = "Train/One/cartesian", "Train/Two/cartesian"
 SPEC = GridSpec(lower=(-8, -8, -2), upper=(8, 8, 2), size=(16, 16, 4), coordinates="cartesian")
 GRID = layout.grid_folder(SPEC)
-FINE = GridSpec(lower=(-15, -15, -3), upper=(15, 15, 3), size=(300, 300, 60), coordinates="cartesian")
+FINE = GridSpec(
+    lower=(-15, -15, -3), upper=(15, 15, 3), size=(300, 300, 60), coordinates="cartesian"
+)
 
 
 def files_of(folder):
     """Return the bytes of all files of a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def write_poses(folder, poses):
@@ -42,7 +50,9 @@ def write_poses(folder, poses):
 
 
 def disturbed(poses):
-    """Return poses with a jitter of 3 cm and 0.1 degrees; the first one is right, as the format says."""
+    """Return poses with a jitter of 3 cm and 0.1 degrees; the first one is right, as the format
+    says.
+    """
     wrong = wrong_poses(poses, jitter_m=0.03, jitter_rad=0.002, seed=4)
     wrong[0] = poses[0]
     return wrong
@@ -61,7 +71,9 @@ def poses_of(folder, path=ONE):
 @pytest.fixture(scope="session")
 def drive(tmp_path_factory):
     """A simulated drive with exact poses, and a grid."""
-    capture = SimulatedCapture(count=FRAMES, sensors=1, seed=3, bev=False, lidar=Lidar(channels=32, points=30_000))
+    capture = SimulatedCapture(
+        count=FRAMES, sensors=1, seed=3, bev=False, lidar=Lidar(channels=32, points=30_000)
+    )
     folder = tmp_path_factory.mktemp("drive")
     carlasc.regrid(capture, SPEC, folder / "Train" / "One", run=ALONE)
     return folder
@@ -83,11 +95,15 @@ def data(exact, truth, tmp_path):
     shutil.copytree(exact / ONE, tmp_path / "data" / TWO, copy_function=os.link)
     shutil.copytree(exact / ONE, tmp_path / "data" / ONE, copy_function=os.link)
     write_poses(tmp_path / "data" / ONE, disturbed(truth))
-    (tmp_path / "data" / ONE / "carlasc.json").write_text('{"format": 2, "sensor": "a", "poses": "file"}')
+    (tmp_path / "data" / ONE / "carlasc.json").write_text(
+        '{"format": 2, "sensor": "a", "poses": "file"}'
+    )
     return tmp_path / "data"
 
 
-def test_motions_are_nearer_to_the_truth_and_everything_else_is_the_same_file(data, truth, tmp_path):
+def test_motions_are_nearer_to_the_truth_and_everything_else_is_the_same_file(
+    data, truth, tmp_path
+):
     before = files_of(data)
     result = carlasc.refine(data, tmp_path / "out", run=ALONE)
     assert files_of(data) == before
@@ -104,27 +120,43 @@ def test_motions_are_nearer_to_the_truth_and_everything_else_is_the_same_file(da
     assert result.sequences == [ONE, TWO] and result.refined == [ONE] and result.scans == FRAMES
     assert result.files == result.kept == 0 and result.linked == len(made) - 6
     assert result.left_out == [f"{GRID}/"]
-    assert result.notes[0].startswith(f"{ONE}: poses were refined: neighbouring scans disagreed by 4.")
-    assert result.notes[1].startswith(f"{TWO}: poses left as they are: neighbouring scans disagree by 1.")
+    assert result.notes[0].startswith(
+        f"{ONE}: poses were refined: neighbouring scans disagreed by 4."
+    )
+    assert result.notes[1].startswith(
+        f"{TWO}: poses left as they are: neighbouring scans disagree by 1."
+    )
     assert not list(tmp_path.glob("out.*"))
 
 
 def test_carlasc_json_says_what_was_done_and_keeps_what_it_said(data, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
-    found = [json.loads((tmp_path / "out" / path / "carlasc.json").read_text()) for path in (ONE, TWO)]
-    assert found[0] == {"format": 2, "axes": "left", "classes": "carla", "sensor": "a", "poses": "file, refined"}
+    found = [
+        json.loads((tmp_path / "out" / path / "carlasc.json").read_text()) for path in (ONE, TWO)
+    ]
+    assert found[0] == {
+        "format": 2,
+        "axes": "left",
+        "classes": "carla",
+        "sensor": "a",
+        "poses": "file, refined",
+    }
     assert found[1] == {"format": 2, "axes": "left", "classes": "carla", "poses": "left as given"}
     again = carlasc.refine(tmp_path / "out", tmp_path / "again", run=ALONE)
     assert again.refined == []
     for path in (ONE, TWO):
         for name in ("carlasc.json", "poses.txt"):
-            assert (tmp_path / "again" / path / name).read_bytes() == (tmp_path / "out" / path / name).read_bytes()
+            assert (tmp_path / "again" / path / name).read_bytes() == (
+                tmp_path / "out" / path / name
+            ).read_bytes()
 
 
 def test_exact_poses_stay_the_same_bytes_unless_they_are_always_refined(exact, truth, tmp_path):
     carlasc.refine(exact, tmp_path / "out", run=ALONE)
     assert (tmp_path / "out" / ONE / "poses.txt").samefile(exact / ONE / "poses.txt")
-    result = carlasc.refine(exact, tmp_path / "always", poses=PoseOptions(refine="always"), run=ALONE)
+    result = carlasc.refine(
+        exact, tmp_path / "always", poses=PoseOptions(refine="always"), run=ALONE
+    )
     assert result.refined == [ONE]
     assert 0 < off_m(poses_of(tmp_path / "always"), truth) < 0.005
 
@@ -133,8 +165,12 @@ def test_stacks_of_aligned_scans_agree_better(data, exact, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
 
     def shares(folder):
-        """Return the share of the voxels of 0.1 m of a stack that at least four of 16 scans have in common."""
-        stacks = carlasc.Dataset(folder, ["One"], history=16, grid=FINE, fields=("occupancy",), remap=None)
+        """Return the share of the voxels of 0.1 m of a stack that at least four of 16 scans have in
+        common.
+        """
+        stacks = carlasc.Dataset(
+            folder, ["One"], history=16, grid=FINE, fields=("occupancy",), remap=None
+        )
         scans = stacks[FRAMES - 1]["occupancy"].sum(axis=0)
         return (scans >= 4).sum() / (scans > 0).sum()
 
@@ -156,11 +192,17 @@ def test_lines_of_frames_without_a_scan_move_with_the_scan_before_them(data, tru
     assert off_m(np.delete(found, 7, axis=0), np.delete(truth, 7, axis=0)) < 0.005
 
 
-def test_missing_poses_are_estimated_unless_those_of_the_data_are_asked_for(exact, truth, tmp_path, monkeypatch):
+def test_missing_poses_are_estimated_unless_those_of_the_data_are_asked_for(
+    exact, truth, tmp_path, monkeypatch
+):
     pytest.importorskip("kiss_icp")
-    monkeypatch.setattr(refining, "find_mounting", lambda *_: pytest.fail("estimated poses are those of the sensor"))
+    monkeypatch.setattr(
+        refining, "find_mounting", lambda *_: pytest.fail("estimated poses are those of the sensor")
+    )
     (exact / ONE / "poses.txt").unlink()
-    with pytest.raises(MissingDataError, match=r"poses.txt: expected poses.*poses=PoseOptions\(\"kiss-icp\"\)"):
+    with pytest.raises(
+        MissingDataError, match=r"poses.txt: expected poses.*poses=PoseOptions\(\"kiss-icp\"\)"
+    ):
         carlasc.refine(exact, tmp_path / "file", poses=PoseOptions("file"), run=ALONE)
     result = carlasc.refine(exact, tmp_path / "out", run=ALONE)
     assert "poses were estimated from the scans (kiss-icp); poses " in result.notes[0]
@@ -178,7 +220,8 @@ def test_too_few_scans_are_left_alone_and_sequences_without_scans_are_left_out(e
     writer.write_document("poses.txt", layout.encode_poses(whole.poses[:2]))
     result = carlasc.refine(tmp_path / "few", tmp_path / "out", run=ALONE)
     assert result.notes == [
-        "Val/Few/cartesian: poses left as they are: the distance between neighbouring scans is unknown"
+        "Val/Few/cartesian: poses left as they are: the distance between neighbouring scans is "
+        "unknown"
     ]
     for path in (tmp_path / "few/Val/Few/cartesian/velodyne").iterdir():
         path.unlink()
@@ -191,7 +234,9 @@ def test_what_exists_is_not_replaced_unless_it_was_refined_and_that_is_asked_for
     carlasc.refine(data, tmp_path / "out", run=ALONE)
     with pytest.raises(ConflictError, match="expected a new path"):
         carlasc.refine(data, tmp_path / "out", run=ALONE)
-    carlasc.refine(data, tmp_path / "out", poses=PoseOptions(refine="always"), overwrite=True, run=ALONE)
+    carlasc.refine(
+        data, tmp_path / "out", poses=PoseOptions(refine="always"), overwrite=True, run=ALONE
+    )
     assert open_store(tmp_path / "out").sequences()[TWO].metadata.extra["poses"] == "refined"
     assert not list(tmp_path.glob("out.*"))
     before = shutil.copytree(data, tmp_path / "other")
@@ -217,9 +262,12 @@ def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(data, 
     out = tmp_path / "out"
     ran = subprocess.run([sys.executable, "-c", KILLED, data, out, when], check=False)
     assert ran.returncode == 9 and not out.exists()
-    assert len(list((tmp_path / "out.part").glob("*/*/*/.carlasc/poses-*.npz"))) == (1 if when == "25" else 2)
+    assert len(list((tmp_path / "out.part").glob("*/*/*/.carlasc/poses-*.npz"))) == (
+        1 if when == "25" else 2
+    )
     with pytest.raises(
-        ConflictError, match=r"out\.part: expected the files of an interrupted run .*: remove the folder"
+        ConflictError,
+        match=r"out\.part: expected the files of an interrupted run .*: remove the folder",
     ):
         carlasc.refine(data, out, poses=PoseOptions(refine="always"), run=ALONE)
     given = poses_of(data)
@@ -237,8 +285,11 @@ def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(data, 
 def test_several_processes_parts_and_packed_sources_make_the_same_files(data, tmp_path):
     carlasc.refine(data, tmp_path / "alone", run=ALONE)
     steps = []
-    carlasc.refine(data, tmp_path / "two", run=Run(workers=2, progress=lambda *step: steps.append(step)))
-    assert steps[-1] == (2 * FRAMES * 5,) * 2 and steps == sorted(steps)  # scans, then the files of four fields
+    carlasc.refine(
+        data, tmp_path / "two", run=Run(workers=2, progress=lambda *step: steps.append(step))
+    )
+    # scans, then the files of four fields
+    assert steps[-1] == (2 * FRAMES * 5,) * 2 and steps == sorted(steps)
     for number in (1, 2):
         carlasc.refine(data, tmp_path / "parts", run=Run(1, part=carlasc.running.Part(number, 2)))
     carlasc.pack(data, tmp_path / "data.zarr", run=ALONE)
@@ -250,7 +301,9 @@ def test_several_processes_parts_and_packed_sources_make_the_same_files(data, tm
 
 def test_a_refined_data_set_is_valid_and_is_regridded_without_refining_again(data, tmp_path):
     carlasc.refine(data, tmp_path / "out", run=ALONE)
-    assert not [one for one in validate(tmp_path / "out", run=ALONE).findings if one.severity == "error"]
+    assert not [
+        one for one in validate(tmp_path / "out", run=ALONE).findings if one.severity == "error"
+    ]
     observe = carlasc.FromScans(window=(-1, 1))
     made = carlasc.regrid(tmp_path / "out" / ONE, SPEC, observe=observe, frames=(0, 1), run=ALONE)
     assert not any("refined" in note for note in made.notes)
@@ -278,10 +331,16 @@ def test_poses_of_another_point_and_late_ones_are_corrected(tmp_path):
         writer.write_document(layout.POSES, layout.encode_poses(invert(given[0]) @ given))
         writer.write_document(layout.METADATA, Metadata("right").to_json())
         for frame, points in enumerate(scans):
-            writer.write("points", frame, np.column_stack([points, np.zeros(len(points))]).astype(np.float32))
+            writer.write(
+                "points", frame, np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+            )
     (note,) = carlasc.refine(source, out, run=Run(workers=1)).notes
-    assert "poses were corrected for the sensor in their frame: x 0.8" in note and "late 0.05" in note
+    assert (
+        "poses were corrected for the sensor in their frame: x 0.8" in note and "late 0.05" in note
+    )
     (sequence,) = carlasc.open(out).sequences().values()
-    off = invert(invert(true[:-10]) @ true[10:]) @ invert(sequence.poses[:-10]) @ sequence.poses[10:]
+    off = (
+        invert(invert(true[:-10]) @ true[10:]) @ invert(sequence.poses[:-10]) @ sequence.poses[10:]
+    )
     assert np.abs(off[:, :3, 3]).max() < 0.04
     assert sequence.metadata.extra["poses"] == "refined"

@@ -1,4 +1,6 @@
-"""The report that a run leaves beside each grid: its figures, and that it is complete whatever the run was like."""
+"""The report that a run leaves beside each grid: its figures, and that it is complete whatever the
+run was like.
+"""
 
 import json
 import shutil
@@ -19,7 +21,14 @@ from carlasc.errors import FormatError
 from carlasc.groundtruth import FromGrid, FromScans, Voting, regrid
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
-from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, Residual, actors_of, digest_of, sample_frames
+from carlasc.groundtruth.reporting.facts import (
+    Changes,
+    FrameFacts,
+    Residual,
+    actors_of,
+    digest_of,
+    sample_frames,
+)
 from carlasc.groundtruth.reporting.report import FileDigest, Report
 from carlasc.storage import FolderSink, layout
 
@@ -245,13 +254,17 @@ def test_the_inferred_share_needs_every_frame_to_say_it():
 
 
 def residual_of(actor, frame):
-    """Compare the observations of an actor in two frames, with the sensor at the origin of the world."""
+    """Compare the observations of an actor in two frames, with the sensor at the origin of the
+    world.
+    """
     one, other = (scan_of([actor], number).points for number in (frame, frame + 1))
     return Residual.between(one, other, actor.pose(0.1 * frame), actor.pose(0.1 * (frame + 1)))
 
 
 def test_a_true_motion_overlays_observations_better_than_no_motion():
-    moving, parked = (residual_of(MovingBox((5.0, 2.0, 0.0), speed=speed), 3) for speed in (8.0, 0.0))
+    moving, parked = (
+        residual_of(MovingBox((5.0, 2.0, 0.0), speed=speed), 3) for speed in (8.0, 0.0)
+    )
     assert moving.count == parked.count > 50
     assert moving.moving_m / moving.count < 0.15
     assert moving.static_m > 1.3 * moving.moving_m
@@ -259,14 +272,31 @@ def test_a_true_motion_overlays_observations_better_than_no_motion():
 
 
 def test_residuals_are_means_over_the_observations_of_each_actor_that_moves():
-    about = {"label": 10, "instance": 0, "scans": 3, "points": 50, "speed_m_s": 5.0, "faces": 2, "confidence": 0.7}
+    about = {
+        "label": 10,
+        "instance": 0,
+        "scans": 3,
+        "points": 50,
+        "speed_m_s": 5.0,
+        "faces": 2,
+        "confidence": 0.7,
+    }
     about |= {"first": 1, "last": 3, "size_m": [4.0, 2.0, 1.5], "seen_m": [3.0, 1.0, 1.5]}
-    summaries = [about | {"moves": False}, about | {"moves": True}, about | {"moves": True, "first": 0, "label": 4}]
+    summaries = [
+        about | {"moves": False},
+        about | {"moves": True},
+        about | {"moves": True, "first": 0, "label": 4},
+    ]
     frames = [{1: Residual(1.0, 4.0, 10), 0: Residual(9.0, 9.0, 1)}, {1: Residual(5.0, 6.0, 20)}]
     person, car = actors_of(summaries, frames, CARLA)
     assert (person.label, person.residual_m, person.residual_static_m) == ("Pedestrian", None, None)
     assert (car.label, car.residual_m, car.residual_static_m) == ("Vehicle", 0.2, round(1 / 3, 4))
-    assert (car.size_m, car.seen_m, car.faces, car.observations) == ((4.0, 2.0, 1.5), (3.0, 1.0, 1.5), 2, 3)
+    assert (car.size_m, car.seen_m, car.faces, car.observations) == (
+        (4.0, 2.0, 1.5),
+        (3.0, 1.0, 1.5),
+        2,
+        3,
+    )
     assert car.confidence == 0.7
 
 
@@ -274,9 +304,13 @@ def test_changes_count_only_voxels_known_in_both():
     spec = GridSpec("cartesian", (4, 1, 1), (0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
 
     def grid(labels, counts):
-        return Grid(spec, np.array(labels, np.uint8).reshape(spec.size), np.array(counts).reshape(spec.size))
+        return Grid(
+            spec, np.array(labels, np.uint8).reshape(spec.size), np.array(counts).reshape(spec.size)
+        )
 
-    assert Changes.between(grid([1, 2, 3, 0], [1, 1, 1, 0]), grid([1, 5, 0, 4], [2, 2, 0, 1])) == Changes(2, 1)
+    assert Changes.between(
+        grid([1, 2, 3, 0], [1, 1, 1, 0]), grid([1, 5, 0, 4], [2, 2, 0, 1])
+    ) == Changes(2, 1)
 
 
 def test_more_lines_in_a_text_file_are_no_change():
@@ -291,4 +325,6 @@ def test_a_run_into_the_source_digests_what_lies_beside_the_grid(tmp_path):
     folder = passing_car.write_sequence(tmp_path, frames=4)
     make(folder)
     assert set(report_in(folder).digests) >= {"points", "labels", "flow", f"{GRID}/labels"}
-    assert FolderSink(folder).sequence("cartesian").read_document(layout.report_file(GRID)) is not None
+    assert (
+        FolderSink(folder).sequence("cartesian").read_document(layout.report_file(GRID)) is not None
+    )

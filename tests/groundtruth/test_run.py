@@ -29,7 +29,9 @@ GOLDEN = {
 }
 
 
-@pytest.mark.parametrize(("variant", "workers"), [(variant, 1) for variant in GOLDEN] + [("cartesian", 2)])
+@pytest.mark.parametrize(
+    ("variant", "workers"), [(variant, 1) for variant in GOLDEN] + [("cartesian", 2)]
+)
 def test_the_golden_files_come_out_byte_for_byte(golden_capture, tmp_path, variant, workers):
     spec, free_step = GOLDEN[variant]
     result = regrid(
@@ -58,7 +60,10 @@ def test_the_golden_files_come_out_byte_for_byte(golden_capture, tmp_path, varia
 def test_what_we_add_stands_beside_the_published_files_only(golden_capture, tmp_path):
     regrid(golden_capture, GridSpec.published(), tmp_path, run=Run(workers=1))
     added = set(read_tree(tmp_path / "cartesian")) - set(read_tree(golden_capture / "cartesian"))
-    assert added == {*(f"instances/{frame:06d}.label" for frame in range(3)), "evaluation/carlasc-report.json"}
+    assert added == {
+        *(f"instances/{frame:06d}.label" for frame in range(3)),
+        "evaluation/carlasc-report.json",
+    }
     instances = np.fromfile(tmp_path / "cartesian/instances/000001.label", "<u4")
     assert np.array_equal(instances, Capture(golden_capture).read(0, 101).scan.instances)
 
@@ -102,17 +107,24 @@ def test_sensors_that_stand_turned_see_the_same_world(tmp_path):
         @ rotation_z(1.1)
         @ np.array([[1, 0, 0, 0], [0, 0.8, -0.6, 0], [0, 0.6, 0.8, 0], [0, 0, 0, 1]])
     )
-    points = transform_points(invert(tilt), transform_points(other.world_T_sensor, other.scan.points))
-    rotated = replace(other, scan=replace(other.scan, points=points.astype(np.float32)), world_T_sensor=tilt)
+    points = transform_points(
+        invert(tilt), transform_points(other.world_T_sensor, other.scan.points)
+    )
+    rotated = replace(
+        other, scan=replace(other.scan, points=points.astype(np.float32)), world_T_sensor=tilt
+    )
     for writer, second in ((upright, other), (turned, rotated)):
         writer.write(0, 0, ego)
         writer.write(1, 0, second)
-        regrid(
-            writer.location, SMALL, voting=Voting(free_step_m=1000), run=Run(workers=1)
-        )  # endpoints alone: rays start elsewhere
-    grids = [FolderSource(w.out).sequences()["cartesian"].grid("evaluation_32x32x4", 0) for w in (upright, turned)]
+        # endpoints alone: rays start elsewhere
+        regrid(writer.location, SMALL, voting=Voting(free_step_m=1000), run=Run(workers=1))
+    grids = [
+        FolderSource(w.out).sequences()["cartesian"].grid("evaluation_32x32x4", 0)
+        for w in (upright, turned)
+    ]
     assert grids[0].counts.sum() > 100
-    assert np.mean(grids[0].labels == grids[1].labels) > 0.999  # float32 may move a point over a cell's edge
+    # float32 may move a point over a cell's edge
+    assert np.mean(grids[0].labels == grids[1].labels) > 0.999
 
 
 def test_votes_are_kept_when_asked_for_and_added_to_a_grid_that_is_there(tmp_path):
@@ -156,7 +168,11 @@ def test_a_run_goes_on_when_the_capture_has_grown(tmp_path):
 
 def test_frames_are_chosen_by_their_number_in_the_capture_and_renumbered(tmp_path):
     capture = write_capture(tmp_path, frames=5)
-    for chosen, expected in (((101, 103), [101, 102]), ((None, 102), [100, 101]), ((103, None), [103, 104])):
+    for chosen, expected in (
+        ((101, 103), [101, 102]),
+        ((None, 102), [100, 101]),
+        ((103, None), [103, 104]),
+    ):
         out = tmp_path / f"out{expected[0]}"
         regrid(tmp_path, SMALL, out, frames=chosen, run=Run(workers=1))
         (sequence,) = FolderSource(out).sequences().values()
@@ -216,10 +232,20 @@ def test_raw_itself_as_the_source_writes_beside_it(tmp_path):
 def test_progress_counts_what_was_there_and_ends_at_the_total(tmp_path):
     write_capture(tmp_path)
     seen: list[tuple[int, int]] = []
-    regrid(tmp_path, SMALL, run=Run(workers=1, progress=lambda *counts: seen.append(counts)), frames=(100, 102))
+    regrid(
+        tmp_path,
+        SMALL,
+        run=Run(workers=1, progress=lambda *counts: seen.append(counts)),
+        frames=(100, 102),
+    )
     assert seen == [(0, 2), (1, 2), (2, 2)]
     seen.clear()
-    regrid(tmp_path, SMALL, run=Run(workers=1, progress=lambda *counts: seen.append(counts)), frames=(100, 102))
+    regrid(
+        tmp_path,
+        SMALL,
+        run=Run(workers=1, progress=lambda *counts: seen.append(counts)),
+        frames=(100, 102),
+    )
     assert seen == [(2, 2)]
 
 
@@ -277,14 +303,19 @@ def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_p
     for name in sequence.fields():
         for frame in range(6):
             assert np.array_equal(writer.fields[name, frame], sequence.read(name, frame)), name
-    with pytest.raises(ConflictError, match="memory: this store cannot replace its grid evaluation_32x32x4"):
+    with pytest.raises(
+        ConflictError, match="memory: this store cannot replace its grid evaluation_32x32x4"
+    ):
         regrid(tmp_path, SMALL, sink, run=Run(workers=1), overwrite=True)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"observe": "capture"}, "observe: expected one of FromCapture, FromScans, FromGrid, found 'capture'"),
+        (
+            {"observe": "capture"},
+            "observe: expected one of FromCapture, FromScans, FromGrid, found 'capture'",
+        ),
         ({"frames": (5, 5)}, "frames: expected a range that holds a frame, found 5:5"),
         ({"frames": "a:b"}, "frames: expected .*, found 'a:b'"),
         ({"name": "a/b"}, "name: expected letters, digits and _ . [+] -, found 'a/b'"),
@@ -294,10 +325,15 @@ def test_a_store_with_one_writer_gets_its_frames_in_order_from_the_workers(tmp_p
             {"name": "velodyne"},
             "name: expected a name that the layout does not reserve, found 'velodyne'",
         ),
-        ({"name": "poses.txt"}, "name: expected a name that the layout does not .*, found 'poses.txt'"),
+        (
+            {"name": "poses.txt"},
+            "name: expected a name that the layout does not .*, found 'poses.txt'",
+        ),
     ],
 )
-def test_arguments_that_are_not_valid_are_refused_before_anything_is_written(tmp_path, arguments, message):
+def test_arguments_that_are_not_valid_are_refused_before_anything_is_written(
+    tmp_path, arguments, message
+):
     write_capture(tmp_path, frames=1)
     with pytest.raises(ArgumentError, match=message):
         regrid(tmp_path, SMALL, **arguments)
@@ -318,7 +354,10 @@ def test_voting_checks_itself(settings, message):
 
 
 def test_a_source_object_must_be_told_where_to_write(golden_capture):
-    with pytest.raises(ArgumentError, match="out: expected where to write, as the source is not a folder, found None"):
+    with pytest.raises(
+        ArgumentError,
+        match="out: expected where to write, as the source is not a folder, found None",
+    ):
         regrid(FolderSource(golden_capture), SMALL, observe=FromScans())
     with pytest.raises(ArgumentError, match="source: expected a folder with a capture"):
         regrid(FolderSource(golden_capture), SMALL, golden_capture, observe=FromCapture())
@@ -326,7 +365,9 @@ def test_a_source_object_must_be_told_where_to_write(golden_capture):
 
 @pytest.mark.parametrize("coordinates", ["cartesian", "cylindrical"])
 def test_a_real_scan_of_a_street_gives_a_sane_grid(real, tmp_path, coordinates):
-    points = np.fromfile(real / "kitti_000008.bin", "<f4").reshape(-1, 4)[:, :3] * np.float32([1, -1, 1])
+    points = np.fromfile(real / "kitti_000008.bin", "<f4").reshape(-1, 4)[:, :3] * np.float32(
+        [1, -1, 1]
+    )
     recording = make_recording()
     scan = replace(
         recording.scan,

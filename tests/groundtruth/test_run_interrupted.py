@@ -30,10 +30,23 @@ def capture(tmp_path_factory):
 
 
 def _interrupt(root: Path, out: Path, kind: signal.Signals, workers: int) -> tuple[int, str]:
-    """Return the exit code and stderr of a run that was sent a signal after 5 frames, once all its processes are gone."""
-    command = [sys.executable, interrupted.__file__, kind.name, "5", "regrid", str(root), "-o", str(out)]
+    """Return the exit code and stderr of a run that was sent a signal after 5 frames, once all its
+    processes are gone.
+    """
+    command = [
+        sys.executable,
+        interrupted.__file__,
+        kind.name,
+        "5",
+        "regrid",
+        str(root),
+        "-o",
+        str(out),
+    ]
     options = ["--preset", "coarse", "--workers", str(workers)]
-    with subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    with subprocess.Popen(
+        [*command, *options], stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
         _, stderr = process.communicate(timeout=60)
     with suppress(ProcessLookupError):
         for _ in range(500):
@@ -44,7 +57,9 @@ def _interrupt(root: Path, out: Path, kind: signal.Signals, workers: int) -> tup
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
-def test_ctrl_c_stops_at_once_with_whole_files_and_the_next_run_finishes(capture, tmp_path, workers):
+def test_ctrl_c_stops_at_once_with_whole_files_and_the_next_run_finishes(
+    capture, tmp_path, workers
+):
     root, whole = capture
     start = time.monotonic()
     code, stderr = _interrupt(root, tmp_path, signal.SIGINT, workers)
@@ -66,7 +81,9 @@ def test_a_killed_run_is_finished_by_the_next_one(capture, tmp_path):
     root, whole = capture
     assert _interrupt(root, tmp_path, signal.SIGKILL, 2)[0] == -signal.SIGKILL
     half = {name for name in read_tree(tmp_path) if name.endswith(".part")}
-    assert {name: data for name, data in read_tree(tmp_path).items() if name not in half}.items() < whole.items()
+    assert {
+        name: data for name, data in read_tree(tmp_path).items() if name not in half
+    }.items() < whole.items()
     result = regrid(root, SPEC, tmp_path, run=Run(workers=1))
     assert result.made + result.skipped == FRAMES and result.skipped >= 5
     assert read_tree(tmp_path) == whole

@@ -1,4 +1,6 @@
-"""A run in parts: each makes its own frames, whatever order they run in, and the last one writes the report."""
+"""A run in parts: each makes its own frames, whatever order they run in, and the last one writes
+the report.
+"""
 
 import json
 import subprocess
@@ -42,16 +44,25 @@ def test_parts_in_any_order_make_what_one_run_makes(source, tmp_path, order):
 
 
 def test_frames_are_dealt_out_evenly_whatever_exists_already(source, tmp_path):
-    made = [regrid(source[0], SPEC, tmp_path / "a", run=Run(part=Part(n, 4), workers=1)).made for n in range(1, 5)]
+    made = [
+        regrid(source[0], SPEC, tmp_path / "a", run=Run(part=Part(n, 4), workers=1)).made
+        for n in range(1, 5)
+    ]
     assert made == [3, 4, 3, 4]
     assert regrid(source[0], SPEC, tmp_path / "a", run=Run(part=Part(2, 4), workers=1)).made == 0
     (tmp_path / "a/A/cartesian/evaluation_16x16x4/000005.label").unlink()
-    made = [regrid(source[0], SPEC, tmp_path / "a", run=Run(part=Part(n, 4), workers=1)).made for n in (1, 3, 4, 2)]
+    made = [
+        regrid(source[0], SPEC, tmp_path / "a", run=Run(part=Part(n, 4), workers=1)).made
+        for n in (1, 3, 4, 2)
+    ]
     assert made == [0, 0, 0, 1]
 
 
 def test_more_parts_than_frames_leave_some_without_work(source, tmp_path):
-    results = [regrid(source[0], SPEC, tmp_path, run=Run(part=Part(n, 20), workers=1)) for n in range(1, 21)]
+    results = [
+        regrid(source[0], SPEC, tmp_path, run=Run(part=Part(n, 20), workers=1))
+        for n in range(1, 21)
+    ]
     assert sorted({result.made for result in results}) == [0, 1]
     assert read_tree(tmp_path) == source[1]
 
@@ -62,7 +73,10 @@ def test_the_report_waits_for_a_frame_that_failed(tmp_path):
     labels = broken / "raw/labels0/102.npy"
     good = labels.read_bytes()
     labels.write_bytes(good[:-4])
-    assert len(regrid(broken, SPEC, tmp_path / "out", run=Run(part=Part(2, 2), workers=1)).failures) == 1
+    assert (
+        len(regrid(broken, SPEC, tmp_path / "out", run=Run(part=Part(2, 2), workers=1)).failures)
+        == 1
+    )
     assert not regrid(broken, SPEC, tmp_path / "out", run=Run(part=Part(1, 2), workers=1)).failures
     report = tmp_path / "out/cartesian/evaluation_16x16x4/carlasc-report.json"
     assert not report.exists()
@@ -73,11 +87,16 @@ def test_the_report_waits_for_a_frame_that_failed(tmp_path):
 
 def test_scans_are_merged_over_the_borders_of_parts(source, tmp_path):
     regrid(source[0], SPEC, tmp_path / "scans", run=Run(workers=1))
-    options = {"observe": FromScans(window=(-2, 2), poses=PoseOptions(force=True)), "name": "merged"}
+    options = {
+        "observe": FromScans(window=(-2, 2), poses=PoseOptions(force=True)),
+        "name": "merged",
+    }
     for out in ("one", "parts"):
         for number in (1,) if out == "one" else (2, 1):
             part = Part(number, 1 if out == "one" else 2)
-            regrid(tmp_path / "scans", SPEC, tmp_path / out, run=Run(part=part, workers=1), **options)
+            regrid(
+                tmp_path / "scans", SPEC, tmp_path / out, run=Run(part=part, workers=1), **options
+            )
     assert read_tree(tmp_path / "one") == read_tree(tmp_path / "parts")
 
 
@@ -86,8 +105,17 @@ def test_commands_that_start_at_once_lose_nothing(source, tmp_path, same):
     """Four processes: the four parts of a run, or four times the whole run."""
     parts = [[] if same else ["--part", f"{n}/4"] for n in range(1, 5)]
     options = ["--size", "16,16,4", "--workers", "1", "-o", str(tmp_path)]
-    command = [sys.executable, "-c", "from carlasc.cli import main; main()", "regrid", str(source[0]), *options]
-    running = [subprocess.Popen([*command, *part], stderr=subprocess.PIPE, text=True) for part in parts]
+    command = [
+        sys.executable,
+        "-c",
+        "from carlasc.cli import main; main()",
+        "regrid",
+        str(source[0]),
+        *options,
+    ]
+    running = [
+        subprocess.Popen([*command, *part], stderr=subprocess.PIPE, text=True) for part in parts
+    ]
     said = [process.communicate(timeout=120)[1] for process in running]
     assert [process.returncode for process in running] == [0, 0, 0, 0], said
     assert read_tree(tmp_path) == source[1]
@@ -100,7 +128,14 @@ def test_a_run_with_other_settings_that_was_a_little_faster_is_found(source, tmp
 
     def slowly(job):
         monkeypatch.setattr(run, "_begin", begin)
-        regrid(source[0] / "A", SPEC, tmp_path, voting=Voting(free_step_m=0.7), name="g", run=Run(workers=1))
+        regrid(
+            source[0] / "A",
+            SPEC,
+            tmp_path,
+            voting=Voting(free_step_m=0.7),
+            name="g",
+            run=Run(workers=1),
+        )
         begin(job)
 
     monkeypatch.setattr(run, "_begin", slowly)

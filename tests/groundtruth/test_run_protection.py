@@ -32,14 +32,19 @@ def made(tmp_path):
         ({"voting": Voting(free_step_m=0.5)}, "carlasc.free_step_m 1.5 where this run has 0.5"),
         ({"voting": Voting("sample")}, 'carlasc.voting "sensor" where this run has "sample"'),
         ({"frames": (100, 102)}, 'carlasc.frames "100:" where this run has "100:102"'),
-        ({"spec": SMALL.with_bounds((-9, -9, -2), (9, 9, 1))}, r"min_bound .* where this run has \[-9.0, -9.0, -2.0\]"),
+        (
+            {"spec": SMALL.with_bounds((-9, -9, -2), (9, 9, 1))},
+            r"min_bound .* where this run has \[-9.0, -9.0, -2.0\]",
+        ),
     ],
 )
 def test_other_settings_stop_the_run_and_name_the_difference(made, settings, difference):
     before = read_tree(made)
     arguments = {"spec": SMALL} | settings
     spec = arguments.pop("spec")
-    with pytest.raises(ConflictError, match=f"params.json: .* found {difference}: .*`name`.*`overwrite=True`"):
+    with pytest.raises(
+        ConflictError, match=f"params.json: .* found {difference}: .*`name`.*`overwrite=True`"
+    ):
         regrid(made, spec, run=Run(workers=1), **arguments)
     assert read_tree(made) == before
 
@@ -78,18 +83,24 @@ def test_a_grid_of_carlasc_0_1_0_is_continued_and_compared(made):
         regrid(made, SMALL, run=Run(workers=1))
 
 
-def test_a_grid_that_carlasc_0_1_0_made_from_scans_is_not_continued_since_scans_give_other_grids_now(tmp_path):
+def test_a_grid_that_carlasc_0_1_0_made_from_scans_is_not_continued_since_scans_give_other_grids_now(
+    tmp_path,
+):
     street = passing_car.write_sequence(tmp_path, frames=4)
     regrid(street, passing_car.SPEC, name="mine", run=Run(workers=1))
     path = street / "cartesian/mine/params.json"
     params = json.loads(path.read_bytes())
-    record = {key: value for key, value in params["carlasc"].items() if key not in ("format", "rule")}
+    record = {
+        key: value for key, value in params["carlasc"].items() if key not in ("format", "rule")
+    }
     path.write_text(json.dumps(params | {"carlasc": {"version": "0.1.0", **record}}))
     before = read_tree(street)
     with pytest.raises(ConflictError, match="carlasc.rule 1 where this run has 3"):
         regrid(street, passing_car.SPEC, name="mine", run=Run(workers=1))
     assert read_tree(street) == before
-    assert regrid(street, passing_car.SPEC, name="mine", run=Run(workers=1), overwrite=True).made == 4
+    assert (
+        regrid(street, passing_car.SPEC, name="mine", run=Run(workers=1), overwrite=True).made == 4
+    )
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -97,7 +108,10 @@ def test_a_grid_that_carlasc_0_1_0_made_from_scans_is_not_continued_since_scans_
 def test_a_record_of_a_newer_format_is_refused_with_the_advice_to_upgrade(made, newer, overwrite):
     edit_record(made, format=newer)
     before = read_tree(made)
-    with pytest.raises(FormatError, match=f"params.json: .* format 1 or older, found format {newer}: upgrade carlasc"):
+    with pytest.raises(
+        FormatError,
+        match=f"params.json: .* format 1 or older, found format {newer}: upgrade carlasc",
+    ):
         regrid(made, SMALL, run=Run(workers=1), overwrite=overwrite)
     assert read_tree(made) == before
 
@@ -116,11 +130,17 @@ def test_overwriting_leaves_nothing_of_the_old_grid(made, tmp_path_factory):
     regrid(made, SMALL, run=Run(workers=1), voting=Voting(keep=True))
     for root in (made, clean):
         result = regrid(
-            root, SMALL, run=Run(workers=1), voting=Voting(free_step_m=0.5), frames=(100, 102), overwrite=True
+            root,
+            SMALL,
+            run=Run(workers=1),
+            voting=Voting(free_step_m=0.5),
+            frames=(100, 102),
+            overwrite=True,
         )
         assert result.made == 2
     ours, theirs = (
-        {name: data for name, data in read_tree(root).items() if name.startswith(GRID)} for root in (made, clean)
+        {name: data for name, data in read_tree(root).items() if name.startswith(GRID)}
+        for root in (made, clean)
     )
     reports = [json.loads(files.pop(f"{GRID}/{layout.REPORT}")) for files in (ours, theirs)]
     assert ours == theirs
@@ -171,7 +191,8 @@ def test_scans_of_another_capture_stop_the_run(made, overwrite):
     path.write_bytes(b"\0" * len(path.read_bytes()))
     (made / GRID / "000001.bin").unlink()
     with pytest.raises(
-        ConflictError, match=r"velodyne/000001.bin: expected the data of this run, found other data at frame 1"
+        ConflictError,
+        match=r"velodyne/000001.bin: expected the data of this run, found other data at frame 1",
     ):
         regrid(made, SMALL, run=Run(workers=1), overwrite=overwrite)
     assert not np.fromfile(path, np.uint8).any()
@@ -184,7 +205,10 @@ def test_poses_and_times_of_another_capture_stop_the_run(made, document):
     lines[1] = "9" + lines[1].lstrip("-")
     path.write_text("\n".join(lines) + "\n")
     before = read_tree(made)
-    with pytest.raises(ConflictError, match=f"{document}: expected the data of this run, found other data at frame 1"):
+    with pytest.raises(
+        ConflictError,
+        match=f"{document}: expected the data of this run, found other data at frame 1",
+    ):
         regrid(made, GridSpec.published().with_size((16, 16, 4)), run=Run(workers=1))
     assert read_tree(made) == before
 
@@ -200,7 +224,10 @@ def test_the_last_digits_of_poses_may_differ(made):
 
 def test_a_sequence_in_another_frame_or_of_other_classes_stops_the_run(made):
     (made / "cartesian/carlasc.json").write_text('{"frame": "kitti"}')
-    with pytest.raises(ConflictError, match="carlasc.json: expected the axes left and the classes carla, found right"):
+    with pytest.raises(
+        ConflictError,
+        match="carlasc.json: expected the axes left and the classes carla, found right",
+    ):
         regrid(made, SMALL, run=Run(workers=1))
 
 

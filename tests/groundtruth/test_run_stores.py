@@ -58,14 +58,23 @@ def test_a_run_on_a_finished_store_finds_that_everything_exists(source, tmp_path
     assert (again.made, again.skipped) == (0, FRAMES)
     assert read_tree(tmp_path / "x.zarr") == source[2]
     with pytest.raises(ConflictError, match="free_step_m"):
-        regrid(source[0], SPEC, tmp_path / "x.zarr", voting=Voting(free_step_m=0.5), run=Run(workers=1))
+        regrid(
+            source[0], SPEC, tmp_path / "x.zarr", voting=Voting(free_step_m=0.5), run=Run(workers=1)
+        )
 
 
 def test_a_grid_is_added_to_a_store_that_can_be_read_meanwhile(source, tmp_path):
     regrid(source[0], SPEC, tmp_path / "x.zarr", run=Run(workers=1))
     before = carlasc.open(tmp_path / "x.zarr").sequences()["cartesian"]
     observe = FromScans(window=(0, 0), poses=PoseOptions(force=True))
-    regrid(tmp_path / "x.zarr", SPEC, tmp_path / "x.zarr", observe=observe, name="own", run=Run(workers=1))
+    regrid(
+        tmp_path / "x.zarr",
+        SPEC,
+        tmp_path / "x.zarr",
+        observe=observe,
+        name="own",
+        run=Run(workers=1),
+    )
     assert before.grid("evaluation_16x16x4", 3).labels.shape == (16, 16, 4)
     after = carlasc.open(tmp_path / "x.zarr").sequences()["cartesian"]
     assert {"own/labels", "evaluation_16x16x4/labels"} <= after.fields()
@@ -105,7 +114,17 @@ def test_frames_that_fail_are_left_out_and_added_when_they_are_corrected(tmp_pat
 
 
 def _command(source, out, *options):
-    arguments = ["regrid", str(source), "-o", str(out), "--size", "16,16,4", "--workers", "1", *options]
+    arguments = [
+        "regrid",
+        str(source),
+        "-o",
+        str(out),
+        "--size",
+        "16,16,4",
+        "--workers",
+        "1",
+        *options,
+    ]
     return [sys.executable, "-c", "from carlasc.cli import main; main()", *arguments]
 
 
@@ -114,7 +133,10 @@ def _command(source, out, *options):
 def test_commands_that_start_at_once_lose_nothing(source, tmp_path, same):
     out = tmp_path / "x.zarr"
     parts = [[] if same else ["--part", f"{n}/3"] for n in range(1, 4)]
-    running = [subprocess.Popen(_command(source[0], out, *p), stderr=subprocess.PIPE, text=True) for p in parts]
+    running = [
+        subprocess.Popen(_command(source[0], out, *p), stderr=subprocess.PIPE, text=True)
+        for p in parts
+    ]
     said = [process.communicate(timeout=120)[1] for process in running]
     assert [process.returncode for process in running] == [0, 0, 0], said
     assert read_tree(out) == source[2]
@@ -147,7 +169,9 @@ def test_the_clocks_of_machines_do_not_matter(source, tmp_path):
     assert read_tree(out) == source[2]
 
 
-def test_a_disk_that_is_full_ends_the_command_and_the_next_one_finishes(source, tmp_path, monkeypatch):
+def test_a_disk_that_is_full_ends_the_command_and_the_next_one_finishes(
+    source, tmp_path, monkeypatch
+):
     from carlasc.storage.transport import targets
 
     write, left = targets.write_atomic, [6]
@@ -209,7 +233,9 @@ def test_a_store_without_its_last_part_is_finished_by_hand(source, tmp_path):
     regrid(source[0], SPEC, out, run=Run(part=Part(1, 3), workers=1))
     ran = CliRunner().invoke(app, ["finish", str(out)])
     assert ran.exit_code == 1
-    assert ran.stderr.startswith(f"carlasc: {out}: expected all frames that the run announced, found 20 of ")
+    assert ran.stderr.startswith(
+        f"carlasc: {out}: expected all frames that the run announced, found 20 of "
+    )
     assert ran.stderr.count("\n") == 1 and "give `--incomplete`" in ran.stderr
     ran = CliRunner().invoke(app, ["finish", str(out), "--incomplete", "--json"])
     assert ran.exit_code == 0

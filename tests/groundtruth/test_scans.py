@@ -44,7 +44,12 @@ def grid_of(sequence, name, frame=FRAME):
 def make(sequence, name, frames=(FRAME, FRAME + 1), spec=passing_car.SPEC, **options):
     observe = FromScans(**options.pop("settings", {}))
     return carlasc.regrid(
-        sequence, spec, name=name, frames=frames, observe=observe, **{"run": Run(workers=1), **options}
+        sequence,
+        spec,
+        name=name,
+        frames=frames,
+        observe=observe,
+        **{"run": Run(workers=1), **options},
     )
 
 
@@ -83,7 +88,9 @@ def test_alignment_completes_the_car_that_one_scan_sees_in_part(street, truth, s
     moving = slice(0, 128), slice(64, 84)  # the right half: the parked car stands on the left
     real = (truth.labels[moving] == VEHICLE).sum()
     seen = {
-        name: int(((grid_of(street, name).labels == VEHICLE) & (truth.labels == VEHICLE))[moving].sum())
+        name: int(
+            ((grid_of(street, name).labels == VEHICLE) & (truth.labels == VEHICLE))[moving].sum()
+        )
         for name in scores
     }
     assert seen["drop"] == 0
@@ -128,7 +135,14 @@ def test_a_frame_does_not_depend_on_which_frames_a_run_makes(street):
 
 def test_processes_make_the_same_grids(street):
     make(street, "one", frames=(18, 22))
-    carlasc.regrid(street, passing_car.SPEC, name="two", frames=(18, 22), observe=FromScans(), run=Run(workers=2))
+    carlasc.regrid(
+        street,
+        passing_car.SPEC,
+        name="two",
+        frames=(18, 22),
+        observe=FromScans(),
+        run=Run(workers=2),
+    )
     for frame in range(18, 22):
         assert (grid_of(street, "one", frame).labels == grid_of(street, "two", frame).labels).all()
 
@@ -155,7 +169,8 @@ def test_times_that_do_not_rise_are_named(tmp_path):
     times[22] = times[21]
     path.write_bytes(layout.encode_times(times))
     with pytest.raises(
-        FormatError, match=r"times.txt: expected increasing times, found 2.1 s and 2.1 s at frames 21 and 22"
+        FormatError,
+        match=r"times.txt: expected increasing times, found 2.1 s and 2.1 s at frames 21 and 22",
     ):
         make(street, "broken")
     path.unlink()
@@ -169,11 +184,19 @@ def test_frames_keep_their_numbers_and_the_record_says_how(street):
         f"0000{n}.label" for n in (30, 31, 32)
     ]
     record = json.loads((street / "cartesian" / "numbered" / "params.json").read_text())["carlasc"]
-    assert (record["observe"], record["dynamic"], record["window"], record["stride"]) == ("scans", "align", "-4:4", 2)
+    assert (record["observe"], record["dynamic"], record["window"], record["stride"]) == (
+        "scans",
+        "align",
+        "-4:4",
+        2,
+    )
     assert record["motion"] == "flow"
     with pytest.raises(ConflictError, match="stride|window"):
         make(street, "numbered", frames=(30, 33))
-    assert make(street, "numbered", frames=(30, 34), settings={"window": (-4, 4), "stride": 2}).skipped == 3
+    assert (
+        make(street, "numbered", frames=(30, 34), settings={"window": (-4, 4), "stride": 2}).skipped
+        == 3
+    )
 
 
 def test_votes_for_things_and_for_free_space_are_kept_apart(street):
@@ -184,10 +207,11 @@ def test_votes_for_things_and_for_free_space_are_kept_apart(street):
     counts = np.bincount(votes["voxel"], votes["votes"], grid.spec.num_voxels)
     known = grid.known.reshape(-1)
     assert (counts[known] == grid.counts.reshape(-1)[known]).all()
-    assert (
-        0 < np.count_nonzero(counts[~known]) < 0.05 * np.count_nonzero(known)
-    )  # where traffic passes, or a body hides them
-    contested = np.intersect1d(votes["voxel"][votes["label"] == 0], votes["voxel"][votes["label"] > 0])
+    # where traffic passes, or a body hides them
+    assert 0 < np.count_nonzero(counts[~known]) < 0.05 * np.count_nonzero(known)
+    contested = np.intersect1d(
+        votes["voxel"][votes["label"] == 0], votes["voxel"][votes["label"] > 0]
+    )
     assert len(contested)
     occupied_labels = grid.labels.reshape(-1)[votes["voxel"][votes["label"] == 0]]
     assert (occupied_labels > 0).any()  # free votes that lost
@@ -266,7 +290,9 @@ def test_rays_through_a_box_are_those_a_plain_look_at_all_rays_finds():
 class TestBadInput:
     def test_no_poses_offer_kiss_icp_if_those_of_the_file_are_asked_for(self, tmp_path):
         street = passing_car.write_sequence(tmp_path, frames=3, poses=False)
-        with pytest.raises(MissingDataError, match=r"poses.txt: expected poses.*poses=PoseOptions\(\"kiss-icp\"\)"):
+        with pytest.raises(
+            MissingDataError, match=r"poses.txt: expected poses.*poses=PoseOptions\(\"kiss-icp\"\)"
+        ):
             make(street, "x", frames=None, settings={"poses": PoseOptions("file")})
 
     @pytest.mark.parametrize("source", ["auto", "kiss-icp"])
@@ -275,7 +301,9 @@ class TestBadInput:
         folder = write_drive(tmp_path / "Street" / "cartesian", drive(8, speed_m=0.8))
         (folder / "poses.txt").unlink()
         result = make(tmp_path, "x", frames=(2, 4), settings={"poses": PoseOptions(source)})
-        assert sum("they were estimated from the scans" in note for note in result.notes) == (source == "auto")
+        assert sum("they were estimated from the scans" in note for note in result.notes) == (
+            source == "auto"
+        )
         record = json.loads((folder / "x" / "params.json").read_bytes())["carlasc"]
         assert record["poses"] == "kiss-icp"
         again = make(tmp_path, "x", frames=(2, 5), settings={"poses": PoseOptions(source)})
@@ -295,7 +323,9 @@ class TestBadInput:
         (note,) = make(street, "x", frames=(10, 11)).notes
         assert "cartesian: free space shows 1 actors that move" in note
         assert ", although no field of the data shows it" in note
-        (note,) = make(street, "y", frames=(10, 11), settings={"motion": MotionOptions("none")}).notes
+        (note,) = make(
+            street, "y", frames=(10, 11), settings={"motion": MotionOptions("none")}
+        ).notes
         assert "cartesian: no field shows motion: all points were treated as static" in note
         assert make(street, "z", frames=(10, 11), settings={"dynamic": "tube"}).notes == ()
 
@@ -317,7 +347,9 @@ class TestBadInput:
         poses = layout.decode_poses(path.read_bytes(), "poses.txt")
         poses[4:, 0, 3] += 30
         path.write_bytes(layout.encode_poses(poses))
-        with pytest.raises(FormatError, match=r"poses.txt: .*jump of 301 m/s.* at frame 4 .*`force=True`"):
+        with pytest.raises(
+            FormatError, match=r"poses.txt: .*jump of 301 m/s.* at frame 4 .*`force=True`"
+        ):
             make(street, "x", frames=None)
         assert make(street, "x", frames=None, settings={"poses": PoseOptions(force=True)}).made == 6
 
@@ -325,7 +357,17 @@ class TestBadInput:
         street = passing_car.write_sequence(tmp_path, frames=30)
         path = street / "cartesian" / "velodyne" / "000002.bin"
         path.write_bytes(path.read_bytes()[:-3])
-        arguments = ["regrid", str(street), "--preset", "coarse", "--window=-1:1", "--workers", "1", "--frames", "0:30"]
+        arguments = [
+            "regrid",
+            str(street),
+            "--preset",
+            "coarse",
+            "--window=-1:1",
+            "--workers",
+            "1",
+            "--frames",
+            "0:30",
+        ]
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == 1
         assert "000002.bin" in result.stderr
@@ -335,17 +377,23 @@ class TestFromFinerGrids:
     def test_a_coarser_grid_of_the_finest_there_is(self, street):
         fine = replace(passing_car.SPEC, size=(256, 256, 16))
         make(street, "fine", frames=(20, 22), spec=fine)
-        result = carlasc.regrid(street, passing_car.SPEC, name="coarse", observe=FromGrid("fine"), run=Run(workers=1))
+        result = carlasc.regrid(
+            street, passing_car.SPEC, name="coarse", observe=FromGrid("fine"), run=Run(workers=1)
+        )
         assert result.made == 2
         coarse, finer = grid_of(street, "coarse", 20), grid_of(street, "fine", 20)
         assert coarse.counts.sum() == finer.counts.sum()
-        record = json.loads((street / "cartesian" / "coarse" / "params.json").read_text())["carlasc"]
+        record = json.loads((street / "cartesian" / "coarse" / "params.json").read_text())[
+            "carlasc"
+        ]
         assert (record["observe"], record["grid"]) == ("grid", "fine")
 
     def test_finer_than_what_is_there_is_refused_with_the_reason(self, street):
         make(street, "base")
         with pytest.raises(ArgumentError, match="new measurements"):
-            carlasc.regrid(street, GridSpec.published().with_resolution(0.1), observe=FromGrid("base"))
+            carlasc.regrid(
+                street, GridSpec.published().with_resolution(0.1), observe=FromGrid("base")
+            )
 
     def test_a_grid_that_is_not_there_is_named(self, street):
         with pytest.raises(MissingDataError, match="the grid ghost"):

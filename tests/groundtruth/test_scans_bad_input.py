@@ -1,4 +1,6 @@
-"""Scans that are wrong in some way: the run goes on where it can, keeps the road, and says what was done."""
+"""Scans that are wrong in some way: the run goes on where it can, keeps the road, and says what was
+done.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +21,12 @@ VEHICLE = CARLA.id_of("Vehicle")
 
 def make(street, name="x", frames=(FRAME, FRAME + 1), **options):
     result = carlasc.regrid(
-        street, passing_car.SPEC, name=name, frames=frames, observe=FromScans(**options), run=Run(workers=1)
+        street,
+        passing_car.SPEC,
+        name=name,
+        frames=frames,
+        observe=FromScans(**options),
+        run=Run(workers=1),
     )
     assert result.failures == ()
     return result
@@ -45,7 +52,9 @@ def road(grid):
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
     """Return the grid of scans in which nothing is wrong."""
-    street = passing_car.write_sequence(tmp_path_factory.mktemp("good"), ("labels", "instances"), FRAMES)
+    street = passing_car.write_sequence(
+        tmp_path_factory.mktemp("good"), ("labels", "instances"), FRAMES
+    )
     make(street)
     return grid_of(street)
 
@@ -94,7 +103,9 @@ def test_a_car_that_appears_from_nowhere_is_where_it_is_seen(tmp_path, good):
 
     change(street, "labels", only_from)
     change(
-        street, "instances", lambda frame, ids: ids if frame >= FRAME else np.where(ids == 9, 0, ids).astype(np.uint32)
+        street,
+        "instances",
+        lambda frame, ids: ids if frame >= FRAME else np.where(ids == 9, 0, ids).astype(np.uint32),
     )
     make(street, frames=(FRAME - 6, FRAME + 1))
     here, before = grid_of(street), grid_of(street, frame=FRAME - 6)
@@ -132,7 +143,8 @@ def test_times_that_fall_are_one_line(street):
     times[7] = 0.2
     (street / "cartesian" / layout.TIMES).write_bytes(layout.encode_times(times))
     with pytest.raises(
-        FormatError, match=r"times.txt: expected increasing times, found 0.6 s and 0.2 s at frames 6 and 7"
+        FormatError,
+        match=r"times.txt: expected increasing times, found 0.6 s and 0.2 s at frames 6 and 7",
     ):
         make(street)
 
@@ -141,7 +153,8 @@ def test_times_that_fall_are_one_line(street):
 def test_motion_from_a_field_that_is_not_there_is_one_line(street, motion):
     with pytest.raises(
         MissingDataError,
-        match=rf'cartesian: expected {motion} in the sequence, found instances: use `motion=MotionOptions\("evidence"\)`',
+        match=rf"cartesian: expected {motion} in the sequence, found instances: use "
+        rf'`motion=MotionOptions\("evidence"\)`',
     ) as error:
         make(street, motion=MotionOptions(motion))
     assert "\n" not in str(error.value)
@@ -149,7 +162,10 @@ def test_motion_from_a_field_that_is_not_there_is_one_line(street, motion):
 
 def test_motion_from_numbers_needs_labels(tmp_path):
     street = passing_car.write_sequence(tmp_path, ("instances",), 3)
-    with pytest.raises(MissingDataError, match="expected instances in the sequence, found no field that shows motion"):
+    with pytest.raises(
+        MissingDataError,
+        match="expected instances in the sequence, found no field that shows motion",
+    ):
         make(street, frames=None, motion=MotionOptions("instances"))
 
 
@@ -193,7 +209,9 @@ def add_boxes(street, label=VEHICLE, size_m=2.0):
         np.ones(1, bool),
     )
     for frame in range(FRAMES):
-        FolderSink(street.parents[1]).sequence("Val/Street/cartesian").write("boxes", frame, box.to_table())
+        FolderSink(street.parents[1]).sequence("Val/Street/cartesian").write(
+            "boxes", frame, box.to_table()
+        )
 
 
 def test_boxes_of_frames_without_a_scan_are_left_out(street):
@@ -202,11 +220,16 @@ def test_boxes_of_frames_without_a_scan_are_left_out(street):
         if path.parent.name != "boxes":
             path.unlink()
     (sequence,) = carlasc.open(street).sequences().values()
-    assert set(sequence.frames("boxes").tolist()) - set(sequence.frames("points").tolist()) == {FRAME - 2}
+    assert set(sequence.frames("boxes").tolist()) - set(sequence.frames("points").tolist()) == {
+        FRAME - 2
+    }
     make(street, motion=MotionOptions("boxes"))
 
 
 def test_a_box_of_a_class_that_does_not_exist_is_named(street):
     add_boxes(street, 4_294_967_295)
-    with pytest.raises(FormatError, match="boxes of frame 0: expected class ids 0..24 .*, found 4294967295 in 1 of 1"):
+    with pytest.raises(
+        FormatError,
+        match="boxes of frame 0: expected class ids 0..24 .*, found 4294967295 in 1 of 1",
+    ):
         make(street, motion=MotionOptions("boxes"))

@@ -21,33 +21,50 @@ def camera(yaw_deg=0.0, at=(0.3137, 0.1271, 0.6113), width=400, height=240, foca
     place = optical_axes((math.cos(yaw), math.sin(yaw)), "left")
     place[:3, 3] = at
     matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-    values = {"name": f"at{int(yaw_deg)}", "width": width, "height": height, "matrix": matrix, "sensor_T_camera": place}
+    values = {
+        "name": f"at{int(yaw_deg)}",
+        "width": width,
+        "height": height,
+        "matrix": matrix,
+        "sensor_T_camera": place,
+    }
     return CameraModel(**values | changes)
 
 
 def plain_seen(occupied, spec, one, boxes=None):
-    """The rule in plain NumPy: the boxes of occupied voxels may stop a ray, but those that the camera and the ray's end are in."""
+    """The rule in plain NumPy: the boxes of occupied voxels may stop a ray, but those that the
+    camera and the ray's end are in.
+    """
     edge, lower, seen = spec.voxel_size, np.array(spec.lower), np.zeros(spec.size, bool)
     eye = one.sensor_T_camera[:3, 3]
     home = tuple(np.floor((eye - lower) / edge).astype(int))
     first, last = np.zeros((*spec.size, 3)), np.ones((*spec.size, 3))
     if boxes is not None:
-        first, last = np.split((boxes.reshape(*spec.size, 6) + [0, 0, 0, 1, 1, 1]) / 256, 2, axis=-1)
+        first, last = np.split(
+            (boxes.reshape(*spec.size, 6) + [0, 0, 0, 1, 1, 1]) / 256, 2, axis=-1
+        )
     for voxel in np.ndindex(*spec.size):
         center = lower + (np.array(voxel) + 0.5) * edge
         u, v = one.project((center - eye)[None] @ one.sensor_T_camera[:3, :3])[0]
         if not (-0.5 <= u < one.width - 0.5 and -0.5 <= v < one.height - 0.5):
             continue
         middle = lower + (np.array(voxel) + (first[voxel] + last[voxel]) / 2) * edge
-        others = np.array([cell for cell in np.argwhere(occupied) if tuple(cell) not in (voxel, home)])
+        others = np.array(
+            [cell for cell in np.argwhere(occupied) if tuple(cell) not in (voxel, home)]
+        )
         for start in (center, middle) if occupied[voxel] else (center,):
             whole = np.stack([np.zeros(others.shape), np.ones(others.shape)])
             filled = np.stack([first[tuple(others.T)], last[tuple(others.T)]])
             filled += 0.02 / edge * np.array([-1, 1])[:, None, None] if boxes is not None else 0
             stops = np.ones(len(others), bool)
             for low, high in (whole, filled):
-                near, far = ((lower + (others + part) * edge - start) / (eye - start) for part in (low, high))
-                enters, leaves = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
+                near, far = (
+                    (lower + (others + part) * edge - start) / (eye - start) for part in (low, high)
+                )
+                enters, leaves = (
+                    np.minimum(near, far).max(axis=1),
+                    np.maximum(near, far).min(axis=1),
+                )
                 stops &= (enters < leaves) & (leaves > 0) & (enters < 1)
             if not stops.any():
                 seen[voxel] = True
@@ -77,15 +94,22 @@ def test_a_pole_hides_what_is_behind_it_and_not_what_is_beside():
     one = camera(0)
     view = [(one, one.sensor_T_camera)]
     behind = see_voxels(occupied, SPEC, view, boxes)[10:]
-    assert not see_voxels(occupied, SPEC, view)[10:].any() and 0.1 < behind[behind.any(axis=(1, 2))].mean() < 0.9
+    assert (
+        not see_voxels(occupied, SPEC, view)[10:].any()
+        and 0.1 < behind[behind.any(axis=(1, 2))].mean() < 0.9
+    )
 
 
 def test_boxes_are_those_around_the_points_of_a_voxel():
     spec = GridSpec("cartesian", (2, 1, 1), (0.0, 0.0, 0.0), (2.0, 1.0, 1.0))
-    points = np.array([[0.25, 0.5, 0.75], [0.5, 0.125, 0.25], [1.5, 0.5, 0.5], [1.9, 0.9, 0.9], [5, 5, 5]], np.float32)
+    points = np.array(
+        [[0.25, 0.5, 0.75], [0.5, 0.125, 0.25], [1.5, 0.5, 0.5], [1.9, 0.9, 0.9], [5, 5, 5]],
+        np.float32,
+    )
     observation = Observation(points, np.array([1, 1, 1, 0, 1], np.uint8), np.eye(4))
     first, second = count_votes([observation], spec, keep_boxes=True).boxes.tolist()
-    assert first == [64, 32, 64, 128, 128, 192] and second == [128] * 6  # the point of class 0 says nothing
+    # the point of class 0 says nothing
+    assert first == [64, 32, 64, 128, 128, 192] and second == [128] * 6
 
 
 def test_each_camera_has_its_bit_and_one_without_an_image_sees_nothing():
@@ -125,8 +149,14 @@ def test_a_town_with_cameras_is_seen_by_them(town):
     seen, grid = sequence.read("evaluation/seen", 0), sequence.grid("evaluation", 0)
     views = [(one, scan_T_camera(sequence, one, 0)) for one in cameras.values()]
     assert list(cameras) == ["front", "back"]
-    boxed, whole = seen > 0, see_voxels(grid.labels > 0, grid.spec, views) > 0  # the boxes around the points hide less
-    assert (boxed | ~whole)[grid.known].mean() > 0.999 and boxed[grid.known].mean() > 1.05 * whole[grid.known].mean()
+    # the boxes around the points hide less
+    boxed, whole = (
+        seen > 0,
+        see_voxels(grid.labels > 0, grid.spec, views) > 0,
+    )
+    assert (boxed | ~whole)[grid.known].mean() > 0.999 and boxed[grid.known].mean() > 1.05 * whole[
+        grid.known
+    ].mean()
     assert not (seen == 3).any() and (seen == 1).any() and (seen == 2).any()
 
 
@@ -151,7 +181,11 @@ def test_points_lie_on_the_pixels_of_their_actor_and_class(town):
 def test_seen_is_added_to_a_grid_that_exists(town, tmp_path):
     run, spec = carlasc.Run(workers=1), GridSpec.published().with_resolution([0.8])
     carlasc.regrid(town, spec, tmp_path, run=run)
-    first = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and "report" not in path.name}
+    first = {
+        path: path.read_bytes()
+        for path in tmp_path.rglob("*")
+        if path.is_file() and "report" not in path.name
+    }
     result = carlasc.regrid(town, spec, tmp_path, voting=carlasc.Voting(keep_seen=True), run=run)
     assert result.made == 1 and len(list(tmp_path.rglob("*.seen"))) == 1
     assert all(path.read_bytes() == data for path, data in first.items())
@@ -187,7 +221,9 @@ def test_images_that_do_not_fit_are_refused_in_one_line(town):
     with pytest.raises(FormatError, match="a PNG with one integer per pixel"):
         decode_image(data, "a.jpg", one, color=False)
     late = one.replaced(times=sequence.times + 0.25)
-    with pytest.raises(FormatError, match=r"an image within a frame \(0.100 s\) of the scan, found \+0.250 s"):
+    with pytest.raises(
+        FormatError, match=r"an image within a frame \(0.100 s\) of the scan, found \+0.250 s"
+    ):
         scan_T_camera(sequence, late, 0)
 
 
@@ -198,7 +234,9 @@ def test_six_cameras_take_little_time():
     occupied = np.zeros(spec.size, bool)
     occupied[:, :, 0] = True
     occupied[rng.random(spec.size) < 0.02] = True
-    ones = [camera(yaw, width=1600, height=900, focal=1100.0) for yaw in (0, 60, 120, 180, 240, 300)]
+    ones = [
+        camera(yaw, width=1600, height=900, focal=1100.0) for yaw in (0, 60, 120, 180, 240, 300)
+    ]
     views = [(one, one.sensor_T_camera) for one in ones]
     boxes = np.sort(rng.integers(0, 256, (spec.num_voxels, 2, 3), np.uint8), axis=1).reshape(-1, 6)
     see_voxels(occupied, spec, views, boxes)

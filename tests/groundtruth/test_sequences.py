@@ -1,4 +1,6 @@
-"""Which trajectories scans are merged by: estimated or given, rigid, without jumps, with increasing times."""
+"""Which trajectories scans are merged by: estimated or given, rigid, without jumps, with increasing
+times.
+"""
 
 import pickle
 
@@ -35,7 +37,9 @@ def turning(rad_s, frames=6):
     return [rotation_z(rad_s * 0.1 * frame) for frame in range(frames)]
 
 
-@pytest.mark.parametrize("poses", [straight(69), turning(4.9), turning(-4.9)], ids=["fast", "left", "right"])
+@pytest.mark.parametrize(
+    "poses", [straight(69), turning(4.9), turning(-4.9)], ids=["fast", "left", "right"]
+)
 def test_what_a_vehicle_can_do_is_accepted(tmp_path, poses):
     check_trajectory(write(tmp_path, poses), FromScans())
 
@@ -51,20 +55,33 @@ def test_what_a_vehicle_can_do_is_accepted(tmp_path, poses):
 )
 def test_what_no_vehicle_can_do_is_refused_unless_forced(tmp_path, poses, message):
     sequence = write(tmp_path, poses)
-    with pytest.raises(FormatError, match=f"poses.txt: expected at most 70 m/s and 5 rad/s, {message}"):
+    with pytest.raises(
+        FormatError, match=f"poses.txt: expected at most 70 m/s and 5 rad/s, {message}"
+    ):
         check_trajectory(sequence, FromScans(poses=PoseOptions("file")))
     check_trajectory(sequence, FromScans(poses=PoseOptions(force=True)))
 
 
 def test_times_say_how_long_a_vehicle_drove_and_turned(tmp_path):
-    poses = [pose @ turn for pose, turn in zip(straight(100), turning(5), strict=True)]  # of 2 Hz: 20 m/s and 1 rad/s
-    check_trajectory(write(tmp_path / "slow", poses, times=[0.5 * frame for frame in range(6)]), FromScans())
-    with pytest.raises(FormatError, match="found a jump of 100 m/s and 3.6 rad/s at frame 1 .5 in all."):
+    # of 2 Hz: 20 m/s and 1 rad/s
+    poses = [pose @ turn for pose, turn in zip(straight(100), turning(5), strict=True)]
+    check_trajectory(
+        write(tmp_path / "slow", poses, times=[0.5 * frame for frame in range(6)]), FromScans()
+    )
+    with pytest.raises(
+        FormatError, match="found a jump of 100 m/s and 3.6 rad/s at frame 1 .5 in all."
+    ):
         check_trajectory(
-            write(tmp_path / "without", [p @ t for p, t in zip(straight(100), turning(3.6), strict=True)]), FromScans()
+            write(
+                tmp_path / "without",
+                [p @ t for p, t in zip(straight(100), turning(3.6), strict=True)],
+            ),
+            FromScans(),
         )
     fast = write(tmp_path / "fast", straight(10), times=[0.01 * frame for frame in range(6)])
-    with pytest.raises(FormatError, match="found a jump of 100 m/s and 0.0 rad/s at frame 1 .5 in all."):
+    with pytest.raises(
+        FormatError, match="found a jump of 100 m/s and 0.0 rad/s at frame 1 .5 in all."
+    ):
         check_trajectory(fast, FromScans())
 
 
@@ -106,7 +123,9 @@ def test_a_sequence_without_poses_offers_to_estimate_them(tmp_path):
     sequence = write(tmp_path, straight(10))
     (tmp_path / "Val/Street/cartesian/poses.txt").unlink()
     (sequence,) = carlasc.open(tmp_path).sequences().values()
-    with pytest.raises(MissingDataError, match='poses.txt: expected poses.*`poses=PoseOptions\\("kiss-icp"\\)`'):
+    with pytest.raises(
+        MissingDataError, match='poses.txt: expected poses.*`poses=PoseOptions\\("kiss-icp"\\)`'
+    ):
         check_trajectory(sequence, FromScans(poses=PoseOptions("file")))
 
 

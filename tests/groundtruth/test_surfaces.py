@@ -1,4 +1,6 @@
-"""Meshes enclose the occupied cells, whatever block they are in; distances are those of a loop over all voxels."""
+"""Meshes enclose the occupied cells, whatever block they are in; distances are those of a loop over
+all voxels.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ def test_a_box_has_its_size_on_both_sides_of_a_block(corner):
     mesh = meshed(BOX + corner, size=(0.5, 1.0, 2.0))
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert solid.is_watertight and solid.is_winding_consistent
-    assert_allclose(solid.bounds, [corner * np.array([0.5, 1, 2]), (corner + np.array([3, 4, 5])) * (0.5, 1, 2)])
+    assert_allclose(
+        solid.bounds, [corner * np.array([0.5, 1, 2]), (corner + np.array([3, 4, 5])) * (0.5, 1, 2)]
+    )
     assert 0.85 * 60 < solid.volume < 60  # outwards; marching cubes cuts the edges
 
 
@@ -56,7 +60,10 @@ def plain_distances(grid):
 
 def test_distances_are_those_of_a_loop_over_all_voxels(tmp_path):
     pytest.importorskip("scipy")
-    rng, spec = np.random.default_rng(1), GridSpec("cartesian", (9, 8, 5), (-2, -2, -1), (2.5, 2, 0.5))
+    rng, spec = (
+        np.random.default_rng(1),
+        GridSpec("cartesian", (9, 8, 5), (-2, -2, -1), (2.5, 2, 0.5)),
+    )
     labels = np.where(rng.random(spec.size) < 0.1, 5, 0).astype(np.uint8)
     grid = Grid(spec, labels, np.where(rng.random(spec.size) < 0.8, 3, 0).astype(np.float32))
     write_distances(tmp_path / "far.npz", grid)

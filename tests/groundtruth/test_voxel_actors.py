@@ -1,4 +1,6 @@
-"""Who is in each voxel, and how fast: from captures, and from scans whose actors are found in several ways."""
+"""Who is in each voxel, and how fast: from captures, and from scans whose actors are found in
+several ways.
+"""
 
 import pickle
 import shutil
@@ -50,9 +52,19 @@ def copy(drive, folder, *fields):
 
 def make(drive, folder, fields, spec=SPEC, frames=slice(NOW, NOW + 2), **options):
     copy(drive, folder, *fields)
-    given = {"motion": MotionOptions(options.pop("motion", "auto")), "window": (-3, 3), "own_path": False}
+    given = {
+        "motion": MotionOptions(options.pop("motion", "auto")),
+        "window": (-3, 3),
+        "own_path": False,
+    }
     result = carlasc.regrid(
-        folder, spec, observe=FromScans(**given | options), voting=KEEP, frames=frames, name="made", run=Run(workers=1)
+        folder,
+        spec,
+        observe=FromScans(**given | options),
+        voting=KEEP,
+        frames=frames,
+        name="made",
+        run=Run(workers=1),
     )
     assert not result.failures
     return next(one for one in FolderSource(folder).sequences().values() if "made" in one.grids)
@@ -82,7 +94,9 @@ def in_box(frame, box, spec=SPEC):
     ],
     ids=["numbers", "flow", "nothing"],
 )
-def test_a_passing_car_has_one_number_and_its_velocity_and_a_parked_one_the_number_of_the_data(drive, tmp_path, fields):
+def test_a_passing_car_has_one_number_and_its_velocity_and_a_parked_one_the_number_of_the_data(
+    drive, tmp_path, fields
+):
     sequence = make(drive, tmp_path, fields)
     numbers = set()
     for frame in (NOW, NOW + 1):
@@ -92,9 +106,16 @@ def test_a_passing_car_has_one_number_and_its_velocity_and_a_parked_one_the_numb
         passing = np.unique(instance[in_box(frame, -1) & (labels > 0)])
         numbers |= set(passing[passing > 0].tolist())
         assert np.isin(instance[in_box(frame, -1) & (labels == 10)], passing[passing > 0]).all()
-        assert velocity.dtype == field_files.VELOCITY_DTYPE and (np.diff(velocity["voxel"]) > 0).all()
-        assert np.isin(velocity["voxel"], np.flatnonzero(np.isin(instance, list(numbers)))).all() and len(velocity) > 20
-        assert np.abs(velocity["velocity"].astype(float) - [SPEED_M_S, 0, 0]).max() < (0.1 if "flow" in fields else 1.0)
+        assert (
+            velocity.dtype == field_files.VELOCITY_DTYPE and (np.diff(velocity["voxel"]) > 0).all()
+        )
+        assert (
+            np.isin(velocity["voxel"], np.flatnonzero(np.isin(instance, list(numbers)))).all()
+            and len(velocity) > 20
+        )
+        assert np.abs(velocity["velocity"].astype(float) - [SPEED_M_S, 0, 0]).max() < (
+            0.1 if "flow" in fields else 1.0
+        )
         parked = instance[in_box(frame, -2) & (labels == 10)]
         assert len(parked) and (parked == (4 if "instances" in fields else 0)).all()
         assert not instance[labels == 0].any()
@@ -116,14 +137,25 @@ def test_parked_cars_have_the_numbers_of_their_boxes(drive, tmp_path):
     for frame in range(12):
         pose = invert(sensor_pose(frame)) @ translation((here.lower[-2] + here.upper[-2]) / 2)
         boxes = Boxes.from_poses(
-            np.array([77], np.uint32), np.array([10], np.uint32), pose[None], (here.upper - here.lower)[-2:-1]
+            np.array([77], np.uint32),
+            np.array([10], np.uint32),
+            pose[None],
+            (here.upper - here.lower)[-2:-1],
         )
         writer.write("boxes", frame, boxes.to_table())
     carlasc.regrid(
-        folder, ROUGH, observe=FromScans(window=(-3, 3)), voting=KEEP, frames=[NOW], name="made", run=Run(workers=1)
+        folder,
+        ROUGH,
+        observe=FromScans(window=(-3, 3)),
+        voting=KEEP,
+        frames=[NOW],
+        name="made",
+        run=Run(workers=1),
     )
     (sequence,) = FolderSource(folder).sequences().values()
-    instance, labels = (sequence.read(f"made/{part}", NOW).reshape(-1) for part in ("instance", "labels"))
+    instance, labels = (
+        sequence.read(f"made/{part}", NOW).reshape(-1) for part in ("instance", "labels")
+    )
     parked = instance[in_box(NOW, -2, ROUGH) & (labels == 10)]
     assert len(parked) and (parked == 77).all()
 
@@ -139,18 +171,28 @@ def test_a_turning_body_has_another_velocity_at_each_end(drive, tmp_path):
     poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angles)
     poses[:, 1, 0], poses[:, 0, 1] = np.sin(angles), -np.sin(angles)
     middle = poses[NOW, :3, 3]
-    found = velocity_at(replace(one, world_T_actor=poses), NOW, middle + [[2.0, 0, 0], [0, 0, 0], [0, -2.0, 1]], feed)
+    found = velocity_at(
+        replace(one, world_T_actor=poses),
+        NOW,
+        middle + [[2.0, 0, 0], [0, 0, 0], [0, -2.0, 1]],
+        feed,
+    )
     assert np.allclose(found, [[10, 0.6, 0], [10, 0, 0], [10.6, 0, 0]], atol=1e-6)
 
 
-# --- from a capture -----------------------------------------------------------------------------------------------------------
+# --- from a capture
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_capture_gives_each_voxel_the_actor_that_most_points_of_its_class_have(tmp_path):
     capture = write_capture(tmp_path / "town", frames=1, sensors=3, points=3000)
-    carlasc.regrid(tmp_path / "town", COARSE, observe=FromCapture(), voting=KEEP, run=Run(workers=1))
+    carlasc.regrid(
+        tmp_path / "town", COARSE, observe=FromCapture(), voting=KEEP, run=Run(workers=1)
+    )
     (sequence,) = FolderSource(tmp_path / "town").sequences().values()
-    labels, instance = (sequence.read(f"evaluation/{part}", 0).reshape(-1) for part in ("labels", "instance"))
+    labels, instance = (
+        sequence.read(f"evaluation/{part}", 0).reshape(-1) for part in ("labels", "instance")
+    )
     velocity = sequence.read("evaluation/velocity", 0)
     ego, counts, speeds = capture.read(0, 100), {}, {}
     for sensor in range(3):
@@ -171,29 +213,55 @@ def test_a_capture_gives_each_voxel_the_actor_that_most_points_of_its_class_have
             wanted[voxel] = min(own, key=lambda actor: (-own[actor], actor))
     assert np.count_nonzero(wanted) > 1000
     assert np.array_equal(instance, wanted)
-    moving = np.flatnonzero(np.isin(wanted, [a for a, v in speeds.items() if np.linalg.norm(v) > 0.3]))
+    moving = np.flatnonzero(
+        np.isin(wanted, [a for a, v in speeds.items() if np.linalg.norm(v) > 0.3])
+    )
     assert np.array_equal(velocity["voxel"], moving)
     expected = np.array([speeds[wanted[voxel]] for voxel in moving])
     assert np.allclose(velocity["velocity"], expected, atol=2e-3)
 
 
 def test_the_voxels_of_a_turning_actor_of_a_capture_differ(tmp_path):
-    """A bus of 10 m drives at 6 m/s and turns by 0.4 rad/s; a person beside it, whose way turns too, has one velocity."""
+    """A bus of 10 m drives at 6 m/s and turns by 0.4 rad/s; a person beside it, whose way turns
+    too, has one velocity.
+    """
     writer, rate, rng = CaptureWriter(tmp_path / "town"), 0.4, np.random.default_rng(0)
     pose = translation((3.0, -2.0, 2.0)) @ rotation_z(0.7)
     for frame in range(3):
         angle = 0.2 + rate * 0.1 * (frame - 1)
-        velocity = rotate_vectors(invert(pose), 6 * np.array([[np.cos(angle), np.sin(angle), 0]]))[0]
+        velocity = rotate_vectors(invert(pose), 6 * np.array([[np.cos(angle), np.sin(angle), 0]]))[
+            0
+        ]
         points = np.concatenate(
-            [rng.uniform((0, -1.5, -2), (10, 1.5, 0.6), (4000, 3)), rng.uniform((-4, -4, -1.5), (-3, -3, 0), (50, 3))]
+            [
+                rng.uniform((0, -1.5, -2), (10, 1.5, 0.6), (4000, 3)),
+                rng.uniform((-4, -4, -1.5), (-3, -3, 0), (50, 3)),
+            ]
         )
         instances = np.repeat(np.array([7, 8], np.uint32), (4000, 50))
-        scan = Scan(points.astype(np.float32), np.where(instances == 7, 10, 4).astype(np.uint32), None, instances)
-        writer.write(0, frame, SensorRecording(scan, pose, np.array([[7, *velocity], [8, *velocity]])))
+        scan = Scan(
+            points.astype(np.float32),
+            np.where(instances == 7, 10, 4).astype(np.uint32),
+            None,
+            instances,
+        )
+        writer.write(
+            0, frame, SensorRecording(scan, pose, np.array([[7, *velocity], [8, *velocity]]))
+        )
         writer.write_times({frame: [frame * 0.1]})
-    carlasc.regrid(tmp_path / "town", COARSE, observe=FromCapture(), voting=KEEP, frames=[1], run=Run(workers=1))
+    carlasc.regrid(
+        tmp_path / "town",
+        COARSE,
+        observe=FromCapture(),
+        voting=KEEP,
+        frames=[1],
+        run=Run(workers=1),
+    )
     (sequence,) = FolderSource(tmp_path / "town").sequences().values()
-    found, instance = sequence.read("evaluation/velocity", 0), sequence.read("evaluation/instance", 0).reshape(-1)
+    found, instance = (
+        sequence.read("evaluation/velocity", 0),
+        sequence.read("evaluation/instance", 0).reshape(-1),
+    )
     own = rotate_vectors(invert(pose), 6 * np.array([[np.cos(0.2), np.sin(0.2), 0]]))
     arm = centers_of(COARSE, found["voxel"]) - [5.0, 0, 0]
     turning = own + rate * np.column_stack([-arm[:, 1], arm[:, 0], np.zeros(len(arm))])
@@ -210,7 +278,8 @@ def test_recordings_without_actors_have_none():
     assert not found.instance.any() and len(found.velocity) == 0
 
 
-# --- what a run writes --------------------------------------------------------------------------------------------------------
+# --- what a run writes
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_nothing_is_written_that_was_not_asked_for_and_runs_are_equal(drive, tmp_path):
@@ -225,7 +294,11 @@ def test_nothing_is_written_that_was_not_asked_for_and_runs_are_equal(drive, tmp
             run=Run(workers=1),
         )
     a, b, c = (
-        {p.name: p.read_bytes() for p in (tmp_path / f).rglob("made/*") if p.is_file() and p.suffix != ".json"}
+        {
+            p.name: p.read_bytes()
+            for p in (tmp_path / f).rglob("made/*")
+            if p.is_file() and p.suffix != ".json"
+        }
         for f in "abc"
     )
     assert b == c
@@ -237,7 +310,13 @@ def test_voxels_that_become_unknown_have_no_actor(drive, tmp_path):
     copy(drive, tmp_path, "labels", "flow")
     voting = Voting(keep_actors=True, min_confidence=0.97)
     carlasc.regrid(
-        tmp_path, ROUGH, observe=FromScans(window=(-3, 3)), voting=voting, frames=[NOW], name="made", run=Run(workers=1)
+        tmp_path,
+        ROUGH,
+        observe=FromScans(window=(-3, 3)),
+        voting=voting,
+        frames=[NOW],
+        name="made",
+        run=Run(workers=1),
     )
     (sequence,) = FolderSource(tmp_path).sequences().values()
     labels, instance = (sequence.read(f"made/{part}", NOW) for part in ("labels", "instance"))
@@ -273,7 +352,9 @@ def test_the_command_takes_it(tmp_path, monkeypatch):
     ]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
-    assert len(list(tmp_path.rglob("*.instance"))) == len(list(tmp_path.rglob("*.velocity.npz"))) == 1
+    assert (
+        len(list(tmp_path.rglob("*.instance"))) == len(list(tmp_path.rglob("*.velocity.npz"))) == 1
+    )
     result = CliRunner().invoke(app, [*given, "--dynamic", "tube", "--name", "other"])
     assert result.exit_code == 2 and "--keep-actors" in result.output
 
@@ -290,10 +371,16 @@ def test_worker_processes_get_the_numbers(drive, tmp_path):
 CAR, PERSON = 10, 4
 
 
-def one_track(first, frames, *, x=0.0, instance=0, label=CAR, rigid=True, half=(2.0, 1.0, 0.75), seen=None):
-    """A track at 1 m per frame along x, from x at frame 0 on, whose members are in all frames, or in those of `seen`."""
+def one_track(
+    first, frames, *, x=0.0, instance=0, label=CAR, rigid=True, half=(2.0, 1.0, 0.75), seen=None
+):
+    """A track at 1 m per frame along x, from x at frame 0 on, whose members are in all frames, or
+    in those of `seen`.
+    """
     poses = np.stack([translation((x + frame, 0.0, 0.0)) for frame in range(first, first + frames)])
-    members = {frame: np.arange(5) for frame in (range(first, first + frames) if seen is None else seen)}
+    members = {
+        frame: np.arange(5) for frame in (range(first, first + frames) if seen is None else seen)
+    }
     upper = np.array(half)
     extent = Extent(-upper, upper, (True,) * 4, 100)
     velocity = np.tile([10.0, 0, 0], (frames, 1))
@@ -324,7 +411,9 @@ def test_numbers_of_the_data_are_kept_and_others_are_new_and_above_them():
         (one_track(6, 10, x=1.5, half=(0.5, 0.5, 0.5)), True),
     ],
 )
-def test_tracks_of_one_class_of_which_one_is_in_the_body_of_the_other_are_one_actor(second, is_same):
+def test_tracks_of_one_class_of_which_one_is_in_the_body_of_the_other_are_one_actor(
+    second, is_same
+):
     found = number_actors({0: one_track(0, 10), 1: second})
     assert (found[0] == found[1]) == is_same
 
@@ -338,9 +427,16 @@ def test_two_people_who_are_seen_at_once_are_two(seen, is_same):
 
 def test_a_track_without_a_number_takes_that_of_its_actor_and_two_numbers_are_never_joined():
     assert number_actors({0: one_track(0, 10), 1: one_track(5, 10, instance=6)}) == {0: 6, 1: 6}
-    assert number_actors({0: one_track(0, 10, instance=3), 1: one_track(5, 10, instance=6)}) == {0: 3, 1: 6}
+    assert number_actors({0: one_track(0, 10, instance=3), 1: one_track(5, 10, instance=6)}) == {
+        0: 3,
+        1: 6,
+    }
     # the one in the middle is of both, and both have numbers: it goes with the first
-    tracks = {0: one_track(0, 10, instance=3), 1: one_track(5, 10), 2: one_track(10, 10, instance=6)}
+    tracks = {
+        0: one_track(0, 10, instance=3),
+        1: one_track(5, 10),
+        2: one_track(10, 10, instance=6),
+    }
     assert number_actors(tracks) == {0: 3, 1: 3, 2: 6}
 
 

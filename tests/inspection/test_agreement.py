@@ -29,7 +29,9 @@ SHIFTS = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0
 
 
 def plain_count(grid, points, labels, shifts):
-    """Place the points, move their cells, and look each up; those that leave the grid stay where they are."""
+    """Place the points, move their cells, and look each up; those that leave the grid stay where
+    they are.
+    """
     spec = grid.spec
     cells, inside = spec.index(spec.to_axes(points))
     cells, labels = cells[inside], labels[inside]
@@ -41,7 +43,9 @@ def plain_count(grid, points, labels, shifts):
         outside = ((moved < 0) | (moved >= spec.size)).any(axis=1)
         moved[outside] = cells[outside]
         known, voxels = grid.known[tuple(moved.T)], grid.labels[tuple(moved.T)]
-        counted.append([known.sum(), (known & (voxels == labels)).sum(), (known & (voxels != 0)).sum()])
+        counted.append(
+            [known.sum(), (known & (voxels == labels)).sum(), (known & (voxels != 0)).sum()]
+        )
     return np.array(counted)
 
 
@@ -57,7 +61,9 @@ def plain_count(grid, points, labels, shifts):
 def test_points_are_counted_as_in_plain_numpy(name, real, whole, narrow, with_counts, seed):
     spec, rng = SPECS[name], np.random.default_rng(seed)
     labels = rng.integers(0, 4, spec.size).astype(narrow)
-    grid = Grid(spec, labels, rng.integers(0, 2, spec.size).astype(np.float32) if with_counts else None)
+    grid = Grid(
+        spec, labels, rng.integers(0, 2, spec.size).astype(np.float32) if with_counts else None
+    )
     points = rng.uniform(-6, 6, (200, 3)) * (1, 1, 0.3)
     points[::3] = np.round(points[::3] * 2) / 2  # on faces and edges
     points[:4, 0] = (math.nan, math.inf, -math.inf, 1e300)
@@ -83,7 +89,9 @@ def test_grids_in_any_order_in_memory_count_alike():
     points = spec.centers().reshape(-1, 3)
     args = (points, labels.reshape(-1), SHIFTS)
     expected = Voxels(Grid(spec, labels, counts)).count(*args)
-    found = Voxels(Grid(spec, np.asfortranarray(labels), counts[::-1, ::-1].copy()[::-1, ::-1])).count(*args)
+    found = Voxels(
+        Grid(spec, np.asfortranarray(labels), counts[::-1, ::-1].copy()[::-1, ::-1])
+    ).count(*args)
     np.testing.assert_array_equal(found, expected)
 
 
@@ -109,7 +117,11 @@ def write_drive(folder, spec, labelled=False):
 @pytest.mark.parametrize("labelled", [False, True])
 def test_a_road_below_the_grid_is_reported_with_bounds_that_hold_it(tmp_path, labelled):
     high = GridSpec("cartesian", (32, 32, 8), (-16.0, -16.0, -1.5), (16.0, 16.0, 1.5))
-    (finding,) = [f for f in validate(write_drive(tmp_path, high, labelled)).findings if f.check == "ground-below-grid"]
+    (finding,) = [
+        f
+        for f in validate(write_drive(tmp_path, high, labelled)).findings
+        if f.check == "ground-below-grid"
+    ]
     assert finding.severity == "warning"
     assert int(finding.found.split("%")[0]) > 95
     bounds = finding.advice.split("--bounds=")[1].rstrip("`")
@@ -147,13 +159,19 @@ ROUND = GridSpec("cylindrical", (10, 24, 6), (0.0, -math.pi, -3.0), (10.0, math.
 
 
 def scene(spec=SPEC, seed=0, right=1.0, count=2000):
-    """Return points at the centres of voxels, their labels, and a grid in which a share of them has its class."""
+    """Return points at the centres of voxels, their labels, and a grid in which a share of them has
+    its class.
+    """
     rng = np.random.default_rng(seed)
     labels = rng.integers(1, 9, spec.size).astype(np.uint8)
     cells = rng.integers(0, spec.size, (count, 3))
     points = spec.from_axes(spec.centers())[tuple(cells.T)]
     wrong = rng.random(count) >= right
-    return points, np.where(wrong, 9, labels[tuple(cells.T)]), Grid(spec, labels, np.ones(spec.size, np.float32))
+    return (
+        points,
+        np.where(wrong, 9, labels[tuple(cells.T)]),
+        Grid(spec, labels, np.ones(spec.size, np.float32)),
+    )
 
 
 def diagnose(points, labels, grid, frames=1):
@@ -166,7 +184,12 @@ def diagnose(points, labels, grid, frames=1):
 @pytest.mark.parametrize("spec", [SPEC, ROUND])
 def test_points_in_voxels_of_their_class_agree(spec):
     result = diagnose(*scene(spec), frames=2)
-    assert (result.share, result.occupied_share, result.frames, result.mistake) == (1.0, 1.0, 2, None)
+    assert (result.share, result.occupied_share, result.frames, result.mistake) == (
+        1.0,
+        1.0,
+        2,
+        None,
+    )
 
 
 def test_the_share_is_that_of_the_points_in_known_voxels():
@@ -207,7 +230,9 @@ def test_without_labels_occupied_voxels_count():
 @pytest.mark.parametrize("step", [1, -1])
 def test_a_grid_shifted_along_its_second_axis_is_named(spec, step):
     points, labels, grid = scene(spec)
-    result = diagnose(points, labels, Grid(spec, np.roll(grid.labels, step, axis=1), grid.counts), frames=2)
+    result = diagnose(
+        points, labels, Grid(spec, np.roll(grid.labels, step, axis=1), grid.counts), frames=2
+    )
     axis = "y" if spec is SPEC else "azimuth"
     assert result.mistake == f"a grid shifted by one cell towards {'+' if step > 0 else '-'}{axis}"
     assert result.corrected_share > 0.9
@@ -219,7 +244,14 @@ def test_a_mistake_in_a_minority_of_frames_is_not_reported():
     points, labels, grid = scene()
     mirrored = points * [1, -1, 1]
     evidence = GridEvidence(SPEC)
-    for wrong in (True, True, False, True, False):  # the mistake would be better on average, but not on three quarters
+    # the mistake would be better on average, but not on three quarters
+    for wrong in (
+        True,
+        True,
+        False,
+        True,
+        False,
+    ):
         evidence.add(mirrored if wrong else points, labels, grid)
     assert evidence.diagnose().mistake is None
     for _ in range(4):
@@ -233,7 +265,9 @@ def test_a_mistake_is_reported_from_one_percent_of_the_points(part, reported):
     labels = np.minimum(grid.labels, grid.labels[:, ::-1])  # y mirrored makes no difference,
     labels[part] = grid.labels[part]  # but for this part: 5 %, or 0.8 % of the grid
     cells, _ = SPEC.index(points)
-    result = diagnose(points * [1, -1, 1], labels[tuple(cells.T)], Grid(SPEC, labels, grid.counts), frames=4)
+    result = diagnose(
+        points * [1, -1, 1], labels[tuple(cells.T)], Grid(SPEC, labels, grid.counts), frames=4
+    )
     assert 0.9 < result.share < 0.999
     assert (result.mistake is not None and "y mirrored" in result.mistake) is reported
 
@@ -281,13 +315,21 @@ def test_a_mistake_in_poses_is_reported_if_it_explains_three_quarters_of_the_pai
     true, mirror = bend(60), np.diag([1.0, -1, 1, 1])
     stored = np.concatenate([mirror @ true[:wrong] @ mirror, true[wrong:]])
     correction = diagnose_poses(structure_along(true, walls()), stored).correction
-    assert (correction is not None and correction.name == "poses with y mirrored against the scans") is reported
+    assert (
+        correction is not None and correction.name == "poses with y mirrored against the scans"
+    ) is reported
     assert reported or correction is None
 
 
 def test_pairs_are_two_metres_apart_or_ten_frames():
-    assert all(later - earlier == 4 for earlier, later in choose_pairs(straight(30, 0.5), 8) if later < 29)
-    assert all(later - earlier == 10 for earlier, later in choose_pairs(straight(40, 0.1), 8) if later < 39)
-    assert {later - earlier for earlier, later in choose_pairs(straight(40, 0.0), 8) if later < 39} == {1, 4}
+    assert all(
+        later - earlier == 4 for earlier, later in choose_pairs(straight(30, 0.5), 8) if later < 29
+    )
+    assert all(
+        later - earlier == 10 for earlier, later in choose_pairs(straight(40, 0.1), 8) if later < 39
+    )
+    assert {
+        later - earlier for earlier, later in choose_pairs(straight(40, 0.0), 8) if later < 39
+    } == {1, 4}
     assert choose_pairs(straight(1, 1.0), 8) == []
     assert len(choose_pairs(straight(60, 0.5), 8)) == 8

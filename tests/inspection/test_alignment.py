@@ -38,7 +38,10 @@ class Swaying(SimulatedDrive):
 
     def world_T_vehicle(self, seconds):
         at = np.asarray(seconds, np.float64)
-        yaw, pitch, roll = (self.sway_rad * np.sin(rate * at + start) for rate, start in ((1.1, 0), (2.3, 1), (1.7, 2)))
+        yaw, pitch, roll = (
+            self.sway_rad * np.sin(rate * at + start)
+            for rate, start in ((1.1, 0), (2.3, 1), (1.7, 2))
+        )
         poses = np.tile(np.eye(4), (*at.shape, 1, 1))
         poses[..., 0, 1], poses[..., 1, 0] = -yaw, yaw
         poses[..., 0, 2], poses[..., 2, 0] = pitch, -pitch
@@ -95,7 +98,10 @@ def test_correct_poses_raise_no_alarm(speed, rolling):
 
 def test_vehicles_that_keep_pace_are_not_taken_for_scans_in_one_frame():
     rng = np.random.default_rng(3)
-    fixed, convoy = rng.uniform((-40, -25, 0), (60, 25, 3), (2500, 3)), rng.uniform((-20, -6, 0), (20, 6, 2), (1500, 3))
+    fixed, convoy = (
+        rng.uniform((-40, -25, 0), (60, 25, 3), (2500, 3)),
+        rng.uniform((-20, -6, 0), (20, 6, 2), (1500, 3)),
+    )
     poses = np.tile(np.eye(4), (20, 1, 1))
     poses[:, 0, 3] = np.arange(20)
     scans = [np.concatenate([fixed - pose[:3, 3], convoy]) for pose in poses]
@@ -126,7 +132,9 @@ def test_mistakes_are_named_on_a_real_drive(real):
 
     with tarfile.open(real / "kitti_tracking_0000.tar.xz") as archive:
         read = {
-            member.name: np.frombuffer(archive.extractfile(member).read(), np.float32).reshape(-1, 4)[:, :3]
+            member.name: np.frombuffer(archive.extractfile(member).read(), np.float32).reshape(
+                -1, 4
+            )[:, :3]
             for member in archive
             if member.name.endswith(".bin") and int(member.name[-10:-4]) < 45
         }

@@ -50,7 +50,9 @@ def test_sound_grids_have_no_fault(town):
     assert result.ok
     assert result.frames == {"cartesian": FRAMES}
     states = {verdict.check: verdict.state for verdict in result.verdicts["cartesian"]}
-    assert {states[name] for name in ("fit", "axes", "shift x", "shift y", "yaw", "voxel size", "lag")} == {"sound"}
+    assert {
+        states[name] for name in ("fit", "axes", "shift x", "shift y", "yaw", "voxel size", "lag")
+    } == {"sound"}
 
 
 MOVED = {
@@ -73,7 +75,9 @@ def some(names):
 def test_a_shift_is_named_with_its_size(town, tmp_path, name):
     offset, wanted = MOVED[name]
     found = faults(planted.write_grids(town, tmp_path, spec=planted.moved(SPEC, offset)), town)
-    assert {check: verdict.value for check, verdict in found.items()} == pytest.approx(wanted, abs=0.11 * X)
+    assert {check: verdict.value for check, verdict in found.items()} == pytest.approx(
+        wanted, abs=0.11 * X
+    )
     for check, size in wanted.items():
         assert found[check].low - 1e-6 <= size <= found[check].high + 1e-6
 
@@ -87,14 +91,23 @@ WRONG = {
     "elsewhere": (
         {"change": elsewhere},
         "fit",
-        "check that scans and grids are of the same sequence and in a known coordinate frame; tried: /",
+        "check that scans and grids are of the same sequence and in a known coordinate frame; "
+        "tried: /",
     ),
     "mirrored": ({"change": planted.mirrored}, "axes", "y mirrored"),
-    "axes": ({"change": planted.swapped_axes}, "axes", "x, y, z of the grid are y, x, z of the scans"),
+    "axes": (
+        {"change": planted.swapped_axes},
+        "axes",
+        "x, y, z of the grid are y, x, z of the scans",
+    ),
     "late": ({"late": 1}, "lag", "1 frame (0.10 s) late"),
     "classes": ({"change": planted.exchanged(1, 10)}, "classes exchanged", "Building and Vehicle"),
     "voxels": ({"spec": planted.larger(SPEC, 1.25)}, "voxel size", "1.250 times"),
-    "absent": ({"absent": (3, 10, 11)}, "missing frames", "3 of 16 frames have no grid (18.8%): 3, 10, 11"),
+    "absent": (
+        {"absent": (3, 10, 11)},
+        "missing frames",
+        "3 of 16 frames have no grid (18.8%): 3, 10, 11",
+    ),
 }
 
 
@@ -124,19 +137,35 @@ SOURCES = {  # what shows motion -> how the recording is copied
     "flow": lambda town, out: planted.without_fields(town, out, "instances"),
     "boxes": planted.with_boxes,
     "evidence": lambda town, out: planted.without_fields(town, out, "instances", "flow"),
-    "evidence without labels": lambda town, out: planted.without_fields(town, out, "instances", "flow", "labels"),
+    "evidence without labels": lambda town, out: planted.without_fields(
+        town, out, "instances", "flow", "labels"
+    ),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SOURCES)
-def test_an_actor_without_voxels_and_its_trail_are_found_by_whatever_shows_motion(town, tmp_path, name):
-    scans, actor = SOURCES[name](town, tmp_path / "scans"), planted.fastest(planted.sequence_of(town))
+def test_an_actor_without_voxels_and_its_trail_are_found_by_whatever_shows_motion(
+    town, tmp_path, name
+):
+    scans, actor = (
+        SOURCES[name](town, tmp_path / "scans"),
+        planted.fastest(planted.sequence_of(town)),
+    )
     named = {"boxes": f"actor {actor} "}.get(name, "actor of track 0, first seen in scan ")
-    assert planted.sequence_of(scans).fields() & {"instances", "flow", "boxes"} == {name} & {"flow", "boxes"}
-    for fault, check in ((None, None), (planted.erased, "erased actors"), (planted.trail, "ghost trails")):
+    assert planted.sequence_of(scans).fields() & {"instances", "flow", "boxes"} == {name} & {
+        "flow",
+        "boxes",
+    }
+    for fault, check in (
+        (None, None),
+        (planted.erased, "erased actors"),
+        (planted.trail, "ghost trails"),
+    ):
         out = tmp_path / f"{check}"
-        found = faults(planted.write_grids(town, out, None if fault is None else fault(actor)), scans)
+        found = faults(
+            planted.write_grids(town, out, None if fault is None else fault(actor)), scans
+        )
         assert set(found) == {check} - {None}
         assert all(named in str(verdict) for verdict in found.values())
 
@@ -148,7 +177,10 @@ def test_a_turn_of_a_degree_is_named(town, tmp_path):
     for frame in range(0, FRAMES, 3):
         recordings = [drive.record(20 + frame, sensor) for sensor in range(5)]
         grid_T_world = turned @ invert(recordings[0].world_T_sensor)
-        seen = [Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor) for r in recordings]
+        seen = [
+            Observation(r.scan.points, r.scan.labels, grid_T_world @ r.world_T_sensor)
+            for r in recordings
+        ]
         grids[frame] = count_votes(seen, SPEC).to_grid()
 
     def change(_sequence, frame, _labels, _counts):
@@ -197,7 +229,9 @@ def test_grids_without_scans_of_theirs_are_refused(town, tmp_path):
         file.rename(file.with_name(f"{int(file.stem) + 500:06d}{file.suffix}"))
     with pytest.raises(MissingDataError, match="frames 0 to 15.*found 500 to 515"):
         carlasc.audit(far, town)
-    with pytest.raises(MissingDataError, match=r"far/cartesian/evaluation with \S*town/cartesian: "):
+    with pytest.raises(
+        MissingDataError, match=r"far/cartesian/evaluation with \S*town/cartesian: "
+    ):
         carlasc.audit(far, town)
     names = tmp_path / "named"
     shutil.copytree(town / "cartesian", names / "Val" / "one" / "cartesian")
@@ -212,7 +246,9 @@ def test_the_command_prints_writes_a_page_and_tells_by_its_exit_code(town, tmp_p
     sound = runner.invoke(app, ["audit", str(town), str(town), "--made-from=-2:2", "--json"])
     assert sound.exit_code == 0
     assert json.loads(sound.stdout)["ok"]
-    assert "false free, held out" in [v["check"] for v in json.loads(sound.stdout)["verdicts"]["cartesian"]]
+    assert "false free, held out" in [
+        v["check"] for v in json.loads(sound.stdout)["verdicts"]["cartesian"]
+    ]
     wrong = planted.write_grids(town, tmp_path / "wrong", planted.mirrored)
     result = runner.invoke(app, ["audit", str(wrong), str(town), "--html", str(page)])
     assert result.exit_code == 1
@@ -246,26 +282,42 @@ def test_names_of_data_are_text_on_the_page(town, tmp_path):
 
 
 KITTI = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
-FORMATS = {  # exporter -> geometry in the frame of the scans, options, axis and size of a shift of one row along x of the layout
+# exporter -> geometry in the frame of the scans, options, axis and size of a shift of one row along
+# x of the layout
+FORMATS = {
     "kitti": (KITTI, {}, "shift x", 0.2),
     "sscbench": (KITTI, {"every": 1}, "shift x", 0.2),
-    "occ3d": (GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -2.8), (40.0, 40.0, 3.6)), {}, "shift x", 0.4),
+    "occ3d": (
+        GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -2.8), (40.0, 40.0, 3.6)),
+        {},
+        "shift x",
+        0.4,
+    ),
     "openoccupancy": (
         GridSpec("cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0)),
         {},
         "shift y",
         0.2,
     ),
-    "carlaocc": (GridSpec("cartesian", (128, 128, 16), (-25.6, -25.6, -2.4), (25.6, 25.6, 4.0)), {}, "shift x", 0.4),
+    "carlaocc": (
+        GridSpec("cartesian", (128, 128, 16), (-25.6, -25.6, -2.4), (25.6, 25.6, 4.0)),
+        {},
+        "shift x",
+        0.4,
+    ),
 }
 
 
 def test_grids_of_another_length_are_named_with_their_scans(town, tmp_path):
     for token in ("a", "b", "c"):
         (tmp_path / "gts" / "scene" / token).mkdir(parents=True)
-        np.savez(tmp_path / "gts" / "scene" / token / "labels.npz", semantics=np.full((200, 200, 16), 17, np.uint8))
+        np.savez(
+            tmp_path / "gts" / "scene" / token / "labels.npz",
+            semantics=np.full((200, 200, 16), 17, np.uint8),
+        )
     with pytest.raises(
-        MissingDataError, match=r"scene with \S*cartesian: expected a time for each of 3 tokens.*found 16 scans"
+        MissingDataError,
+        match=r"scene with \S*cartesian: expected a time for each of 3 tokens.*found 16 scans",
     ):
         carlasc.audit(tmp_path / "gts", town)
     grids = planted.write_grids(town, tmp_path / "longer")
@@ -273,7 +325,10 @@ def test_grids_of_another_length_are_named_with_their_scans(town, tmp_path):
         shutil.copy(file, file.with_name(f"000099{file.suffix}"))
     result = carlasc.audit(grids, town, frames=(8, 100))
     assert result.frames == {"cartesian": 8}
-    assert "cartesian: 1 of 17 grids left out, without a scan of the same number or time: 99" in result.notes
+    assert (
+        "cartesian: 1 of 17 grids left out, without a scan of the same number or time: 99"
+        in result.notes
+    )
 
 
 @pytest.mark.slow
@@ -281,22 +336,32 @@ def test_grids_of_another_length_are_named_with_their_scans(town, tmp_path):
 def test_files_of_other_benchmarks_are_sound_or_faults_are_named(town, tmp_path, name):
     spec, options, check, size = FORMATS[name]
     run, observe = Run(workers=1), FromScans(window=(-3, 3))
-    carlasc.regrid(town, spec, tmp_path / "made", observe=observe, frames=(4, 9), name="evaluation", run=run)
+    carlasc.regrid(
+        town, spec, tmp_path / "made", observe=observe, frames=(4, 9), name="evaluation", run=run
+    )
 
     def row_too_far(_sequence, _frame, labels, counts):
         return np.roll(labels, 1, axis=0), np.roll(counts, 1, axis=0)
 
-    wrong = {"sound": (None, ()), "shifted": (row_too_far, ()), "exchanged": (planted.exchanged(1, 10), (6,))}
+    wrong = {
+        "sound": (None, ()),
+        "shifted": (row_too_far, ()),
+        "exchanged": (planted.exchanged(1, 10), (6,)),
+    }
     for fault, (change, absent) in wrong.items():
         out = tmp_path / fault
-        grids = planted.write_grids(tmp_path / "made", tmp_path / f"{fault}-grids", change, absent=absent)
+        grids = planted.write_grids(
+            tmp_path / "made", tmp_path / f"{fault}-grids", change, absent=absent
+        )
         if name == "carlaocc":
             planted.write_carlaocc(grids, out)
         else:
             carlasc.export(name, grids, out, options=options, run=run)
         if name == "openoccupancy":
             tokens = sorted(file.stem for file in out.rglob("*.npy"))
-            (out / "tokens.txt").write_text("".join(f"{token} {0.1 * int(token[-6:]):.1f}\n" for token in tokens))
+            (out / "tokens.txt").write_text(
+                "".join(f"{token} {0.1 * int(token[-6:]):.1f}\n" for token in tokens)
+            )
         result = carlasc.audit(out, town)
         assert list(result.frames.values()) == [5 - len(absent)]
         found = {verdict.check: verdict for verdict in result.faults}
@@ -337,6 +402,16 @@ def test_a_drift_of_five_centimetres_a_second_is_named(tmp_path):
     observe = FromScans((-25, 25), motion=MotionOptions("flow"), poses=PoseOptions("file", "never"))
     for folder, wanted in ((drifting, {"height drift": 0.05}), (scans, {})):
         made = tmp_path / f"{folder.name}-grids"
-        carlasc.regrid(folder, spec, made, observe=observe, frames=(20, 31), name="evaluation", run=Run(workers=1))
+        carlasc.regrid(
+            folder,
+            spec,
+            made,
+            observe=observe,
+            frames=(20, 31),
+            name="evaluation",
+            run=Run(workers=1),
+        )
         found = faults(made, scans)
-        assert {check: verdict.value for check, verdict in found.items()} == pytest.approx(wanted, abs=0.011)
+        assert {check: verdict.value for check, verdict in found.items()} == pytest.approx(
+            wanted, abs=0.011
+        )

@@ -1,4 +1,6 @@
-"""The card of a data set, judged by the readers that it is for: the Hub's own parser, mlcroissant and datasets."""
+"""The card of a data set, judged by the readers that it is for: the Hub's own parser, mlcroissant
+and datasets.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ SAID: dict[str, Any] = {"license": "cc-by-4.0", "published": "2026-11-22"}
 
 def write_card(source: Any, out: Path | None = None, **given: Any) -> carlasc.inspection.CardResult:
     """Write a card; what the author says of the data is given beside the other arguments."""
-    details = {field.name: given.pop(field.name) for field in fields(CardDetails) if field.name in given}
+    details = {
+        field.name: given.pop(field.name) for field in fields(CardDetails) if field.name in given
+    }
     return carlasc.card(source, out, about=CardDetails(**details), **given)
 
 
@@ -68,7 +72,14 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny simulated town with a grid, as the demo makes one."""
     root = tmp_path_factory.mktemp("simulated") / "town"
     sequence = root / "Train" / "Demo"
-    carlasc.simulate(sequence, count=2, sensors=2, lidar=Lidar(channels=16, points=4000), bev=False, run=Run(workers=1))
+    carlasc.simulate(
+        sequence,
+        count=2,
+        sensors=2,
+        lidar=Lidar(channels=16, points=4000),
+        bev=False,
+        run=Run(workers=1),
+    )
     carlasc.regrid(sequence, GridSpec.published().with_resolution(1.6), run=Run(workers=1))
     return root
 
@@ -85,7 +96,9 @@ def tables(town: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def mixed(tmp_path: Path) -> Path:
     """Two converted sequences and one that was converted from nothing."""
-    return licensed(write_dataset(tmp_path / "mixed"), {WHOLE: "CC BY-NC-SA 4.0", SCANS: "CC BY 4.0"})
+    return licensed(
+        write_dataset(tmp_path / "mixed"), {WHOLE: "CC BY-NC-SA 4.0", SCANS: "CC BY 4.0"}
+    )
 
 
 def licensed(root: Path, licenses: dict[str, object]) -> Path:
@@ -103,7 +116,10 @@ def test_the_card_of_simulated_data_is_valid_croissant_with_its_responsible_fiel
 ) -> None:
     found = validated(tables, caplog).metadata
     content = croissant(tables)
-    assert content["conformsTo"] == ["http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0"]
+    assert content["conformsTo"] == [
+        "http://mlcommons.org/croissant/1.1",
+        "http://mlcommons.org/croissant/RAI/1.0",
+    ]
     required = (
         "data_biases",
         "data_limitations",
@@ -111,7 +127,12 @@ def test_the_card_of_simulated_data_is_valid_croissant_with_its_responsible_fiel
         "data_social_impact",
         "personal_sensitive_information",
     )
-    for name in (*required, "data_collection", "data_annotation_protocol", "data_preprocessing_protocol"):
+    for name in (
+        *required,
+        "data_collection",
+        "data_annotation_protocol",
+        "data_preprocessing_protocol",
+    ):
         assert len(str(getattr(found, name))) > 30, name
     assert content["rai:hasSyntheticData"] is True
     assert [activity["prov:label"] for activity in content["prov:wasGeneratedBy"]] == [
@@ -119,13 +140,17 @@ def test_the_card_of_simulated_data_is_valid_croissant_with_its_responsible_fiel
         "Ground truth",
     ]
     assert content["prov:wasDerivedFrom"] == ["no other data set: recorded in a simulator"]
-    assert all(value not in ("", [], [""]) for name, value in content.items() if name.startswith("rai:"))
+    assert all(
+        value not in ("", [], [""]) for name, value in content.items() if name.startswith("rai:")
+    )
     assert content["license"] == "https://creativecommons.org/licenses/by/4.0/"
     assert content["creator"] == [{"@type": "sc:Organization", "name": "Town Lab"}]
 
 
 @pytest.mark.needs("mlcroissant", "pyarrow")
-def test_mlcroissant_reads_records_of_the_tables(tables: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_mlcroissant_reads_records_of_the_tables(
+    tables: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     data, sequence = validated(tables, caplog), carlasc.open(tables).sequences()[TOWN]
     point = next(iter(data.records("points")))
     assert [point[f"points/{axis}"] for axis in "xyz"] == sequence.read("points", 0)[0, :3].tolist()
@@ -134,23 +159,35 @@ def test_mlcroissant_reads_records_of_the_tables(tables: Path, caplog: pytest.Lo
     assert np.array_equal(np.reshape(frames[1]["frames/pose"], (3, 4)), sequence.read_pose(1)[:3])
     assert {record["sequences/path"] for record in data.records("sequences")} == {TOWN}
     labels = sequence.read("evaluation_32x32x2/labels", 0).reshape(-1)
-    read = [record["evaluation_32x32x2_labels/label"] for record in data.records("evaluation_32x32x2_labels")]
+    read = [
+        record["evaluation_32x32x2_labels/label"]
+        for record in data.records("evaluation_32x32x2_labels")
+    ]
     assert read[: len(labels)] == labels.tolist()
 
 
 @pytest.mark.needs("pyarrow")
 def test_checksums_are_those_of_the_files(tables: Path) -> None:
-    objects = [file for file in croissant(tables)["distribution"] if file["@type"] == "cr:FileObject"]
+    objects = [
+        file for file in croissant(tables)["distribution"] if file["@type"] == "cr:FileObject"
+    ]
     assert {file["contentUrl"] for file in objects} == {
-        path for path in files_of(tables) if path.endswith(".parquet") and not path.endswith("documents.parquet")
+        path
+        for path in files_of(tables)
+        if path.endswith(".parquet") and not path.endswith("documents.parquet")
     }
     for file in objects:
         data = (tables / file["contentUrl"]).read_bytes()
-        assert (file["sha256"], file["contentSize"]) == (hashlib.sha256(data).hexdigest(), f"{len(data)} B")
+        assert (file["sha256"], file["contentSize"]) == (
+            hashlib.sha256(data).hexdigest(),
+            f"{len(data)} B",
+        )
 
 
 @pytest.mark.needs("datasets", "pyarrow")
-def test_load_dataset_opens_the_store_as_it_is_and_the_readme_shows_how(tables: Path, tmp_path: Path) -> None:
+def test_load_dataset_opens_the_store_as_it_is_and_the_readme_shows_how(
+    tables: Path, tmp_path: Path
+) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (tables / "README.md").read_text(), re.DOTALL)
     assert len(blocks) == 2
     asked = """
@@ -165,7 +202,11 @@ print(json.dumps({
     "configs": datasets.get_dataset_config_names(data),
 }))
 """
-    offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path), "HF_DATASETS_CACHE": str(tmp_path / "cache")}
+    offline = {
+        "HF_HUB_OFFLINE": "1",
+        "HF_HOME": str(tmp_path),
+        "HF_DATASETS_CACHE": str(tmp_path / "cache"),
+    }
     ran = subprocess.run(
         [sys.executable, "-c", "".join(blocks) + asked],
         cwd=tables,
@@ -175,7 +216,10 @@ print(json.dumps({
         check=False,
     )
     assert ran.returncode == 0, ran.stderr
-    found, sequence = json.loads(ran.stdout.splitlines()[-1]), carlasc.open(tables).sequences()[TOWN]
+    found, sequence = (
+        json.loads(ran.stdout.splitlines()[-1]),
+        carlasc.open(tables).sequences()[TOWN],
+    )
     assert found["xyz"] == sequence.read("points", 0)[5, :3].tolist()
     assert found["rows"] == len(sequence.read("points", 0))
     assert (found["frames"], found["path"]) == ([0, 1], TOWN)
@@ -193,7 +237,9 @@ def test_the_hub_reads_the_head_of_the_readme(tables: Path) -> None:
     assert (found["task_categories"], found["size_categories"]) == (["other"], ["n<1K"])
     points = next(config for config in found["configs"] if config["config_name"] == "points")
     assert points["data_files"] == [{"split": "train", "path": [f"{TOWN}/points.parquet"]}]
-    assert [config["config_name"] for config in found["configs"] if config.get("default")] == ["frames"]
+    assert [config["config_name"] for config in found["configs"] if config.get("default")] == [
+        "frames"
+    ]
 
 
 @pytest.mark.needs("datasets", "pyarrow", "mlcroissant")
@@ -203,7 +249,9 @@ def test_sequences_with_other_columns_and_several_splits_are_opened(
     store = tmp_path / "x.parquet"
     carlasc.pack(write_dataset(tmp_path / "data"), store)
     write_card(store, **SAID, pictures=False)
-    names = {config["config_name"]: config["data_files"] for config in front_matter(store)["configs"]}
+    names = {
+        config["config_name"]: config["data_files"] for config in front_matter(store)["configs"]
+    }
     frames = [name for name in names if name.startswith("frames")]
     assert len(frames) > 1  # one sequence has no poses, one no scans
     assert {entry["split"] for entry in names["points"]} == {"train", "validation"}
@@ -235,8 +283,15 @@ def test_other_stores_are_valid_and_say_how_they_are_opened(
     exec(code.partition("\ndataset")[0], names := {})  # what the card tells its reader to run
     assert names["sequence"].path in carlasc.open(source).sequences()
     validated(result.folder, caplog)
-    objects = {file["@id"] for file in croissant(result.folder)["distribution"] if file["@type"] == "cr:FileObject"}
-    assert objects == {"folder": set(), "zip": {"x.zip"}, "zarr": {"x.zarr/zarr.json"}, "h5": {"x.h5"}}[kind]
+    objects = {
+        file["@id"]
+        for file in croissant(result.folder)["distribution"]
+        if file["@type"] == "cr:FileObject"
+    }
+    assert (
+        objects
+        == {"folder": set(), "zip": {"x.zip"}, "zarr": {"x.zarr/zarr.json"}, "h5": {"x.h5"}}[kind]
+    )
 
 
 @pytest.mark.parametrize("kind", ["folder", "zarr"])
@@ -247,12 +302,22 @@ def test_the_patterns_of_a_folder_find_its_files(kind: str, tmp_path: Path) -> N
     if kind == "zarr":
         carlasc.pack(root, tmp_path / "x.zarr")
         root = tmp_path
-    names = set(files_of(root)) if kind == "folder" else {name for name in files_of(root) if name.startswith("x.zarr")}
+    names = (
+        set(files_of(root))
+        if kind == "folder"
+        else {name for name in files_of(root) if name.startswith("x.zarr")}
+    )
     write_card(root if kind == "folder" else root / "x.zarr", **SAID, pictures=False)
     sets = [file for file in croissant(root)["distribution"] if file["@type"] == "cr:FileSet"]
     for one in sets:
         assert any(fnmatch(name, pattern) for name in names for pattern in one["includes"]), one
-    found = {name for name in names for one in sets for pattern in one["includes"] if fnmatch(name, pattern)}
+    found = {
+        name
+        for name in names
+        for one in sets
+        for pattern in one["includes"]
+        if fnmatch(name, pattern)
+    }
     assert names == found
 
 
@@ -260,7 +325,9 @@ def test_counts_and_classes_are_those_of_stats(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     write_card(root, **SAID, pictures=False)
     counted = carlasc.stats(root, remap=None).to_dict()["total"]["points"]
-    (records,) = [one["data"] for one in croissant(root)["recordSet"] if one["@id"] == "classes-carla"]
+    (records,) = [
+        one["data"] for one in croissant(root)["recordSet"] if one["@id"] == "classes-carla"
+    ]
     for row in records:
         share = counted[row["classes-carla/name"]] / sum(counted.values())
         assert row["classes-carla/points"] == pytest.approx(share, abs=1e-6)
@@ -302,31 +369,47 @@ def test_a_non_commercial_set_stays_so_and_each_source_keeps_its_licence(mixed: 
 
 
 @pytest.mark.parametrize(
-    "license_", ["CC BY-NC-ND 3.0", "cc-by-nd-4.0", "https://creativecommons.org/licenses/by-nc-nd/3.0/deed.fr"]
+    "license_",
+    [
+        "CC BY-NC-ND 3.0",
+        "cc-by-nd-4.0",
+        "https://creativecommons.org/licenses/by-nc-nd/3.0/deed.fr",
+    ],
 )
-def test_a_set_that_forbids_passing_on_is_refused_with_the_reason(tmp_path: Path, license_: str) -> None:
+def test_a_set_that_forbids_passing_on_is_refused_with_the_reason(
+    tmp_path: Path, license_: str
+) -> None:
     root = licensed(write_dataset(tmp_path / "data"), {SCANS: license_})
     with pytest.raises(
-        CarlascError, match=r"found CC BY-(NC-)?ND \d\.0 of set of Val, which forbids that: publish instead how"
+        CarlascError,
+        match=r"found CC BY-(NC-)?ND \d\.0 of set of Val, which forbids that: publish instead how",
     ):
         write_card(root, **SAID, pictures=False)
     assert not (root / "README.md").exists()
 
 
 @pytest.mark.parametrize("license_", ["ask the authors", 4, ["CC BY 4.0"], "CC BY-NC-SA"])
-def test_a_licence_in_the_data_that_nobody_knows_is_one_line(tmp_path: Path, license_: object) -> None:
+def test_a_licence_in_the_data_that_nobody_knows_is_one_line(
+    tmp_path: Path, license_: object
+) -> None:
     root = licensed(write_dataset(tmp_path / "data"), {WHOLE: license_})
-    with pytest.raises(FormatError, match=r"carlasc\.json: expected the name of a licence, .* look it up"):
+    with pytest.raises(
+        FormatError, match=r"carlasc\.json: expected the name of a licence, .* look it up"
+    ):
         write_card(root, **SAID, pictures=False)
 
 
 def test_an_unknown_licence_names_those_that_are_near(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
-    with pytest.raises(ArgumentError, match=r"license: expected .*cc-by-sa-4\.0.*, found 'cc-by-sa-5\.0'"):
+    with pytest.raises(
+        ArgumentError, match=r"license: expected .*cc-by-sa-4\.0.*, found 'cc-by-sa-5\.0'"
+    ):
         write_card(root, license="cc-by-sa-5.0", pictures=False)
 
 
-def test_a_licence_of_your_own_is_named_by_its_address(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_licence_of_your_own_is_named_by_its_address(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     root = write_dataset(tmp_path / "data")
     write_card(root, license="https://lab.example/terms", published="2026-11-22", pictures=False)
     found = front_matter(root)
@@ -349,7 +432,8 @@ def test_a_given_licence_does_not_replace_that_of_the_source(tmp_path: Path) -> 
     root = write_dataset(tmp_path / "data")
     licensed(root, dict.fromkeys(carlasc.open(root).sequences(), "CC BY-NC-SA 3.0"))
     with pytest.raises(
-        ArgumentError, match=r"license: expected CC BY-NC-SA 3\.0, the licence of the source, .*, found MIT"
+        ArgumentError,
+        match=r"license: expected CC BY-NC-SA 3\.0, the licence of the source, .*, found MIT",
     ):
         write_card(root, license="mit", pictures=False)
     assert write_card(root, pictures=False).licenses == ("CC BY-NC-SA 3.0",)
@@ -387,14 +471,22 @@ def test_a_run_that_was_killed_is_finished_by_the_next(tmp_path: Path) -> None:
         write_card(root, **SAID, pictures=False)
 
 
-def test_data_behind_a_url_have_their_card_in_a_folder_here(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_data_behind_a_url_have_their_card_in_a_folder_here(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     fsspec = pytest.importorskip("fsspec")
     source = write_zip(files_of(write_dataset(tmp_path / "data")), tmp_path / "x.zip")
     fsspec.filesystem("memory").pipe("/cards/x.zip", source.read_bytes())
-    with pytest.raises(ArgumentError, match=r"out: expected a folder for the card, because memory://cards/x\.zip"):
+    with pytest.raises(
+        ArgumentError, match=r"out: expected a folder for the card, because memory://cards/x\.zip"
+    ):
         write_card("memory://cards/x.zip", **SAID, pictures=False)
     write_card("memory://cards/x.zip", tmp_path / "card", **SAID, pictures=False)
-    (file,) = [file for file in croissant(tmp_path / "card")["distribution"] if file["@type"] == "cr:FileObject"]
+    (file,) = [
+        file
+        for file in croissant(tmp_path / "card")["distribution"]
+        if file["@type"] == "cr:FileObject"
+    ]
     assert (file["contentUrl"], file["encodingFormat"]) == ("x.zip", "application/zip")
     assert file["sha256"] == hashlib.sha256(source.read_bytes()).hexdigest()
     assert front_matter(tmp_path / "card")["pretty_name"] == "x"
@@ -431,7 +523,10 @@ def test_wrong_arguments_are_one_line(tmp_path: Path, given: dict[str, Any], exp
 
 def test_names_in_the_data_make_no_markup(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     root = write_dataset(tmp_path / "data")
-    table = {"name": "evil|<b>", "names": {"0": "free", "1": "<script>alert(1)</script>|x", "2": "a\n# b"}}
+    table = {
+        "name": "evil|<b>",
+        "names": {"0": "free", "1": "<script>alert(1)</script>|x", "2": "a\n# b"},
+    }
     colors = {"colors": {index: [0, 0, 0] for index in table["names"]}}
     table["names"] |= {str(k): f"c{k}" for k in range(3, 23)}
     colors["colors"] |= {str(k): [0, 0, 0] for k in range(3, 23)}
@@ -449,12 +544,23 @@ def test_names_in_the_data_make_no_markup(tmp_path: Path, caplog: pytest.LogCapt
 def test_a_published_store_is_addressed_at_the_hub(
     tables: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    write_card(tables, tmp_path / "card", url="https://huggingface.co/datasets/lab/town", pictures=False, **SAID)
+    write_card(
+        tables,
+        tmp_path / "card",
+        url="https://huggingface.co/datasets/lab/town",
+        pictures=False,
+        **SAID,
+    )
     content = croissant(tmp_path / "card")
-    address = f"https://huggingface.co/datasets/lab/town/resolve/main/town.parquet/{TOWN}/points.parquet"
+    address = (
+        f"https://huggingface.co/datasets/lab/town/resolve/main/town.parquet/{TOWN}/points.parquet"
+    )
     assert address in [file.get("contentUrl") for file in content["distribution"]]
     text = (tmp_path / "card" / "README.md").read_text()
-    assert 'data = "lab/town"' in text and 'carlasc.open("hf://datasets/lab/town/town.parquet")' in text
+    assert (
+        'data = "lab/town"' in text
+        and 'carlasc.open("hf://datasets/lab/town/town.parquet")' in text
+    )
     validated(tmp_path / "card", caplog)
 
 
@@ -479,13 +585,24 @@ def test_a_grid_that_cannot_be_described_is_not_left_out(tmp_path: Path) -> None
 def test_the_command_prints_what_it_wrote(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     (tmp_path / "cite.bib").write_text("@misc{town}")
-    arguments = ["--license", "mit", "--author", "A", "--author", "B", "--citation", str(tmp_path / "cite.bib")]
+    arguments = [
+        "--license",
+        "mit",
+        "--author",
+        "A",
+        "--author",
+        "B",
+        "--citation",
+        str(tmp_path / "cite.bib"),
+    ]
     result = CliRunner().invoke(
         app, ["card", str(root), *arguments, "--no-pictures", "--json", "-o", str(tmp_path / "c")]
     )
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
-    assert found["files"] == [str(tmp_path / "c" / name) for name in ("README.md", "croissant.json")]
+    assert found["files"] == [
+        str(tmp_path / "c" / name) for name in ("README.md", "croissant.json")
+    ]
     assert croissant(tmp_path / "c")["citeAs"] == "@misc{town}"
     assert [author["name"] for author in croissant(tmp_path / "c")["creator"]] == ["A", "B"]
 
@@ -495,9 +612,16 @@ def test_the_card_of_converted_data_keeps_their_licence_and_names_their_authors(
 ) -> None:
     write_tiny_kitti(tmp_path / "kitti", frames=2)
     carlasc.convert(
-        "kitti", tmp_path / "kitti", tmp_path / "out", poses=PoseOptions(source="file"), grids=None, run=Run(workers=1)
+        "kitti",
+        tmp_path / "kitti",
+        tmp_path / "out",
+        poses=PoseOptions(source="file"),
+        grids=None,
+        run=Run(workers=1),
     )
-    assert write_card(tmp_path / "out", pictures=False, published="2026-11-22").licenses == ("CC BY-NC-SA 3.0",)
+    assert write_card(tmp_path / "out", pictures=False, published="2026-11-22").licenses == (
+        "CC BY-NC-SA 3.0",
+    )
     text, content = (tmp_path / "out" / "README.md").read_text(), croissant(tmp_path / "out")
     assert front_matter(tmp_path / "out")["license"] == "cc-by-nc-sa-3.0"
     assert "- kitti kitti: J. Behley et al., SemanticKITTI, ICCV 2019" in text
@@ -525,7 +649,10 @@ def test_rounded_coordinates_are_said(town: Path, tmp_path: Path) -> None:
     from carlasc.storage.packed.stores import PackOptions
     from carlasc.storage.parquet.parquet_sink import ParquetSink
 
-    with ParquetSink(tmp_path / "x.parquet", PackOptions(lossy_mm=2)) as sink, sink.sequence(SCANS) as writer:
+    with (
+        ParquetSink(tmp_path / "x.parquet", PackOptions(lossy_mm=2)) as sink,
+        sink.sequence(SCANS) as writer,
+    ):
         writer.write("points", 0, np.ones((3, 4), np.float32))
     write_card(tmp_path / "x.parquet", **SAID, pictures=False)
     text = (tmp_path / "x.parquet" / "README.md").read_text()

@@ -21,7 +21,10 @@ def statistics():
 
 def objects_of(pdf):
     """Return the objects of a PDF by number: the bytes between `obj` and `endobj`."""
-    return {int(number): body for number, body in re.findall(rb"(\d+) 0 obj\s(.*?)endobj", pdf, re.DOTALL)}
+    return {
+        int(number): body
+        for number, body in re.findall(rb"(\d+) 0 obj\s(.*?)endobj", pdf, re.DOTALL)
+    }
 
 
 def test_a_pdf_contains_its_fonts_as_truetype(statistics, tmp_path):
@@ -29,13 +32,19 @@ def test_a_pdf_contains_its_fonts_as_truetype(statistics, tmp_path):
     objects = objects_of((tmp_path / "a.pdf").read_bytes())
     fonts = [body for body in objects.values() if re.search(rb"/Type /Font\b(?!Desc)", body)]
     kinds = {re.search(rb"/Subtype /(\w+)", body)[1] for body in fonts}
-    assert fonts and kinds <= {b"Type0", b"CIDFontType2", b"TrueType"}  # Type 3 is what publishers refuse
+    # Type 3 is what publishers refuse
+    assert fonts and kinds <= {
+        b"Type0",
+        b"CIDFontType2",
+        b"TrueType",
+    }
     descriptors = [body for body in objects.values() if b"/Type /FontDescriptor" in body]
     assert descriptors
     for descriptor in descriptors:
         file = objects[int(re.search(rb"/FontFile2 (\d+) 0 R", descriptor)[1])]
         data = re.search(rb"stream\r?\n(.*?)\r?\nendstream", file, re.DOTALL)[1]
-        assert zlib.decompress(data).startswith(b"\x00\x01\x00\x00")  # the first bytes of a TrueType font
+        # the first bytes of a TrueType font
+        assert zlib.decompress(data).startswith(b"\x00\x01\x00\x00")
 
 
 def test_the_letters_of_an_svg_are_outlines(statistics, tmp_path):

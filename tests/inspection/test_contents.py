@@ -1,4 +1,6 @@
-"""Checks of files and poses on a small sequence with one fault each, and with values just inside and outside the limits."""
+"""Checks of files and poses on a small sequence with one fault each, and with values just inside
+and outside the limits.
+"""
 
 from __future__ import annotations
 
@@ -61,14 +63,19 @@ def test_a_sound_sequence_has_no_findings(folder):
 @pytest.mark.parametrize(("speed", "count"), [(100, 0), (101, 1), (-101, 1)])
 def test_velocities_of_more_than_100_m_s_are_a_warning(folder, speed, count):
     rewrite(folder / "predictions/000000.bin", lambda flow: flow.__setitem__(4, speed))
-    assert [(s, c) for s, c, _ in findings(check_values, folder, 0)] == [("warning", "flow")] * count
+    assert [(s, c) for s, c, _ in findings(check_values, folder, 0)] == [
+        ("warning", "flow")
+    ] * count
 
 
 @pytest.mark.parametrize("count", [-1, 0.5, 1.5, np.inf])
 def test_counts_are_whole_numbers_of_votes(folder, count):
     rewrite(folder / "evaluation/000000.bin", lambda counts: counts.__setitem__(slice(3), count))
     texts = [text for *_, text in findings(check_values, folder, 0)]
-    assert f"expected whole numbers of votes, 0 or more, found {count:g}, and 2 other such values" in texts[0]
+    assert (
+        f"expected whole numbers of votes, 0 or more, found {count:g}, and 2 other such values"
+        in texts[0]
+    )
 
 
 def test_a_grid_without_any_vote_is_a_warning(folder):
@@ -87,10 +94,14 @@ def test_a_picture_that_is_no_jpeg_is_a_warning(folder):
 def test_an_empty_scan_is_a_warning(folder):
     for name in ("velodyne/000000.bin", "labels/000000.label", "predictions/000000.bin"):
         (folder / name).write_bytes(b"")
-    assert [finding[:2] for finding in findings(check_shapes, folder, 0)] == [("warning", "empty-scan")]
+    assert [finding[:2] for finding in findings(check_shapes, folder, 0)] == [
+        ("warning", "empty-scan")
+    ]
 
 
-@pytest.mark.parametrize(("channels", "sound"), [(23, True), (22, False), ("23", False), (None, False)])
+@pytest.mark.parametrize(
+    ("channels", "sound"), [(23, True), (22, False), ("23", False), (None, False)]
+)
 def test_params_say_as_many_channels_as_there_are_classes(folder, channels, sound):
     path = folder / "evaluation/params.json"
     path.write_text(json.dumps(SPEC.to_params() | {"num_channels": channels}))
@@ -111,7 +122,9 @@ def test_a_grid_without_counts_is_a_warning_unless_a_network_predicted_it(folder
     ((severity, check, _),) = findings(check_documents, folder)
     assert (severity, check) == ("warning", "frame-counts")
     path = folder / "evaluation/params.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"carlasc": {"network": "lmscnet_ss"}}))
+    path.write_text(
+        json.dumps(json.loads(path.read_text()) | {"carlasc": {"network": "lmscnet_ss"}})
+    )
     assert findings(check_documents, folder) == []
 
 
@@ -135,7 +148,11 @@ def test_a_gap_between_grids_alone_is_only_a_note(folder):
 def write_poses(folder, poses, frames=None):
     """Write poses, and only the scans of some frames."""
     (folder / layout.POSES).write_bytes(layout.encode_poses(np.asarray(poses)))
-    for path in [*folder.glob("*/00000*.label"), *folder.glob("*/00000*.bin"), *folder.glob("bev/*")]:
+    for path in [
+        *folder.glob("*/00000*.label"),
+        *folder.glob("*/00000*.bin"),
+        *folder.glob("bev/*"),
+    ]:
         path.unlink()
     for frame in range(len(poses)) if frames is None else frames:
         np.ones((5, 4), "<f4").tofile(folder / f"velodyne/{frame:06d}.bin")
@@ -165,7 +182,9 @@ def drive(steps, turns=None):
 )
 def test_steps_that_a_vehicle_cannot_make_are_errors(folder, steps, turns, jumps):
     write_poses(folder, drive(steps, turns))
-    assert [finding[:2] for finding in findings(check_poses, folder)] == [("error", "pose-jump")] * jumps
+    assert [finding[:2] for finding in findings(check_poses, folder)] == [
+        ("error", "pose-jump")
+    ] * jumps
 
 
 def test_a_step_over_missing_frames_may_be_longer(folder):
@@ -196,7 +215,9 @@ def test_poses_are_rigid_up_to_a_thousandth(folder, scale, sound):
         assert "(and 2 more such lines)" in found[0][2]
 
 
-@pytest.mark.parametrize(("times", "text"), [([0.0, 0.0], "0 s in line 2 after 0 s"), ([0.0, np.nan], "line 2")])
+@pytest.mark.parametrize(
+    ("times", "text"), [([0.0, 0.0], "0 s in line 2 after 0 s"), ([0.0, np.nan], "line 2")]
+)
 def test_times_increase(folder, times, text):
     (folder / layout.TIMES).write_bytes(layout.encode_times(np.array(times)))
     ((severity, check, found),) = findings(check_times, folder)
@@ -231,12 +252,22 @@ def test_frames_without_boxes_were_not_annotated_and_are_no_finding(folder):
 @pytest.mark.parametrize(
     ("changes", "severity", "check", "message"),
     [
-        ({"x": np.nan}, "error", "boxes", r"boxes/000000.bin.*finite numbers.*in box 1 \(track 2\)"),
+        (
+            {"x": np.nan},
+            "error",
+            "boxes",
+            r"boxes/000000.bin.*finite numbers.*in box 1 \(track 2\)",
+        ),
         ({"height": 0}, "error", "boxes", "positive lengths, widths and heights"),
         ({"qz": 0.5}, "error", "boxes", "a quaternion of length 1"),
         ({"track": 1}, "error", "boxes", "one box per track in a frame"),
         ({"label": 77}, "error", "class-ids", r"class ids of carla, found 77 \(1 times\)"),
-        ({"y": 501}, "warning", "boxes", r"boxes within 500 m, found track 2 at \[9.0, 501.0, -1.0\]"),
+        (
+            {"y": 501},
+            "warning",
+            "boxes",
+            r"boxes within 500 m, found track 2 at \[9.0, 501.0, -1.0\]",
+        ),
     ],
 )
 def test_boxes_that_are_wrong_are_found(folder, changes, severity, check, message):

@@ -26,7 +26,9 @@ def writer(tmp_path):
     writer.write("evaluation/counts", 0, np.ones(SPEC.size, np.float32))
     writer.write("evaluation/occupied", 0, np.linspace(0, 1, 8).reshape(SPEC.size))
     # three thirds, each rounded up, are one step more than 1
-    writer.write("evaluation/classes", 0, table((0, 7, 65535), (7, 1, 21845), (7, 7, 21846), (7, 10, 21845)))
+    writer.write(
+        "evaluation/classes", 0, table((0, 7, 65535), (7, 1, 21845), (7, 7, 21846), (7, 10, 21845))
+    )
     writer.write("evaluation/flags", 0, np.full(SPEC.size, sum(VoxelFlag), np.uint8))
     writer.write("evaluation/views", 0, np.full(SPEC.size, 65535, np.uint16))
     return writer
@@ -51,11 +53,27 @@ def test_a_sound_grid_has_no_findings(writer):
             "000000.occupied.bin: expected probabilities of 0 to 1, found 1.25, and 7 other",
         ),
         ("occupied", np.array([0.5, -0.1, np.nan, 1, 0, 0, 0, 0]), "found -0.0999756, and 1 other"),
-        ("flags", np.array([15, 16, 255, 0, 0, 0, 0, 0], np.uint8), "expected flags of 0 to 15, found 16, and 1 other"),
-        ("classes", table((0, 7, 1), (8, 7, 1)), "expected voxels 0 to 7, found 8, and 0 other such rows"),
+        (
+            "flags",
+            np.array([15, 16, 255, 0, 0, 0, 0, 0], np.uint8),
+            "expected flags of 0 to 15, found 16, and 1 other",
+        ),
+        (
+            "classes",
+            table((0, 7, 1), (8, 7, 1)),
+            "expected voxels 0 to 7, found 8, and 0 other such rows",
+        ),
         ("classes", table((-1, 7, 1)), "found -1, and 0 other such rows"),
-        ("classes", table((0, 24, 1), (0, 0, 1)), "expected class ids of carla other than 0, found 24, and 1 other"),
-        ("classes", table((2, 7, 65535), (2, 8, 5)), "at most 65535 per voxel, found 65540 in voxel 2, and 0 other"),
+        (
+            "classes",
+            table((0, 24, 1), (0, 0, 1)),
+            "expected class ids of carla other than 0, found 24, and 1 other",
+        ),
+        (
+            "classes",
+            table((2, 7, 65535), (2, 8, 5)),
+            "at most 65535 per voxel, found 65540 in voxel 2, and 0 other",
+        ),
     ],
 )
 def test_values_out_of_range_are_errors(writer, part, array, message):
@@ -71,7 +89,9 @@ def test_a_frame_without_one_of_the_fields_is_an_error_where_others_have_it(writ
     writer.write("evaluation/counts", 1, np.ones(SPEC.size, np.float32))
     found = findings(check_frames, writer)
     assert [(severity, check) for severity, check, _ in found] == [("error", "frame-counts")] * 4
-    assert all(any(f"evaluation/{part}" in text for *_, text in found) for part in layout.EVIDENCE_FIELDS)
+    assert all(
+        any(f"evaluation/{part}" in text for *_, text in found) for part in layout.EVIDENCE_FIELDS
+    )
 
 
 def test_info_names_the_fields(writer):

@@ -12,11 +12,17 @@ from carlasc.inspection.findings import Finding, SequenceReport, ValidationResul
     ("error", "advice", "expected"),
     [
         (
-            FormatError("a.bin", expected="a b, found in c: x", found="d: expected e", advice="copy it"),
+            FormatError(
+                "a.bin", expected="a b, found in c: x", found="d: expected e", advice="copy it"
+            ),
             "make it again",
             ("a.bin", "a b, found in c: x", "d: expected e", "copy it"),
         ),
-        (FormatError("a.bin", expected="b", found="c"), "make it again", ("a.bin", "b", "c", "make it again")),
+        (
+            FormatError("a.bin", expected="b", found="c"),
+            "make it again",
+            ("a.bin", "b", "c", "make it again"),
+        ),
         (
             FormatError("a.json", problem="does not parse", expected="JSON", found="{"),
             "",
@@ -38,7 +44,11 @@ def test_the_parts_of_an_error_become_those_of_a_finding(error, advice, expected
 
 def test_a_finding_reads_as_an_error_does():
     error = FormatError("a.bin", expected="b", found="c", advice="d")
-    assert str(Finding.from_error("check", "", "", error)) == str(error) == "a.bin: expected b, found c: d"
+    assert (
+        str(Finding.from_error("check", "", "", error))
+        == str(error)
+        == "a.bin: expected b, found c: d"
+    )
     assert str(Finding("note", "check", "", "a.bin", "b", "c")) == "a.bin: expected b, found c"
 
 
@@ -47,9 +57,20 @@ def finding(severity, check="x"):
 
 
 def test_findings_are_grouped_by_check_with_errors_first():
-    findings = (finding("note"), finding("warning"), finding("error", "y"), finding("note"), finding("error"))
+    findings = (
+        finding("note"),
+        finding("warning"),
+        finding("error", "y"),
+        finding("note"),
+        finding("error"),
+    )
     result = ValidationResult("place", findings, ())
-    assert list(result.grouped()) == [("error", "y"), ("error", "x"), ("warning", "x"), ("note", "x")]
+    assert list(result.grouped()) == [
+        ("error", "y"),
+        ("error", "x"),
+        ("warning", "x"),
+        ("note", "x"),
+    ]
     assert len(result.grouped()["note", "x"]) == 2
     assert [result.count(severity) for severity in ("error", "warning", "note")] == [2, 1, 2]
 
@@ -63,7 +84,11 @@ def test_a_result_as_a_dictionary_holds_all_of_it():
     report = SequenceReport("Val/A", 10, 2, {"evaluation": 0.5}, 0.25)
     values = ValidationResult("place", (finding("warning"),), (report,)).to_dict()
     assert values["counts"] == {"error": 0, "warning": 1, "note": 0}
-    assert (values["ok"], values["location"], values["findings"][0]["expected"]) == (True, "place", "b")
+    assert (values["ok"], values["location"], values["findings"][0]["expected"]) == (
+        True,
+        "place",
+        "b",
+    )
     assert values["sequences"] == [
         {
             "path": "Val/A",

@@ -1,4 +1,6 @@
-"""Held-out rays: scans that are left out are hidden completely, and their rays tell good grids from bad ones."""
+"""Held-out rays: scans that are left out are hidden completely, and their rays tell good grids from
+bad ones.
+"""
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
@@ -100,15 +102,25 @@ def small_grid():
 
 def test_each_return_is_counted_by_where_it_ends_and_what_it_passes():
     points = np.array(
-        [[8.4, 0.4, 0.4], [6.5, 0.5, 0.5], [3.5, 1.6, 0.2], [30.0, 0, 0], [4.6, 0.3, 0.5], [5.5, -0.5, 0.5]]
+        [
+            [8.4, 0.4, 0.4],
+            [6.5, 0.5, 0.5],
+            [3.5, 1.6, 0.2],
+            [30.0, 0, 0],
+            [4.6, 0.3, 0.5],
+            [5.5, -0.5, 0.5],
+        ]
     )
-    scores = HeldOutScores.of(small_grid(), CARLA, points, np.array([1, 10, 10, 1, 10, 7], np.uint8))
+    scores = HeldOutScores.of(
+        small_grid(), CARLA, points, np.array([1, 10, 10, 1, 10, 7], np.uint8)
+    )
     rays = scores.all
     assert rays.returns == 5  # one is outside
     assert rays.free == pytest.approx(1 / 5)
     assert rays.unknown == pytest.approx(1 / 5)
     assert rays.occupied == pytest.approx(3 / 5)
-    assert rays.passed == pytest.approx(3 / 5)  # two behind the vehicle, and one that passes the road
+    # two behind the vehicle, and one that passes the road
+    assert rays.passed == pytest.approx(3 / 5)
     assert rays.passed_object == pytest.approx(2 / 5)
     assert scores.by_class()["Vehicle"].returns == 3
     assert scores.by_class()["Vehicle"].free == pytest.approx(1 / 3)
@@ -144,7 +156,10 @@ def test_merged_scores_are_those_of_all_frames():
     labels = np.array([1, 10, 10, 7], np.uint8)
     pose = [translation((4.0, 0.0, 0.5))]
     whole = HeldOutScores.of(small_grid(), CARLA, points, labels)
-    parts = [HeldOutScores.of(small_grid(), CARLA, points[i : i + 2], labels[i : i + 2], pose) for i in (0, 2)]
+    parts = [
+        HeldOutScores.of(small_grid(), CARLA, points[i : i + 2], labels[i : i + 2], pose)
+        for i in (0, 2)
+    ]
     merged = parts[0].merge(parts[1])
     assert merged.all == whole.all
     assert merged.frames == 2
@@ -153,7 +168,11 @@ def test_merged_scores_are_those_of_all_frames():
 
 def test_swept_voxels_are_those_whose_centre_the_vehicle_covers():
     spec = GridSpec.published()
-    poses = [translation((3.0, -1.0, 0.2)) @ rotation_z(0.7), translation((40.0, 0.0, 0.0)), translation((25.0, 0, 0))]
+    poses = [
+        translation((3.0, -1.0, 0.2)) @ rotation_z(0.7),
+        translation((40.0, 0.0, 0.0)),
+        translation((25.0, 0, 0)),
+    ]
     centers = spec.centers().reshape(-1, 3)
     wanted = np.zeros(spec.num_voxels, bool)
     for pose in poses:
@@ -166,11 +185,17 @@ def test_swept_voxels_are_those_whose_centre_the_vehicle_covers():
 def test_traces_are_told_from_a_clean_grid(street):
     scores = {
         dynamic: holdout(
-            street, passing_car.SPEC, observe=FromScans(window=(-6, 6), dynamic=dynamic), every=4, run=Run(workers=1)
+            street,
+            passing_car.SPEC,
+            observe=FromScans(window=(-6, 6), dynamic=dynamic),
+            every=4,
+            run=Run(workers=1),
         ).total
         for dynamic in ("tube", "align", "current")
     }
-    tube, align, current = (scores[name].by_class()["Vehicle"] for name in ("tube", "align", "current"))
+    tube, align, current = (
+        scores[name].by_class()["Vehicle"] for name in ("tube", "align", "current")
+    )
     assert scores["tube"].all.passed_object > 1.5 * scores["align"].all.passed_object
     assert current.free > 2 * align.free  # a car that is in no other scan's place is missing
     assert tube.returns == align.returns > 100
@@ -193,7 +218,10 @@ def test_frames_whose_window_is_cut_are_not_measured(bare):
     result = holdout(bare, observe=FromScans(window=(-3, 3)), every=2, run=Run(workers=1))
     assert result.total.frames == 2  # of frames 1, 3, 5 and 7, those with a whole window
     assert (
-        holdout(bare, observe=FromScans(window=(-3, 3)), every=2, frames=(0, 2), run=Run(workers=1)).total.frames == 1
+        holdout(
+            bare, observe=FromScans(window=(-3, 3)), every=2, frames=(0, 2), run=Run(workers=1)
+        ).total.frames
+        == 1
     )
     with pytest.raises(MissingDataError, match="leave out"):
         holdout(bare, every=2, frames=(2, 3))
@@ -205,9 +233,8 @@ def test_executors_give_the_same_scores_and_progress_counts_frames(bare):
     with ThreadPoolExecutor(2) as threads:
         other = holdout(bare, every=3, run=Run(executor=threads, workers=2))
     assert one.to_dict() | {"elapsed_s": 0} == other.to_dict() | {"elapsed_s": 0}
-    assert steps == [
-        (done, 18) for done in range(19)
-    ]  # nine scans for poses, six in which actors are found, three frames
+    # nine scans for poses, six in which actors are found, three frames
+    assert steps == [(done, 18) for done in range(19)]
 
 
 def test_a_scan_that_cannot_be_read_is_reported_and_the_others_are_measured(tmp_path):

@@ -16,8 +16,14 @@ FRAMES, WIDTH, HEIGHT = 9, 320, 120
 
 
 def write(folder, shift=0, late=0, noise=False):
-    """Write a drive with a camera that looks to the left; its images are shifted, or those of later frames."""
-    poses, street, rng = drive(FRAMES + late, speed_m=0.8), Street.random(4), np.random.default_rng(0)
+    """Write a drive with a camera that looks to the left; its images are shifted, or those of later
+    frames.
+    """
+    poses, street, rng = (
+        drive(FRAMES + late, speed_m=0.8),
+        Street.random(4),
+        np.random.default_rng(0),
+    )
     write_drive(folder / "A/cartesian", poses[:FRAMES], labelled=False, seed=4)
     matrix = np.array([[200.0, 0, (WIDTH - 1) / 2], [0, 200, (HEIGHT - 1) / 2], [0, 0, 1]])
     place = optical_axes((0.3, -1.0), "left")
@@ -28,8 +34,14 @@ def write(folder, shift=0, late=0, noise=False):
         points, _ = street.scan(poses[frame], rng, channels=32, columns=900)
         writer.write("points", frame, np.column_stack([points, np.zeros(len(points), np.float32)]))
         classes = np.roll(cast_image(street, poses[frame + late], one)[0], shift, axis=1)
-        pixels = rng.integers(0, 255, classes.shape).astype(np.uint8) if noise else classes * np.uint8(11)
-        writer.write("images.side.png", frame, encode_image(np.repeat(pixels[..., None], 3, axis=2), "PNG"))
+        pixels = (
+            rng.integers(0, 255, classes.shape).astype(np.uint8)
+            if noise
+            else classes * np.uint8(11)
+        )
+        writer.write(
+            "images.side.png", frame, encode_image(np.repeat(pixels[..., None], 3, axis=2), "PNG")
+        )
     return folder
 
 
@@ -50,7 +62,11 @@ def test_a_shift_of_the_image_is_a_warning_with_its_pixels(tmp_path):
     assert found.shift_px == pytest.approx(8, abs=2) and found.is_wrong
     result = validate(tmp_path)
     (finding,) = [one for one in result.findings if one.check == "images-on-scans"]
-    assert finding.severity == "warning" and "side: +" in finding.found and "pixels to the right" in finding.found
+    assert (
+        finding.severity == "warning"
+        and "side: +" in finding.found
+        and "pixels to the right" in finding.found
+    )
     assert "pixels to the right" in result.sequences[0].images["side"]
 
 
@@ -63,4 +79,6 @@ def test_images_of_the_next_frame_are_late(tmp_path):
 @pytest.mark.slow
 def test_noise_determines_nothing(tmp_path):
     found = agreement(write(tmp_path, noise=True))
-    assert (found.shift_px, found.late_s) == (None, None) and str(found) == "undetermined, undetermined"
+    assert (found.shift_px, found.late_s) == (None, None) and str(
+        found
+    ) == "undetermined, undetermined"

@@ -1,4 +1,6 @@
-"""`doctor` says what is installed, names no user, and tells what is broken from what is only missing."""
+"""`doctor` says what is installed, names no user, and tells what is broken from what is only
+missing.
+"""
 
 import errno
 import importlib
@@ -34,7 +36,9 @@ def required(lines, extras):
 
 @pytest.fixture
 def metadata_of_project(monkeypatch):
-    """The requirements as pyproject.toml has them now, whatever was installed; returns them by extra ("" without)."""
+    """The requirements as pyproject.toml has them now, whatever was installed; returns them by
+    extra ("" without).
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lines = {"": project["dependencies"], **project["optional-dependencies"]}
     listed = [
@@ -52,8 +56,13 @@ def test_every_package_of_every_extra_for_users_is_listed(metadata_of_project):
     listed = {"": found.packages} | {extra.name: extra.packages for extra in found.extras}
     for extra, lines in metadata_of_project.items():
         if extra not in installation.FOR_DEVELOPERS:
-            wanted = {(need.name, next(iter(need.specifier)).version) for need in required(lines, metadata_of_project)}
-            assert {(package.name, package.lowest) for package in listed.pop(extra)} == wanted, extra
+            wanted = {
+                (need.name, next(iter(need.specifier)).version)
+                for need in required(lines, metadata_of_project)
+            }
+            assert {(package.name, package.lowest) for package in listed.pop(extra)} == wanted, (
+                extra
+            )
     assert listed == {}
     assert found.version == carlasc.__version__
     assert found.ok and found.problems == ()
@@ -97,7 +106,9 @@ def test_a_needed_package_that_is_too_old_is_a_problem(monkeypatch):
     assert re.search(r"\nproblems\n  rich 10.1 is older than [\d.]+\n$", ran.output)
 
 
-def test_a_needed_package_that_does_not_load_is_a_problem_and_what_needs_it_is_left_out(monkeypatch):
+def test_a_needed_package_that_does_not_load_is_a_problem_and_what_needs_it_is_left_out(
+    monkeypatch,
+):
     real = importlib.import_module
 
     def load(name, *arguments):

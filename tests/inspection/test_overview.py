@@ -17,7 +17,9 @@ from carlasc.storage.published import PublishedSequence
 
 @pytest.fixture
 def data(golden_capture: Path, tmp_path: Path) -> Path:
-    """A data set of two sequences; one with gaps, two grids, a record, metadata, and its raw capture beside it."""
+    """A data set of two sequences; one with gaps, two grids, a record, metadata, and its raw
+    capture beside it.
+    """
     first, second = tmp_path / "Train/Town01_Light", tmp_path / "Val/Town07_Heavy"
     shutil.copytree(golden_capture / "cartesian", first / "cartesian")
     shutil.copytree(golden_capture / "cartesian", second / "cartesian")
@@ -25,23 +27,40 @@ def data(golden_capture: Path, tmp_path: Path) -> Path:
     fine = second / "cartesian" / "evaluation_256x256x16"
     shutil.copytree(golden_capture / "cartesian_fine" / "evaluation", fine)
     params = json.loads((fine / "params.json").read_text())
-    (fine / "params.json").write_text(json.dumps(params | {"carlasc": {"version": "0.1", "vote": "sensor"}}))
+    (fine / "params.json").write_text(
+        json.dumps(params | {"carlasc": {"version": "0.1", "vote": "sensor"}})
+    )
     for path in second.glob("cartesian/*/000001.*"):
         path.unlink()
-    (second / "cartesian" / layout.METADATA).write_text(json.dumps({"sensor": "HDL-64E", "source": "elsewhere"}))
+    (second / "cartesian" / layout.METADATA).write_text(
+        json.dumps({"sensor": "HDL-64E", "source": "elsewhere"})
+    )
     return tmp_path
 
 
 def test_a_data_set_is_described_from_its_splits_to_its_grids(data: Path) -> None:
     overview = info(data)
-    assert (overview.level, overview.store, overview.splits) == ("data set", "folder", {"Train": 1, "Val": 1})
+    assert (overview.level, overview.store, overview.splits) == (
+        "data set",
+        "folder",
+        {"Train": 1, "Val": 1},
+    )
     light, heavy = overview.sequences
-    assert (light.path, light.split, light.name) == ("Train/Town01_Light/cartesian", "Train", "Town01_Light")
+    assert (light.path, light.split, light.name) == (
+        "Train/Town01_Light/cartesian",
+        "Train",
+        "Town01_Light",
+    )
     assert (light.frames, light.first, light.last, light.gaps) == (3, 0, 2, 0)
     assert (heavy.frames, heavy.first, heavy.last, heavy.gaps) == (2, 0, 2, 1)
     assert light.fields == {"bev": 3, "flow": 3, "labels": 3, "points": 3}
     assert set(light.documents) == {"poses.txt", "times.txt"}
-    assert (heavy.sensor, heavy.source, heavy.axes, heavy.classes) == ("HDL-64E", "elsewhere", "left", "carla")
+    assert (heavy.sensor, heavy.source, heavy.axes, heavy.classes) == (
+        "HDL-64E",
+        "elsewhere",
+        "left",
+        "carla",
+    )
 
 
 def test_grids_are_told_with_their_geometry_and_how_they_were_made(data: Path) -> None:
@@ -72,13 +91,20 @@ def test_captures_are_told_beside_sequences_and_alone(data: Path, golden_capture
 
 
 def test_every_level_is_called_by_its_name(data: Path) -> None:
-    levels = {path: info(data / path).level for path in ("Val", "Val/Town07_Heavy", "Val/Town07_Heavy/cartesian")}
+    levels = {
+        path: info(data / path).level
+        for path in ("Val", "Val/Town07_Heavy", "Val/Town07_Heavy/cartesian")
+    }
     assert list(levels.values()) == ["split", "sequence", "coordinates"]
 
 
 def test_a_size_is_given_that_is_about_that_of_the_files(data: Path) -> None:
     sequence = info(data / "Train").sequences[0]
-    files = [path for path in (data / "Train").rglob("*") if path.is_file() and path.suffix not in (".txt", ".json")]
+    files = [
+        path
+        for path in (data / "Train").rglob("*")
+        if path.is_file() and path.suffix not in (".txt", ".json")
+    ]
     assert sequence.bytes == pytest.approx(sum(path.stat().st_size for path in files), rel=0.01)
 
 

@@ -1,4 +1,6 @@
-"""Poses of another point of the vehicle, and late poses, are told from correct ones on a drive that turns."""
+"""Poses of another point of the vehicle, and late poses, are told from correct ones on a drive that
+turns.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def mounting_of(scans, poses):
 @pytest.mark.parametrize("jitter_m", [0.0, 0.03])
 def test_correct_poses_need_no_explanation(winding, jitter_m):
     scans, poses = winding
-    mounting = mounting_of(scans, wrong_poses(poses, jitter_m=jitter_m, jitter_rad=0.002 * bool(jitter_m)))
+    mounting = mounting_of(
+        scans, wrong_poses(poses, jitter_m=jitter_m, jitter_rad=0.002 * bool(jitter_m))
+    )
     assert not mounting.wrong.any()
     assert mounting.determined.tolist() == [True, True, False, True, True, True, True]
     assert (np.abs(mounting.values) < 4 * mounting.errors + 1e-3)[mounting.determined].all()
@@ -39,11 +43,14 @@ def test_scans_that_are_not_corrected_for_motion_raise_no_alarm():
 
 @pytest.mark.parametrize("jitter_m", [0.0, 0.03])
 @pytest.mark.parametrize(
-    ("arm_m", "yaw_deg"), [((0.81, -0.32, -0.8), 0.0), ((-0.6, 0.0, 0.0), 0.0), ((1.0, 0.3, 0.0), 3.0)]
+    ("arm_m", "yaw_deg"),
+    [((0.81, -0.32, -0.8), 0.0), ((-0.6, 0.0, 0.0), 0.0), ((1.0, 0.3, 0.0), 3.0)],
 )
 def test_poses_of_another_point_are_told_where_the_sensor_is(winding, arm_m, yaw_deg, jitter_m):
     scans, poses = winding
-    stored = wrong_poses(poses @ invert(translation(arm_m) @ rotation_z(np.deg2rad(yaw_deg))), jitter_m=jitter_m)
+    stored = wrong_poses(
+        poses @ invert(translation(arm_m) @ rotation_z(np.deg2rad(yaw_deg))), jitter_m=jitter_m
+    )
     mounting = mounting_of(scans, stored)
     assert mounting.values[:2] == pytest.approx(arm_m[:2], abs=0.02 if jitter_m == 0 else 0.12)
     assert np.rad2deg(mounting.values[5]) == pytest.approx(yaw_deg, abs=0.4)
@@ -81,11 +88,19 @@ def test_the_messages_say_what_to_do():
     def described(**values):
         names = ("x", "y", "z", "roll", "pitch", "yaw", "late")
         errors = np.array([0.02, 0.02, 9.0, 0.001, 0.001, 0.001, 0.005])
-        return describe_mounting(Mounting(np.array([values.get(name, 0.0) for name in names]), errors), 0.1)
+        return describe_mounting(
+            Mounting(np.array([values.get(name, 0.0) for name in names]), errors), 0.1
+        )
 
     late, fix_late = described(late=0.2)
-    assert late == "poses that are 0.20 ± 0.01 s late (2.0 frames)" and "compare the time stamps" in fix_late
+    assert (
+        late == "poses that are 0.20 ± 0.01 s late (2.0 frames)"
+        and "compare the time stamps" in fix_late
+    )
     assert "0.10 ± 0.01 s early" in described(late=-0.1)[0]
     arm, fix_arm = described(x=0.8, y=-0.3, yaw=np.deg2rad(2.0))
-    assert "at about x = 0.80 ± 0.02 m, y = -0.30 ± 0.02 m, z undetermined, turned by yaw 2.0 degrees" in arm
+    assert (
+        "at about x = 0.80 ± 0.02 m, y = -0.30 ± 0.02 m, z undetermined, turned by yaw 2.0 degrees"
+        in arm
+    )
     assert "inv(T) @ P @ T" in fix_arm and "carlasc refine" in fix_arm

@@ -50,7 +50,8 @@ def test_a_report_that_is_made_from_files_is_that_of_the_run(made, copied):
     steps = []
     again = report(made, remake=True, run=Run(workers=1, progress=lambda *step: steps.append(step)))
     assert again == report(made)
-    assert steps == [(i, 3 * FRAMES) for i in range(3 * FRAMES + 1)]  # poses, actors, and the frames
+    # poses, actors, and the frames
+    assert steps == [(i, 3 * FRAMES) for i in range(3 * FRAMES + 1)]
     next(copied.rglob(layout.REPORT)).unlink()
     with ThreadPoolExecutor(2) as threads:
         assert report(copied, run=Run(executor=threads, workers=2)).reports == again.reports
@@ -89,7 +90,9 @@ def test_a_store_keeps_the_report_and_takes_none(made, tmp_path):
     carlasc.pack(made, tmp_path / "a.h5")
     packed = report(tmp_path / "a.h5").reports
     assert list(packed.values()) == list(report(made).reports.values())
-    assert list(report(tmp_path / "a.h5", remake=True, run=Run(workers=1)).reports.values()) == list(packed.values())
+    assert list(
+        report(tmp_path / "a.h5", remake=True, run=Run(workers=1)).reports.values()
+    ) == list(packed.values())
     assert validate(tmp_path / "a.h5").count("warning") == 0
     with pytest.raises(ArgumentError, match="folder"):
         report(tmp_path / "a.h5", save=True)
@@ -245,7 +248,9 @@ def test_the_page_loads_nothing_and_shows_every_figure(made, tmp_path):
 
 def test_names_are_escaped_on_the_page(made, tmp_path):
     one = report(made).reports[NAME]
-    odd = replace(one, settings={**one.settings, "carlasc": {"observe": "<script>alert(1)</script>"}})
+    odd = replace(
+        one, settings={**one.settings, "carlasc": {"observe": "<script>alert(1)</script>"}}
+    )
     write_report_page(ReportResult("<b>here", {"<i>a": odd}), tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     assert "<script" not in text
@@ -256,7 +261,11 @@ def test_names_are_escaped_on_the_page(made, tmp_path):
 def test_a_report_without_actors_votes_and_scores_is_drawn(made, tmp_path):
     one = report(made).reports[NAME]
     bare = replace(
-        one, actors=None, convergence=None, coverage=replace(one.coverage, votes=(), mean_votes=None), frames=()
+        one,
+        actors=None,
+        convergence=None,
+        coverage=replace(one.coverage, votes=(), mean_votes=None),
+        frames=(),
     )
     for number, shown in enumerate((bare, replace(bare, actors=()))):
         write_report_page(ReportResult("here", {"a": shown}), tmp_path / f"{number}.html")

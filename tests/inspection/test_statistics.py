@@ -47,7 +47,11 @@ def write_sequence(
 
 @pytest.fixture
 def data(tmp_path: Path) -> tuple[Path, dict[str, dict[str, np.ndarray]]]:
-    paths = ("Train/Town01_Light/cartesian", "Train/Town02_Light/cartesian", "Val/Town07_Light/cartesian")
+    paths = (
+        "Train/Town01_Light/cartesian",
+        "Train/Town02_Light/cartesian",
+        "Val/Town07_Light/cartesian",
+    )
     return tmp_path, {path: write_sequence(tmp_path, path, seed) for seed, path in enumerate(paths)}
 
 
@@ -70,13 +74,19 @@ def test_splits_and_total_are_sums(data: tuple[Path, dict[str, dict[str, np.ndar
     result = stats(root)
     train = [counts for path, counts in expected.items() if path.startswith("Train")]
     assert list(result.by_split()) == ["Train", "Val"]
-    np.testing.assert_array_equal(result.by_split()["Train"].voxels, sum(counts["voxels"] for counts in train))
-    np.testing.assert_array_equal(result.total.points, sum(counts["points"] for counts in expected.values()))
+    np.testing.assert_array_equal(
+        result.by_split()["Train"].voxels, sum(counts["voxels"] for counts in train)
+    )
+    np.testing.assert_array_equal(
+        result.total.points, sum(counts["points"] for counts in expected.values())
+    )
     known = sum(int(counts["voxels"].sum()) for counts in expected.values())
     assert result.total.known_share == pytest.approx(known / (15 * SPEC.num_voxels))
 
 
-def test_remapped_counts_and_weights_follow_the_remap(data: tuple[Path, dict[str, dict[str, np.ndarray]]]) -> None:
+def test_remapped_counts_and_weights_follow_the_remap(
+    data: tuple[Path, dict[str, dict[str, np.ndarray]]],
+) -> None:
     result = stats(data[0])
     voxels = result.total.voxels
     summed = result.summed(voxels)
@@ -89,12 +99,16 @@ def test_remapped_counts_and_weights_follow_the_remap(data: tuple[Path, dict[str
 
 def test_the_golden_grids_have_the_counts_of_their_files(golden_capture: Path) -> None:
     result = stats(golden_capture / "cartesian").total
-    labels = np.concatenate([np.fromfile(p, "<u4") for p in sorted((golden_capture / "cartesian/labels").iterdir())])
+    labels = np.concatenate(
+        [np.fromfile(p, "<u4") for p in sorted((golden_capture / "cartesian/labels").iterdir())]
+    )
     np.testing.assert_array_equal(result.points, np.bincount(labels, minlength=25))
     assert int(result.voxels.sum()) + result.unknown == 3 * 128 * 128 * 8
 
 
-def test_every_other_frame_is_counted_on_request(data: tuple[Path, dict[str, dict[str, np.ndarray]]]) -> None:
+def test_every_other_frame_is_counted_on_request(
+    data: tuple[Path, dict[str, dict[str, np.ndarray]]],
+) -> None:
     assert stats(data[0], every=2).total.scans == 9
 
 
@@ -103,7 +117,9 @@ def test_the_only_grid_is_counted_whatever_its_name(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stats(tmp_path).total.voxels, expected["voxels"])
 
 
-def test_a_bad_frame_is_listed_and_the_others_are_counted(data: tuple[Path, dict[str, dict[str, np.ndarray]]]) -> None:
+def test_a_bad_frame_is_listed_and_the_others_are_counted(
+    data: tuple[Path, dict[str, dict[str, np.ndarray]]],
+) -> None:
     root, _ = data
     folder = root / "Val/Town07_Light/cartesian"
     (folder / "evaluation/000001.label").write_bytes(b"123")
@@ -127,9 +143,13 @@ def test_wide_class_ids_are_counted(tmp_path: Path) -> None:
     assert result.remap == REMAPS["semantickitti19"]
 
 
-def test_two_class_tables_are_not_summed_up(data: tuple[Path, dict[str, dict[str, np.ndarray]]]) -> None:
+def test_two_class_tables_are_not_summed_up(
+    data: tuple[Path, dict[str, dict[str, np.ndarray]]],
+) -> None:
     root, _ = data
-    (root / "Val/Town07_Light/cartesian" / layout.METADATA).write_bytes(Metadata(classes=SEMANTICKITTI).to_json())
+    (root / "Val/Town07_Light/cartesian" / layout.METADATA).write_bytes(
+        Metadata(classes=SEMANTICKITTI).to_json()
+    )
     with pytest.raises(FormatError, match="expected one table, found carla, semantickitti"):
         stats(root)
 
@@ -165,7 +185,9 @@ def test_the_figures_turn_into_json(data: tuple[Path, dict[str, dict[str, np.nda
     )
 
 
-@pytest.mark.parametrize(("suffix", "start"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")])
+@pytest.mark.parametrize(
+    ("suffix", "start"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")]
+)
 def test_a_chart_is_drawn(
     data: tuple[Path, dict[str, dict[str, np.ndarray]]], tmp_path: Path, suffix: str, start: bytes
 ) -> None:

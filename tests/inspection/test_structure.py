@@ -9,7 +9,14 @@ import pytest
 
 from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.inspection.alignment import choose_pairs, diagnose_poses
-from carlasc.inspection.structure import MAX_RANGE_M, MIN_RANGE_M, occupancy, overlap, static_structure, within
+from carlasc.inspection.structure import (
+    MAX_RANGE_M,
+    MIN_RANGE_M,
+    occupancy,
+    overlap,
+    static_structure,
+    within,
+)
 from carlasc.storage import FolderSink, FolderSource
 
 POINTS = np.random.default_rng(0).uniform(-32, 32, (20_000, 3)) * (1, 1, 0.05)
@@ -44,7 +51,9 @@ def test_ranges_have_the_bits_of_numpy(dtype):
     points[4:6] = ((3, 0, 0), (0, 30, 0))
     with np.errstate(invalid="ignore"):
         distance = np.linalg.norm(points, axis=1)
-        expected = np.isfinite(points).all(axis=1) & (distance > MIN_RANGE_M) & (distance < MAX_RANGE_M)
+        expected = (
+            np.isfinite(points).all(axis=1) & (distance > MIN_RANGE_M) & (distance < MAX_RANGE_M)
+        )
     assert np.array_equal(within(points, dtype(MIN_RANGE_M), dtype(MAX_RANGE_M)), expected)
 
 
@@ -68,7 +77,9 @@ def scan(folder, points, labels=None, flow=None):
     """Write a scan, and return its structure."""
     writer = FolderSink(folder).sequence("cartesian")
     points = np.array(points, np.float32)
-    writer.write("points", 0, np.concatenate([points, np.ones((len(points), 1), np.float32)], axis=1))
+    writer.write(
+        "points", 0, np.concatenate([points, np.ones((len(points), 1), np.float32)], axis=1)
+    )
     if labels is not None:
         writer.write("labels", 0, np.array(labels, np.uint32))
     if flow is not None:

@@ -1,4 +1,6 @@
-"""The shares at which `validate` reports warnings and errors, on small sequences made for each of them."""
+"""The shares at which `validate` reports warnings and errors, on small sequences made for each of
+them.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ OTHER = 9  # a class that is nowhere in the grid
 
 
 def write_scans(folder, right, frames=4, metadata=None, far=None, spec=SPEC):
-    """Write scans and grids: a share of the points is in voxels of their class; points farther than `far` never are."""
+    """Write scans and grids: a share of the points is in voxels of their class; points farther than
+    `far` never are.
+    """
     rng, writer = np.random.default_rng(0), FolderSink(folder).sequence("cartesian")
     writer.write_document(layout.params_file("evaluation"), json.dumps(spec.to_params()).encode())
     writer.write_document(layout.POSES, layout.encode_poses(np.tile(np.eye(4), (frames, 1, 1))))
@@ -31,8 +35,12 @@ def write_scans(folder, right, frames=4, metadata=None, far=None, spec=SPEC):
         wrong = np.arange(2000) >= round(2000 * right)
         if far is not None:
             wrong |= np.linalg.norm(points, axis=1) > far
-        writer.write("points", frame, np.concatenate([points, np.ones((2000, 1))], axis=1).astype(np.float32))
-        writer.write("labels", frame, np.where(wrong, OTHER, labels[tuple(cells.T)]).astype(np.uint32))
+        writer.write(
+            "points", frame, np.concatenate([points, np.ones((2000, 1))], axis=1).astype(np.float32)
+        )
+        writer.write(
+            "labels", frame, np.where(wrong, OTHER, labels[tuple(cells.T)]).astype(np.uint32)
+        )
         writer.write("evaluation/labels", frame, labels.astype(np.uint32))
         writer.write("evaluation/counts", frame, np.ones(spec.size, np.float32))
     return folder
@@ -43,7 +51,8 @@ def severities(result, check):
 
 
 @pytest.mark.parametrize(
-    ("right", "expected"), [(0.71, []), (0.69, ["warning"]), (0.51, ["warning"]), (0.49, ["error"]), (0.0, ["error"])]
+    ("right", "expected"),
+    [(0.71, []), (0.69, ["warning"]), (0.51, ["warning"]), (0.49, ["error"]), (0.0, ["error"])],
 )
 def test_the_share_of_points_in_voxels_of_their_class_decides(tmp_path, right, expected):
     result = validate(write_scans(tmp_path, right))
@@ -69,7 +78,9 @@ def test_points_nearer_than_the_least_range_are_not_compared(tmp_path):
     folder = write_scans(tmp_path, 1.0, metadata={"min_range_m": 8.0})
     shares = validate(folder).sequences[0].voxel_share
     for path in folder.glob("cartesian/labels/*"):
-        points = np.fromfile(folder / "cartesian/velodyne" / f"{path.stem}.bin", "<f4").reshape(-1, 4)
+        points = np.fromfile(folder / "cartesian/velodyne" / f"{path.stem}.bin", "<f4").reshape(
+            -1, 4
+        )
         labels = np.fromfile(path, "<u4")
         labels[np.linalg.norm(points[:, :3], axis=1) < 8] = OTHER
         labels.tofile(path)
@@ -82,7 +93,9 @@ def test_scans_that_do_not_overlap_at_all_are_a_warning(tmp_path):
     writer.write_document(layout.TIMES, layout.encode_times(0.1 * np.arange(6)))
     for frame in range(6):
         points = rng.uniform(-20, 20, (400, 3))
-        writer.write("points", frame, np.concatenate([points, np.ones((400, 1))], axis=1).astype(np.float32))
+        writer.write(
+            "points", frame, np.concatenate([points, np.ones((400, 1))], axis=1).astype(np.float32)
+        )
         writer.write("labels", frame, np.ones(400, np.uint32))
     result = validate(tmp_path)
     assert severities(result, "poses-on-scans") == ["warning"]

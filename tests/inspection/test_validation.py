@@ -1,4 +1,6 @@
-"""`validate` on sound data, on data with one known fault each, and on files that are damaged as they are in practice."""
+"""`validate` on sound data, on data with one known fault each, and on files that are damaged as
+they are in practice.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,18 @@ KITTI = GridSpec("cartesian", (128, 128, 16), (0.0, -25.6, -2.0), (51.2, 25.6, 4
 
 @pytest.fixture(scope="session")
 def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve frames round a bend, with labels and coarse grids: a sequence folder that holds cartesian/."""
+    """Twelve frames round a bend, with labels and coarse grids: a sequence folder that holds
+    cartesian/.
+    """
     return _drive(tmp_path_factory, drive(12, turn_rad=0.05), spec=COARSE)
 
 
 @pytest.fixture(scope="session")
 def turning_kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same in KITTI's right-handed frame, a grid ahead of the car every fourth frame."""
-    return _drive(tmp_path_factory, drive(12, turn_rad=0.05), spec=KITTI, frame="kitti", grid_every=4)
+    return _drive(
+        tmp_path_factory, drive(12, turn_rad=0.05), spec=KITTI, frame="kitti", grid_every=4
+    )
 
 
 def _drive(factory: pytest.TempPathFactory, poses: np.ndarray, **options: object) -> Path:
@@ -54,7 +60,12 @@ def copy_kitti(turning_kitti: Path, tmp_path: Path) -> Path:
 
 def found(result: ValidationResult, severity: str = "error") -> dict[str, str]:
     """The text of the findings of a severity, by check."""
-    return {f.check: "\n".join(map(str, g)) for (s, _), g in result.grouped().items() if s == severity for f in g}
+    return {
+        f.check: "\n".join(map(str, g))
+        for (s, _), g in result.grouped().items()
+        if s == severity
+        for f in g
+    }
 
 
 def change_poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -62,7 +73,9 @@ def change_poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> No
     path.write_bytes(layout.encode_poses(change(layout.decode_poses(path.read_bytes(), ""))))
 
 
-def change_files(folder: Path, dtype: str, change: Callable[[np.ndarray], np.ndarray], suffix: str = ".bin") -> None:
+def change_files(
+    folder: Path, dtype: str, change: Callable[[np.ndarray], np.ndarray], suffix: str = ".bin"
+) -> None:
     for path in folder.glob(f"*{suffix}"):
         path.write_bytes(change(np.frombuffer(path.read_bytes(), dtype)).tobytes())
 
@@ -90,7 +103,9 @@ def test_a_sequence_of_grids_alone_is_sound(golden_capture: Path, grid: str) -> 
 
 
 @pytest.mark.parametrize("fixture", ["turning", "turning_kitti"])
-def test_a_drive_round_a_bend_is_sound_in_both_frames(fixture: str, request: pytest.FixtureRequest) -> None:
+def test_a_drive_round_a_bend_is_sound_in_both_frames(
+    fixture: str, request: pytest.FixtureRequest
+) -> None:
     result = validate(request.getfixturevalue(fixture))
     assert (found(result), found(result, "warning")) == ({}, {})
     assert result.sequences[0].voxel_share["evaluation"] > 0.9
@@ -103,13 +118,19 @@ def test_a_drive_round_a_bend_is_sound_in_both_frames(fixture: str, request: pyt
         pytest.param(drive(10), id="straight"),
         pytest.param(drive(10, speed_m=0.02), id="creeping"),
         pytest.param(drive(10, speed_m=-0.5, turn_rad=0.03), id="backwards"),
-        pytest.param(np.concatenate([np.repeat(drive(1), 5, axis=0), drive(8, turn_rad=0.04)]), id="starting"),
+        pytest.param(
+            np.concatenate([np.repeat(drive(1), 5, axis=0), drive(8, turn_rad=0.04)]), id="starting"
+        ),
         pytest.param(drive(1), id="one frame"),
         pytest.param(drive(2), id="two frames"),
     ],
 )
-@pytest.mark.parametrize(("frame", "labelled"), [("carlasc", True), ("kitti", True), ("kitti", False)])
-def test_scans_alone_raise_no_false_alarm(tmp_path: Path, poses: np.ndarray, labelled: bool, frame: str) -> None:
+@pytest.mark.parametrize(
+    ("frame", "labelled"), [("carlasc", True), ("kitti", True), ("kitti", False)]
+)
+def test_scans_alone_raise_no_false_alarm(
+    tmp_path: Path, poses: np.ndarray, labelled: bool, frame: str
+) -> None:
     write_drive(tmp_path / "cartesian", poses, frame=frame, labelled=labelled, seed=3)
     result = validate(tmp_path)
     assert [finding.check for finding in result.findings] == ["no-grids"]
@@ -119,26 +140,36 @@ def test_scans_alone_raise_no_false_alarm(tmp_path: Path, poses: np.ndarray, lab
 @pytest.mark.parametrize("labelled", [True, False])
 def test_other_grids_raise_no_false_alarm(tmp_path: Path, name: str, labelled: bool) -> None:
     spec = GridSpec.published(name)
-    write_drive(tmp_path / spec.coordinates, drive(4, turn_rad=0.05), spec=spec, labelled=labelled, seed=5)
+    write_drive(
+        tmp_path / spec.coordinates, drive(4, turn_rad=0.05), spec=spec, labelled=labelled, seed=5
+    )
     assert validate(tmp_path).findings == ()
 
 
-def test_a_prediction_beside_the_data_is_judged_by_its_own_classes_and_not_as_truth(copy: Path) -> None:
+def test_a_prediction_beside_the_data_is_judged_by_its_own_classes_and_not_as_truth(
+    copy: Path,
+) -> None:
     shutil.copytree(copy / "evaluation", copy / "completion")
     for path in (copy / "completion").glob("*.bin"):
         path.unlink()
     params = json.loads((copy / "evaluation/params.json").read_text())
     record = {"classes": "carlasc11", "network": "lmscnet_ss"}
-    (copy / "completion/params.json").write_text(json.dumps(params | {"num_channels": 11, "carlasc": record}))
+    (copy / "completion/params.json").write_text(
+        json.dumps(params | {"num_channels": 11, "carlasc": record})
+    )
     for path in (copy / "completion").glob("*.label"):
-        path.write_bytes(np.where(np.fromfile(path, np.uint32) > 0, 9, 0).astype(np.uint32).tobytes())
+        path.write_bytes(
+            np.where(np.fromfile(path, np.uint32) > 0, 9, 0).astype(np.uint32).tobytes()
+        )
     assert not validate(copy).findings
     path.write_bytes(np.full(128 * 128 * 8, 11, np.uint32).tobytes())
     assert "class ids of carlasc11" in found(validate(copy, every=1))["class-ids"]
 
 
 @pytest.mark.parametrize("ending", ["zarr", "h5"])
-def test_a_packed_store_is_as_sound_as_what_it_was_packed_from(turning: Path, tmp_path: Path, ending: str) -> None:
+def test_a_packed_store_is_as_sound_as_what_it_was_packed_from(
+    turning: Path, tmp_path: Path, ending: str
+) -> None:
     """Stores keep labels as uint8: all checks hold there too."""
     store = tmp_path / f"drive.{ending}"
     carlasc.pack(turning, store)
@@ -162,7 +193,9 @@ def test_mirrored_points_are_told_from_the_grid_and_from_the_poses(copy: Path) -
 
 
 def test_mirrored_points_are_told_in_a_converted_sequence(copy_kitti: Path) -> None:
-    change_files(copy_kitti / "velodyne", "<f4", lambda a: a.reshape(-1, 4) * np.float32([1, -1, 1, 1]))
+    change_files(
+        copy_kitti / "velodyne", "<f4", lambda a: a.reshape(-1, 4) * np.float32([1, -1, 1, 1])
+    )
     errors = found(validate(copy_kitti))
     assert "the likely cause is points with y mirrored" in errors["scan-in-voxels"]
     assert "y mirrored against the scans" in errors["poses-on-scans"]
@@ -187,16 +220,24 @@ def test_a_fault_of_poses_is_named_and_nothing_else_is(
     assert f"likely cause is {fault}" in errors["poses-on-scans"]
 
 
-def test_camera_frame_poses_of_a_converted_sequence_are_named_with_the_remedy(copy_kitti: Path) -> None:
+def test_camera_frame_poses_of_a_converted_sequence_are_named_with_the_remedy(
+    copy_kitti: Path,
+) -> None:
     change_poses(copy_kitti, camera_poses)
     errors = found(validate(copy_kitti))
-    assert "likely cause is camera-frame poses (x right, y down, z forward)" in errors["poses-on-scans"]
+    assert (
+        "likely cause is camera-frame poses (x right, y down, z forward)"
+        in errors["poses-on-scans"]
+    )
     assert "inv(Tr) @ P @ Tr" in errors["poses-on-scans"]
 
 
 @pytest.mark.parametrize("mirrored", [True, False])
-def test_camera_frame_poses_are_named_in_a_mirrored_sequence_too(copy: Path, mirrored: bool) -> None:
-    # the converter mirrored the scans, and took the camera's poses as they were, or mirrored them too
+def test_camera_frame_poses_are_named_in_a_mirrored_sequence_too(
+    copy: Path, mirrored: bool
+) -> None:
+    # the converter mirrored the scans, and took the camera's poses as they were, or mirrored them
+    # too
     def change(poses: np.ndarray) -> np.ndarray:
         camera = camera_poses(MIRROR @ poses @ MIRROR)
         return MIRROR @ camera @ MIRROR if mirrored else camera
@@ -205,7 +246,9 @@ def test_camera_frame_poses_are_named_in_a_mirrored_sequence_too(copy: Path, mir
     assert "camera-frame poses" in found(validate(copy))["poses-on-scans"]
 
 
-def test_camera_frame_poses_show_on_a_straight_drive_where_a_mirrored_y_cannot(tmp_path: Path) -> None:
+def test_camera_frame_poses_show_on_a_straight_drive_where_a_mirrored_y_cannot(
+    tmp_path: Path,
+) -> None:
     folder = write_drive(tmp_path / "cartesian", drive(12), frame="kitti", seed=3)
     change_poses(folder, lambda p: MIRROR @ p @ MIRROR)
     assert validate(folder).ok
@@ -229,7 +272,9 @@ def test_scans_that_are_in_one_common_frame_are_told(copy: Path) -> None:
 
 
 @pytest.mark.parametrize("shift", [(1, 0, 0), (0, -1, 0), (-1, 1, 0), (0, 0, 1)])
-def test_a_grid_shifted_by_a_cell_is_named_with_its_direction(copy: Path, shift: tuple[int, int, int]) -> None:
+def test_a_grid_shifted_by_a_cell_is_named_with_its_direction(
+    copy: Path, shift: tuple[int, int, int]
+) -> None:
     def roll(values: np.ndarray) -> np.ndarray:
         return np.roll(values.reshape(COARSE.size), shift, (0, 1, 2))
 
@@ -239,7 +284,9 @@ def test_a_grid_shifted_by_a_cell_is_named_with_its_direction(copy: Path, shift:
     assert list(errors) == ["scan-in-voxels"]
     assert "a grid shifted by" in errors["scan-in-voxels"]
     for name, step in zip("xyz", shift, strict=True):
-        assert (f"one cell towards {'+' if step > 0 else '-'}{name}" in errors["scan-in-voxels"]) == bool(step)
+        assert (
+            f"one cell towards {'+' if step > 0 else '-'}{name}" in errors["scan-in-voxels"]
+        ) == bool(step)
 
 
 def test_grids_of_other_frames_are_told_from_those_of_other_classes(copy: Path) -> None:
@@ -282,7 +329,9 @@ def test_params_of_another_size_are_found_in_every_file(copy: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"grid_size": [1, 2]}'])
-def test_a_broken_params_file_is_one_finding_and_scans_are_still_checked(copy: Path, text: str) -> None:
+def test_a_broken_params_file_is_one_finding_and_scans_are_still_checked(
+    copy: Path, text: str
+) -> None:
     (copy / "evaluation" / "params.json").write_text(text)
     change_poses(copy, transpose_rotations)
     errors = found(validate(copy))
@@ -291,7 +340,10 @@ def test_a_broken_params_file_is_one_finding_and_scans_are_still_checked(copy: P
 
 def test_a_grid_folder_without_params_is_not_passed_over(copy: Path) -> None:
     (copy / "evaluation" / "params.json").unlink()
-    assert "params.json: expected the grid's geometry, found no file" in found(validate(copy))["params"]
+    assert (
+        "params.json: expected the grid's geometry, found no file"
+        in found(validate(copy))["params"]
+    )
 
 
 def test_a_label_without_votes_and_votes_that_are_no_numbers_are_counted(copy: Path) -> None:
@@ -341,7 +393,8 @@ def test_missing_frames_are_a_warning_and_missing_labels_an_error(copy: Path) ->
     result = validate(copy)
     assert "1 gaps" not in found(result)
     assert "none for 000009" in found(result)["frame-counts"]
-    assert "1 more: 000006" in found(result, "warning")["frame-counts"]  # the grid of a scan that is gone
+    # the grid of a scan that is gone
+    assert "1 more: 000006" in found(result, "warning")["frame-counts"]
 
 
 def test_a_gap_in_all_fields_is_a_lesser_finding(copy: Path) -> None:
@@ -349,7 +402,10 @@ def test_a_gap_in_all_fields_is_a_lesser_finding(copy: Path) -> None:
         path.unlink()
     result = validate(copy)
     assert result.ok
-    assert "1 gaps, 2 frames missing; the first gap is between 5 and 8" in found(result, "warning")["frame-gaps"]
+    assert (
+        "1 gaps, 2 frames missing; the first gap is between 5 and 8"
+        in found(result, "warning")["frame-gaps"]
+    )
 
 
 def test_grids_on_some_frames_only_are_a_note(copy: Path) -> None:
@@ -357,7 +413,10 @@ def test_grids_on_some_frames_only_are_a_note(copy: Path) -> None:
         path.unlink()
     result = validate(copy)
     assert result.ok
-    assert "evaluation/labels for each of the 12 frames of points" in found(result, "note")["frame-counts"]
+    assert (
+        "evaluation/labels for each of the 12 frames of points"
+        in found(result, "note")["frame-counts"]
+    )
 
 
 def test_counts_missing_for_a_frame_are_an_error(copy: Path) -> None:
@@ -445,7 +504,9 @@ def test_a_sequence_without_anything_is_an_error_and_the_others_are_still_checke
 def test_the_level_above_a_sequence_is_understood(turning: Path, tmp_path: Path) -> None:
     (tmp_path / "Val" / "A").mkdir(parents=True)
     (tmp_path / "Val" / "A" / "cartesian").symlink_to(turning / "cartesian")
-    assert [report.path for report in validate(tmp_path / "Val", every=6).sequences] == ["A/cartesian"]
+    assert [report.path for report in validate(tmp_path / "Val", every=6).sequences] == [
+        "A/cartesian"
+    ]
 
 
 def test_a_level_too_low_and_an_empty_folder_are_told(turning: Path, tmp_path: Path) -> None:
@@ -457,7 +518,9 @@ def test_a_level_too_low_and_an_empty_folder_are_told(turning: Path, tmp_path: P
 
 def test_progress_reaches_its_total_and_a_source_serves_as_well_as_a_path(turning: Path) -> None:
     seen: list[tuple[int, int]] = []
-    validate(FolderSource(turning), run=Run(1, progress=lambda done, total: seen.append((done, total))))
+    validate(
+        FolderSource(turning), run=Run(1, progress=lambda done, total: seen.append((done, total)))
+    )
     assert seen[-1][0] == seen[-1][1] == 12 + 12 + 1
     assert [done for done, _ in seen] == list(range(1, 26))
 

@@ -16,8 +16,12 @@ SPEC = GridSpec.published().with_size((8, 8, 4))
 CAR, ROAD = 10, 7
 
 
-def write(folder, change=lambda frame, labels, instance, velocity: None, parts=("instance", "velocity")):
-    """Write three frames: road, and two cars of 16 voxels, of which the first moves at 8 m/s and the second stands."""
+def write(
+    folder, change=lambda frame, labels, instance, velocity: None, parts=("instance", "velocity")
+):
+    """Write three frames: road, and two cars of 16 voxels, of which the first moves at 8 m/s and
+    the second stands.
+    """
     writer = FolderSink(folder).sequence("Val/Town01/cartesian")
     writer.write_document(
         "evaluation/params.json",
@@ -55,7 +59,11 @@ def test_the_truth_itself_is_perfect(truth):
     found = score(truth, truth)
     assert found.panoptic.pq[CAR] == found.panoptic.pq[ROAD] == 1
     assert found.tracking.lstq == 1 and found.tracking.actors == 2
-    assert found.velocity_m_s == 0 and found.velocity_by_speed[5.0] == 0 and np.isnan(found.velocity_by_speed[0.0])
+    assert (
+        found.velocity_m_s == 0
+        and found.velocity_by_speed[5.0] == 0
+        and np.isnan(found.velocity_by_speed[0.0])
+    )
 
 
 def test_other_numbers_in_each_frame_cost_lstq_but_not_pq(truth, tmp_path):
@@ -66,7 +74,10 @@ def test_other_numbers_in_each_frame_cost_lstq_but_not_pq(truth, tmp_path):
     found = score(write(tmp_path / "a", renumber), truth)
     assert found.panoptic.pq[CAR] == 1
     # the first car has three numbers, each with a third of it; the second has one
-    assert found.tracking.association == pytest.approx((1 / 3 + 1) / 2) and found.tracking.classification == 1
+    assert (
+        found.tracking.association == pytest.approx((1 / 3 + 1) / 2)
+        and found.tracking.classification == 1
+    )
     assert found.velocity_m_s == pytest.approx(3, abs=0.01)
     assert found.velocity_by_class["Vehicle"] == pytest.approx(3, abs=0.01)
 
@@ -96,14 +107,17 @@ def test_true_actors_without_a_number_do_not_count(tmp_path):
 def test_grids_without_instances_and_velocities_that_are_not_finite_are_named(truth, tmp_path):
     bare = write(tmp_path / "bare", parts=())
     with pytest.raises(
-        ArgumentError, match="actors: expected grids with instances for prediction and ground truth, found .*bare"
+        ArgumentError,
+        match="actors: expected grids with instances for prediction and ground truth, found .*bare",
     ):
         score(bare, truth)
 
     def break_it(frame, labels, instance, velocity):
         velocity["velocity"][3] = np.nan
 
-    result = carlasc.evaluate(write(tmp_path / "nan", break_it), truth, convention="own", scoring=Scoring(actors=True))
+    result = carlasc.evaluate(
+        write(tmp_path / "nan", break_it), truth, convention="own", scoring=Scoring(actors=True)
+    )
     assert len(result.failures) == 3 and "finite velocities" in result.failures[0][1]
 
 
@@ -112,14 +126,24 @@ def test_instance_grids_of_another_geometry_are_named(truth, tmp_path):
     for file in folder.rglob("*.instance"):
         file.write_bytes(file.read_bytes()[:-64])
     result = carlasc.evaluate(folder, truth, convention="own", scoring=Scoring(actors=True))
-    assert len(result.failures) == 3 and "000000.instance: expected 1024 bytes (8 x 8 x 4" in result.failures[0][1]
+    assert (
+        len(result.failures) == 3
+        and "000000.instance: expected 1024 bytes (8 x 8 x 4" in result.failures[0][1]
+    )
 
 
 def test_the_command_prints_the_table(truth):
     given = ["evaluate", str(truth), str(truth), "--convention", "own", "--actors"]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
-    assert "LSTQ" in result.output and "mean velocity error of moving voxels: 0.00 m/s" in result.output
+    assert (
+        "LSTQ" in result.output
+        and "mean velocity error of moving voxels: 0.00 m/s" in result.output
+    )
     result = CliRunner().invoke(app, [*given, "--json"])
     values = json.loads(result.stdout)["actors"]
-    assert values["class_pq"]["Vehicle"] == 1 and values["lstq"] == 1 and values["velocity_by_speed"]["from 5 m/s"] == 0
+    assert (
+        values["class_pq"]["Vehicle"] == 1
+        and values["lstq"] == 1
+        and values["velocity_by_speed"]["from 5 m/s"] == 0
+    )

@@ -31,7 +31,11 @@ def per_class_loop(pred, target, mask, num_classes):
 
 def labels_and_mask(seed, shape=(2, 9, 7, 5), dtype=np.uint8):
     rng = np.random.default_rng(seed)
-    return rng.integers(0, K, shape).astype(dtype), rng.integers(0, K, shape).astype(dtype), rng.random(shape) < 0.6
+    return (
+        rng.integers(0, K, shape).astype(dtype),
+        rng.integers(0, K, shape).astype(dtype),
+        rng.random(shape) < 0.6,
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.int64])
@@ -56,7 +60,9 @@ def test_figures_of_a_matrix_worked_out_by_hand():
     np.testing.assert_allclose(matrix.recall, [1 / 2, 2 / 3, 0, np.nan])
     np.testing.assert_allclose(matrix.precision, [1 / 2, 2 / 3, 0, np.nan])
     geometry = matrix.completeness()  # occupied: predicted at 2..5, true at 1..4
-    assert (geometry.precision, geometry.recall, geometry.iou) == pytest.approx((3 / 4, 3 / 4, 3 / 5))
+    assert (geometry.precision, geometry.recall, geometry.iou) == pytest.approx(
+        (3 / 4, 3 / 4, 3 / 5)
+    )
 
 
 def test_an_empty_matrix_has_no_figures_rather_than_zeros_or_errors():
@@ -86,7 +92,9 @@ def test_tensors_count_as_arrays_do():
     tensors = [torch.from_numpy(a) for a in (pred, target, mask)]
     assert ConfusionMatrix(K).update(*tensors) == expected
     assert ConfusionMatrix(K).update(tensors[0], target, mask) == expected
-    assert ConfusionMatrix(K).update(tensors[0].long(), tensors[1]) == ConfusionMatrix(K).update(pred, target)
+    assert ConfusionMatrix(K).update(tensors[0].long(), tensors[1]) == ConfusionMatrix(K).update(
+        pred, target
+    )
 
 
 def test_the_count_on_another_device_is_that_on_the_cpu():
@@ -98,7 +106,9 @@ def test_the_count_on_another_device_is_that_on_the_cpu():
     tensors = [torch.from_numpy(a).to(device) for a in (pred, target, mask)]
     expected = ConfusionMatrix(K).update(pred, target, mask)
     np.testing.assert_array_equal(count_tensors(device, *tensors, K), expected.counts)
-    np.testing.assert_array_equal(count_tensors(device, tensors[0], target, mask, K), expected.counts)
+    np.testing.assert_array_equal(
+        count_tensors(device, tensors[0], target, mask, K), expected.counts
+    )
     with pytest.raises(FormatError, match=r"prediction: expected class ids 0\.\.2, found"):
         count_tensors(device, *tensors, 3)
     with pytest.raises(FormatError, match="truth: expected integer"):
@@ -108,29 +118,42 @@ def test_the_count_on_another_device_is_that_on_the_cpu():
 def test_ids_out_of_range_are_named_unless_masked():
     pred, target, mask = np.array([0, 11, 255]), np.array([0, 1, 2]), np.array([True, False, False])
     assert ConfusionMatrix(K).update(pred, target, mask).total == 1
-    with pytest.raises(FormatError, match=r"prediction: expected class ids 0\.\.10, found 11 \(2 voxels"):
+    with pytest.raises(
+        FormatError, match=r"prediction: expected class ids 0\.\.10, found 11 \(2 voxels"
+    ):
         ConfusionMatrix(K).update(pred, target)
     with pytest.raises(FormatError, match=r"truth: expected class ids 0\.\.10, found -1"):
         ConfusionMatrix(K).update(target, np.array([0, -1, 2]))
 
 
 def test_shapes_and_types_that_do_not_fit_are_refused():
-    with pytest.raises(FormatError, match=r"prediction: expected the shape of the ground truth \(2, 2\), found \(4,\)"):
+    with pytest.raises(
+        FormatError,
+        match=r"prediction: expected the shape of the ground truth \(2, 2\), found \(4,\)",
+    ):
         ConfusionMatrix(K).update(np.zeros(4, int), np.zeros((2, 2), int))
-    with pytest.raises(FormatError, match=r"mask: expected the shape of the ground truth \(4,\), found \(3,\)"):
+    with pytest.raises(
+        FormatError, match=r"mask: expected the shape of the ground truth \(4,\), found \(3,\)"
+    ):
         ConfusionMatrix(K).update(np.zeros(4, int), np.zeros(4, int), np.ones(3, bool))
     with pytest.raises(FormatError, match="prediction: expected integer class ids, found float64"):
         ConfusionMatrix(K).update(np.zeros(4), np.zeros(4, int))
     with pytest.raises(ArgumentError, match="num_classes: expected 1 or more, found 0"):
         ConfusionMatrix(0)
     for free in (-1, 3):
-        with pytest.raises(ArgumentError, match=rf"free: expected a class id in 0\.\.2, found {free}"):
+        with pytest.raises(
+            ArgumentError, match=rf"free: expected a class id in 0\.\.2, found {free}"
+        ):
             ConfusionMatrix(3, free=free)
     with pytest.raises(ArgumentError, match="counts"):
         ConfusionMatrix(3, counts=np.zeros((2, 2), int))
-    with pytest.raises(ArgumentError, match="expected 3 classes with free 0, found 4 classes with free 0"):
+    with pytest.raises(
+        ArgumentError, match="expected 3 classes with free 0, found 4 classes with free 0"
+    ):
         ConfusionMatrix(3) + ConfusionMatrix(4)
-    with pytest.raises(ArgumentError, match="expected 3 classes with free 0, found 3 classes with free 1"):
+    with pytest.raises(
+        ArgumentError, match="expected 3 classes with free 0, found 3 classes with free 1"
+    ):
         ConfusionMatrix(3) + ConfusionMatrix(3, free=1)
     with pytest.raises(ArgumentError, match="absent: expected zero or skip, found 'maybe'"):
         ConfusionMatrix(3).mean_iou(absent="maybe")
@@ -150,13 +173,16 @@ def test_counts_given_at_the_start_are_copied_and_compared():
 def test_free_may_be_any_class():
     matrix = ConfusionMatrix(3, free=2, counts=np.array([[4, 1, 3], [0, 2, 1], [2, 0, 9]]))
     geometry = matrix.completeness()  # occupied are 0 and 1: 7 of them right, 9 predicted, 11 true
-    assert (geometry.precision, geometry.recall, geometry.iou) == pytest.approx((7 / 9, 7 / 11, 7 / 13))
+    assert (geometry.precision, geometry.recall, geometry.iou) == pytest.approx(
+        (7 / 9, 7 / 11, 7 / 13)
+    )
     assert matrix.mean_iou(with_free=False) == pytest.approx((4 / 10 + 2 / 4) / 2)
 
 
 def test_metrics_of_arrays_do_not_import_torch():
     code = (
-        "import sys, numpy as np; from carlasc.metrics import ConfusionMatrix; a = np.zeros(3, int);"
+        "import sys, numpy as np; from carlasc.metrics import ConfusionMatrix; a = np.zeros(3, "
+        "int);"
         "ConfusionMatrix(2).update(a, a); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -179,7 +205,11 @@ def test_truth_is_scored_over_voxels_known_to_both():
     spec = GridSpec("cartesian", (4, 1, 1), (0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
 
     def grid(labels, counts):
-        return Grid(spec, np.array(labels, np.uint8).reshape(4, 1, 1), np.array(counts, np.float32).reshape(4, 1, 1))
+        return Grid(
+            spec,
+            np.array(labels, np.uint8).reshape(4, 1, 1),
+            np.array(counts, np.float32).reshape(4, 1, 1),
+        )
 
     score = score_truth(grid([1, 2, 0, 2], [1, 1, 0, 3]), grid([1, 1, 0, 2], [1, 2, 5, 0]), 3)
     assert (score.known, score.known_reference, score.known_both) == (3, 3, 2)
@@ -193,9 +223,16 @@ def test_truth_is_scored_over_voxels_known_to_both():
 
 def test_truth_is_scored_only_where_the_mask_says():
     spec = GridSpec("cartesian", (4, 1, 1), (0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
-    grid = Grid(spec, np.array([1, 2, 0, 2], np.uint8).reshape(4, 1, 1), np.ones(spec.size, np.float32))
+    grid = Grid(
+        spec, np.array([1, 2, 0, 2], np.uint8).reshape(4, 1, 1), np.ones(spec.size, np.float32)
+    )
     score = score_truth(grid, grid, 3, np.array([True, True, False, False]).reshape(4, 1, 1))
-    assert (score.known, score.known_reference, score.known_both, score.matrix.total) == (2, 2, 2, 2)
+    assert (score.known, score.known_reference, score.known_both, score.matrix.total) == (
+        2,
+        2,
+        2,
+        2,
+    )
     empty = score_truth(grid, grid, 3, np.zeros(spec.size, bool))
     assert math.isnan(empty.coverage) and math.isnan(empty.accuracy)
 

@@ -59,7 +59,9 @@ def test_sscbench_adds_its_epsilon_and_counts_absent_classes_as_zero():
     rows = counted_iou(pred[known], truth[known], range(1, 19))
     convention = CONVENTIONS["sscbench"]
     score = convention.score(convention.count((pred, table), (truth, table), known))
-    assert score.miou == pytest.approx(np.mean([tp / (union + 1e-5) for tp, union in rows.values()]), rel=1e-12)
+    assert score.miou == pytest.approx(
+        np.mean([tp / (union + 1e-5) for tp, union in rows.values()]), rel=1e-12
+    )
 
 
 def test_occ3d_leaves_out_free_and_the_classes_that_are_absent_from_both():
@@ -71,10 +73,14 @@ def test_occ3d_leaves_out_free_and_the_classes_that_are_absent_from_both():
     present = [tp / union for tp, union in rows.values() if union]
     assert convention.score(matrix).miou == pytest.approx(np.mean(present))
     only_true = [tp / union for c, (tp, union) in rows.items() if (truth == c).any()]
-    assert CONVENTIONS["occ3d-lidar-sparseocc"].score(matrix).miou == pytest.approx(np.mean(only_true))
+    assert CONVENTIONS["occ3d-lidar-sparseocc"].score(matrix).miou == pytest.approx(
+        np.mean(only_true)
+    )
     assert len(only_true) < len(present)
     occupied = (pred != 17).sum()
-    assert convention.score(matrix).precision == pytest.approx(((pred != 17) & (truth != 17)).sum() / occupied)
+    assert convention.score(matrix).precision == pytest.approx(
+        ((pred != 17) & (truth != 17)).sum() / occupied
+    )
 
 
 def test_openoccupancy_takes_what_nobody_saw_for_empty_leaves_noise_out_and_is_nan_where_a_class_is_absent():
@@ -86,7 +92,9 @@ def test_openoccupancy_takes_what_nobody_saw_for_empty_leaves_noise_out_and_is_n
     keep = seen != 255
     rows = counted_iou(pred[keep], seen[keep], range(1, 17))
     matrix = convention.count((pred, table), (truth, table), known)
-    assert convention.score(matrix).miou == pytest.approx(np.mean([tp / union for tp, union in rows.values()]))
+    assert convention.score(matrix).miou == pytest.approx(
+        np.mean([tp / union for tp, union in rows.values()])
+    )
     without = truth.copy()
     without[truth == 9] = 0
     few = convention.count((np.where(pred == 9, 0, pred), table), (without, table), known)
@@ -137,12 +145,20 @@ def test_matrices_of_frames_add_up_in_any_order():
 
 
 def test_what_cannot_be_scored_is_said_in_one_line():
-    with pytest.raises(ArgumentError, match="convention: expected one of carlasc, .*, found 'nuscenes'"):
+    with pytest.raises(
+        ArgumentError, match="convention: expected one of carlasc, .*, found 'nuscenes'"
+    ):
         convention_named("nuscenes")
     other = ClassTable("lab", {0: "free", 1: "thing"}, {0: (0, 0, 0), 1: (9, 9, 9)})
     with pytest.raises(
-        FormatError, match=r"truth: expected a class table with a map in the convention sscbench \(.*\), found lab"
+        FormatError,
+        match=r"truth: expected a class table with a map in the convention sscbench \(.*\), found "
+        r"lab",
     ):
         CONVENTIONS["sscbench"].check(other, "truth")
-    with pytest.raises(FormatError, match=r"prediction: expected class ids of carla, found 77 \(3000 times\)"):
-        CONVENTIONS["carlasc"].count((np.full(3000, 77), CARLA), (labels(range(23), 0), CARLA), None)
+    with pytest.raises(
+        FormatError, match=r"prediction: expected class ids of carla, found 77 \(3000 times\)"
+    ):
+        CONVENTIONS["carlasc"].count(
+            (np.full(3000, 77), CARLA), (labels(range(23), 0), CARLA), None
+        )

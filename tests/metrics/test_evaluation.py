@@ -49,7 +49,9 @@ def world():
     truth = {key: rng.integers(0, 23, SHAPE) for key in keys}
     counts = {key: rng.integers(0, 3, SHAPE) for key in keys}
     pred = {
-        key: np.where(rng.random(SHAPE) < 0.5, REMAPS["carlasc11"](truth[key]), rng.integers(0, 11, SHAPE))
+        key: np.where(
+            rng.random(SHAPE) < 0.5, REMAPS["carlasc11"](truth[key]), rng.integers(0, 11, SHAPE)
+        )
         for key in keys
     }
     return truth, counts, pred
@@ -83,7 +85,9 @@ def test_a_data_set_is_scored_as_the_sum_of_its_frames(folders, world):
     assert seen == [(i, 6) for i in range(1, 7)]
     assert result.miou == pytest.approx(result.matrix.miou)
     assert result.miou_without_free == pytest.approx(result.matrix.mean_iou(with_free=False))
-    assert [(f.sequence, f.frame) for f in result.frame_scores] == [(p, str(i)) for p in SEQUENCES for i in range(3)]
+    assert [(f.sequence, f.frame) for f in result.frame_scores] == [
+        (p, str(i)) for p in SEQUENCES for i in range(3)
+    ]
     assert len(result.to_csv().splitlines()) == 7
 
 
@@ -91,9 +95,9 @@ def test_frames_regions_and_masks_choose_what_counts(folders, world):
     result = evaluate(*folders, frames=(1, 2))
     assert result.matrix == expected_matrix(world, keep=lambda key: key[1] == 1)
     near = distance_band(SPEC, 0, 2)
-    assert evaluate(*folders, scoring=Scoring(region=lambda spec: distance_band(spec, 0, 2))).matrix == expected_matrix(
-        world, mask=near
-    )
+    assert evaluate(
+        *folders, scoring=Scoring(region=lambda spec: distance_band(spec, 0, 2))
+    ).matrix == expected_matrix(world, mask=near)
     assert evaluate(*folders, scoring=Scoring(voxels="all")).matrix.total == 6 * np.prod(SHAPE)
 
 
@@ -163,7 +167,9 @@ def test_frames_that_cannot_be_scored_are_listed_and_the_others_done(folders, wo
 def test_a_prediction_of_another_grid_is_refused(folders, world, tmp_path):
     other = GridSpec("cartesian", (4, 4, 2), SPEC.lower, SPEC.upper)
     write_grids(tmp_path / "other", {key: np.zeros(other.size) for key in world[0]}, spec=other)
-    with pytest.raises(FormatError, match="expected the geometry of the ground truth, cartesian 8 x 8 x 2"):
+    with pytest.raises(
+        FormatError, match="expected the geometry of the ground truth, cartesian 8 x 8 x 2"
+    ):
         evaluate(tmp_path / "other", folders[1])
     plain = tmp_path / "plain"
     plain.mkdir()
@@ -179,7 +185,9 @@ def test_sides_that_cannot_be_compared_are_refused_in_one_line(folders, world, t
     shutil.copytree(truth / "Test" / "Town10_Heavy", tmp_path / "renamed" / "Test" / "Town99_Heavy")
     shutil.copytree(truth / "Test" / "Town10_Light", tmp_path / "renamed" / "Test" / "Town98_Light")
     found = "found Test/Town98_Light/cartesian, Test/Town99_Heavy/cartesian: sequences are matched by path or by name"
-    with pytest.raises(MissingDataError, match=f"expected ground truth for the sequence '{SEQUENCES[0]}', {found}"):
+    with pytest.raises(
+        MissingDataError, match=f"expected ground truth for the sequence '{SEQUENCES[0]}', {found}"
+    ):
         evaluate(pred, tmp_path / "renamed")
     with pytest.raises(MissingDataError, match="grid nothing"):
         evaluate(pred, truth, grid="nothing")
@@ -230,8 +238,12 @@ def test_voxels_that_no_camera_sees_do_not_count_for_cameras(folders):
     by_lidar = evaluate(folders[0], truth, convention="occ3d-lidar")
     assert 0 < by_camera.matrix.total <= seen
     assert by_camera.matrix.total < 0.8 * by_lidar.matrix.total
-    parts = evaluate(folders[0], truth, convention="occ3d-lidar", scoring=Scoring(by=["seen"])).breakdown
-    assert parts["seen"] == by_camera.matrix and parts["seen"] + parts["not seen"] == by_lidar.matrix
+    parts = evaluate(
+        folders[0], truth, convention="occ3d-lidar", scoring=Scoring(by=["seen"])
+    ).breakdown
+    assert (
+        parts["seen"] == by_camera.matrix and parts["seen"] + parts["not seen"] == by_lidar.matrix
+    )
     with pytest.raises(MissingDataError, match="cameras and the field `seen`"):
         evaluate(folders[0], folders[0], convention="own", scoring=Scoring(by=["seen"]))
 
@@ -246,7 +258,8 @@ def test_a_sequence_without_prediction_is_named_in_a_note(folders):
     result = evaluate(*folders)
     assert set(result.sequences) == set(SEQUENCES)
     assert result.notes == (
-        "1 of 3 sequences of the ground truth have no prediction and were not scored: Test/Town10_New/cartesian",
+        "1 of 3 sequences of the ground truth have no prediction and were not scored: "
+        "Test/Town10_New/cartesian",
     )
 
 
@@ -255,7 +268,10 @@ def test_five_sequences_have_an_interval_and_can_be_compared(tmp_path, world):
     paths = [f"Test/Town{n}/cartesian" for n in range(6)]
     truth = {(path, 0): rng.integers(0, 11, SHAPE) for path in paths}
     for name, share in (("good", 0.8), ("bad", 0.5)):
-        labels = {k: np.where(rng.random(SHAPE) < share, t, rng.integers(0, 11, SHAPE)) for k, t in truth.items()}
+        labels = {
+            k: np.where(rng.random(SHAPE) < share, t, rng.integers(0, 11, SHAPE))
+            for k, t in truth.items()
+        }
         write_grids(tmp_path / name, labels, classes="carlasc11")
     write_grids(tmp_path / "truth", truth, {k: np.ones(SHAPE) for k in truth}, classes="carlasc11")
     good, bad = (evaluate(tmp_path / name, tmp_path / "truth") for name in ("good", "bad"))
@@ -263,7 +279,10 @@ def test_five_sequences_have_an_interval_and_can_be_compared(tmp_path, world):
     assert interval.low < good.miou < interval.high
     comparison = good.compare(bad)
     assert comparison.p_value < 0.05 and comparison.difference.low > 0
-    assert evaluate(tmp_path / "good", tmp_path / "truth", frames=(0, 1)).to_dict()["miou_interval"] is not None
+    assert (
+        evaluate(tmp_path / "good", tmp_path / "truth", frames=(0, 1)).to_dict()["miou_interval"]
+        is not None
+    )
     with pytest.raises(ArgumentError, match="other: expected scores by carlasc, found sscbench"):
         good.compare(evaluate(tmp_path / "bad", tmp_path / "truth", convention="sscbench"))
 
@@ -276,7 +295,8 @@ def test_scores_are_broken_down_by_distance_height_and_visibility(folders, world
     assert parts["0-10 m"].total == result.matrix.total
     assert result.tables()[-1].rows[0][0] == "0-10 m"
     with pytest.raises(
-        ArgumentError, match="by: expected any of distance, height, visibility, motion, seen, found 'colour'"
+        ArgumentError,
+        match="by: expected any of distance, height, visibility, motion, seen, found 'colour'",
     ):
         evaluate(*folders, scoring=Scoring(by=("colour",)))
 
@@ -284,7 +304,13 @@ def test_scores_are_broken_down_by_distance_height_and_visibility(folders, world
 def test_tables_hold_the_figures_in_percent(folders):
     result = evaluate(*folders, name="Net_1")
     semantic, geometric = semantic_table([result, result]), geometric_table([result])
-    assert semantic.header == ("Network", *CARLASC11.names.values(), "mIoU", "mIoU w/o free", "Accuracy")
+    assert semantic.header == (
+        "Network",
+        *CARLASC11.names.values(),
+        "mIoU",
+        "mIoU w/o free",
+        "Accuracy",
+    )
     assert len(semantic.rows) == 2
     assert semantic.rows[0][-1] == pytest.approx(100 * result.matrix.accuracy)
     found = result.matrix.completeness()
@@ -298,7 +324,9 @@ def test_tables_hold_the_figures_in_percent(folders):
     latex = geometric.to_latex()
     assert r"Net\_1 & " in latex
     assert latex.count(r"\\") == 2
-    assert json.loads(json.dumps(result.to_dict()))["class_iou"].keys() == set(CARLASC11.names.values())
+    assert json.loads(json.dumps(result.to_dict()))["class_iou"].keys() == set(
+        CARLASC11.names.values()
+    )
 
 
 def write_plain(folder, files):
@@ -310,10 +338,11 @@ def write_plain(folder, files):
 
 
 def test_a_plain_folder_of_truth_has_counts_or_all_its_voxels_are_unknown(tmp_path):
+    # 7 is a road: class 6 of the eleven
     truth, pred = (
         np.array([7, 7, 0, 1], np.uint32),
         np.array([6, 0, 0, 1], np.uint32),
-    )  # 7 is a road: class 6 of the eleven
+    )
     source = write_plain(tmp_path / "source", {"000000.label": pred})
     plain = {"000000.label": truth, "000000.bin": np.array([1, 2, 0, 3], np.float32)}
     result = evaluate(source, write_plain(tmp_path / "truth", plain))
@@ -331,7 +360,10 @@ def test_plain_folders_of_different_sizes_are_told_by_the_size_of_their_files(tm
         r"expected the shape of the ground truth (4,), found (3,)"
         in evaluate(source, without, scoring=Scoring(voxels="all")).failures[0][1]
     )
-    assert "expected 4 labels" in evaluate(source, write_plain(tmp_path / "counted", counted)).failures[0][1]
+    assert (
+        "expected 4 labels"
+        in evaluate(source, write_plain(tmp_path / "counted", counted)).failures[0][1]
+    )
 
 
 def test_the_classes_of_plain_predictions_can_be_named(folders, world, tmp_path):
@@ -339,20 +371,28 @@ def test_the_classes_of_plain_predictions_can_be_named(folders, world, tmp_path)
     files = {f"{frame:06d}.label": world[0][heavy, frame].astype(np.uint32) for frame in range(3)}
     source, truth = write_plain(tmp_path / "plain", files), folders[1] / heavy
     assert evaluate(source, truth, source_classes="carla").matrix.accuracy == 1.0
-    assert len(evaluate(source, truth).failures) == 3  # ids above 10 are not ids of the scored classes
+    # ids above 10 are not ids of the scored classes
+    assert len(evaluate(source, truth).failures) == 3
 
 
 def test_a_region_needs_grids_whose_geometry_is_known(tmp_path):
     folder = write_plain(tmp_path / "plain", {"000000.label": np.zeros(4, np.uint32)})
     with pytest.raises(ArgumentError, match="region: expected None for grids without geometry"):
-        evaluate(folder, folder, scoring=Scoring(voxels="all", region=lambda spec: distance_band(spec, 0, 1)))
+        evaluate(
+            folder,
+            folder,
+            scoring=Scoring(voxels="all", region=lambda spec: distance_band(spec, 0, 1)),
+        )
 
 
 def test_semantickittis_mask_is_combined_with_its_invalid_voxels_and_a_region(tmp_path):
     labels = np.array([[[0, 1], [10, 40]]])  # 1 is ignored
     spec = GridSpec("cartesian", (1, 2, 2), (0.0, -1.0, 0.0), (1.0, 1.0, 2.0))
     write_grids(
-        tmp_path / "a", {(SEQUENCES[0], 0): labels}, {(SEQUENCES[0], 0): np.array([[[1, 1], [1, 0]]])}, spec=spec
+        tmp_path / "a",
+        {(SEQUENCES[0], 0): labels},
+        {(SEQUENCES[0], 0): np.array([[[1, 1], [1, 0]]])},
+        spec=spec,
     )
     path = tmp_path / "a" / SEQUENCES[0] / layout.METADATA
     path.write_text(json.dumps({"classes": "semantickitti"}))
@@ -367,13 +407,20 @@ def test_semantickittis_mask_is_combined_with_its_invalid_voxels_and_a_region(tm
     assert half.matrix.total == 1
 
 
-def test_sequences_of_different_classes_are_summed_in_the_classes_of_the_convention(world, tmp_path):
+def test_sequences_of_different_classes_are_summed_in_the_classes_of_the_convention(
+    world, tmp_path
+):
     labels, counts = world[2], world[1]
     for path, classes in zip(SEQUENCES, ("carlasc11", "carla"), strict=True):
-        write_grids(tmp_path, {k: v for k, v in labels.items() if k[0] == path}, counts, classes=classes)
+        write_grids(
+            tmp_path, {k: v for k, v in labels.items() if k[0] == path}, counts, classes=classes
+        )
     result = evaluate(tmp_path, tmp_path)
     assert (result.frames, result.matrix.accuracy) == (6, 1.0)
-    with pytest.raises(FormatError, match=r"a class table with a map in the convention own \(carlasc11\), found carla"):
+    with pytest.raises(
+        FormatError,
+        match=r"a class table with a map in the convention own \(carlasc11\), found carla",
+    ):
         evaluate(tmp_path, tmp_path, convention="own")
 
 
@@ -381,14 +428,17 @@ def test_of_several_grids_one_is_to_be_named(world, tmp_path):
     for grid in ("evaluation_a", "evaluation_b"):
         write_grids(tmp_path, world[0], world[1], grid=grid)
     with pytest.raises(
-        MissingDataError, match="expected the grid evaluation, found evaluation_a, evaluation_b: choose a grid with"
+        MissingDataError,
+        match="expected the grid evaluation, found evaluation_a, evaluation_b: choose a grid with",
     ):
         evaluate(tmp_path, tmp_path)
     assert evaluate(tmp_path, tmp_path, truth_grid="evaluation_b").miou > 0.9
 
 
 def evaluation(classes, matrix, absent="zero"):
-    return Evaluation("Net_1", replace(own_convention(classes), absent=absent), matrix, {}, 1, "known", [])
+    return Evaluation(
+        "Net_1", replace(own_convention(classes), absent=absent), matrix, {}, 1, "known", []
+    )
 
 
 def test_ids_that_are_no_class_are_not_in_the_mean():
@@ -416,5 +466,7 @@ def test_a_table_needs_evaluations_by_the_same_convention():
         Evaluation("Net_1", CONVENTIONS[name], ConfusionMatrix(20), {}, 1, "known", [])
         for name in ("sscbench", "semantickitti")
     ]
-    with pytest.raises(ArgumentError, match="evaluations by one convention, found semantickitti, sscbench"):
+    with pytest.raises(
+        ArgumentError, match="evaluations by one convention, found semantickitti, sscbench"
+    ):
         semantic_table(results)

@@ -11,7 +11,9 @@ SPEC = GridSpec("cartesian", (9, 7, 5), (-2.25, -1.75, -1.0), (2.25, 1.75, 1.5))
 
 
 def sampled(solid, spec, origin, point, steps=20000):
-    """Return the distance of the middle of the path through the first solid voxel, and what is passed, by dense samples."""
+    """Return the distance of the middle of the path through the first solid voxel, and what is
+    passed, by dense samples.
+    """
     end = spec.index(point[None])[0][0]
     direction = point - origin
     parameters = np.linspace(0, 6, 6 * steps + 1)
@@ -33,7 +35,9 @@ def sampled(solid, spec, origin, point, steps=20000):
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-4.0, 0.3, 0.2), (0.1, 0.2, 3.0)])
 def test_rays_meet_and_pass_what_dense_samples_meet_and_pass(origin):
     rng = np.random.default_rng(3)
-    solid = np.where(rng.random(SPEC.size) < 0.06, rng.integers(1, 4, SPEC.size), 0).astype(np.uint8)
+    solid = np.where(rng.random(SPEC.size) < 0.06, rng.integers(1, 4, SPEC.size), 0).astype(
+        np.uint8
+    )
     points = rng.uniform(SPEC.lower, SPEC.upper, (25, 3))
     first, passed = follow_rays(solid, SPEC, np.array(origin), points)
     for point, distance, bits in zip(points, first, passed, strict=True):
@@ -65,4 +69,9 @@ def test_a_ray_goes_on_behind_its_point():
 
 def test_a_cylindrical_grid_is_refused():
     with pytest.raises(ArgumentError, match="Cartesian"):
-        follow_rays(np.zeros((128, 128, 8), np.uint8), GridSpec.published("cylindrical"), np.zeros(3), np.ones((1, 3)))
+        follow_rays(
+            np.zeros((128, 128, 8), np.uint8),
+            GridSpec.published("cylindrical"),
+            np.zeros(3),
+            np.ones((1, 3)),
+        )

@@ -20,11 +20,15 @@ FRAMES, SECONDS = 6, 0.5
 
 
 def write(folder, grids, pose=lambda frame: translation((frame, 0, 0)), times=True):
-    """Write grids, {name: {frame: labels, counts}}, of a vehicle that drives one voxel in every frame of half a second."""
+    """Write grids, {name: {frame: labels, counts}}, of a vehicle that drives one voxel in every
+    frame of half a second.
+    """
     writer = FolderSink(folder).sequence(PATH)
     if pose is not None:
         poses = [pose(frame)[:3].reshape(-1) for frame in range(FRAMES)]
-        writer.write_document(layout.POSES, "".join(" ".join(map(str, row)) + "\n" for row in poses).encode())
+        writer.write_document(
+            layout.POSES, "".join(" ".join(map(str, row)) + "\n" for row in poses).encode()
+        )
     if times:
         seconds = "".join(f"{SECONDS * f + 0.01 * (f % 2)}\n" for f in range(FRAMES))
         writer.write_document(layout.TIMES, seconds.encode())
@@ -42,7 +46,9 @@ def world():
     grids = {}
     for frame in range(FRAMES):
         rng = np.random.default_rng(frame)
-        labels = np.where(rng.random(SPEC.size) < 0.3, rng.integers(1, 11, SPEC.size), 0).astype(np.uint8)
+        labels = np.where(rng.random(SPEC.size) < 0.3, rng.integers(1, 11, SPEC.size), 0).astype(
+            np.uint8
+        )
         grids[frame] = carlasc.Grid(SPEC, labels, (rng.random(SPEC.size) < 0.9).astype(np.float32))
     return grids
 
@@ -54,7 +60,9 @@ def truth(tmp_path, world):
 
 def exact(world, steps):
     """Return what is known in each frame of the grid some frames later, in the frame's own axes."""
-    return {f: moved_grid(world[f + steps], translation((steps, 0, 0))) for f in range(FRAMES - steps)}
+    return {
+        f: moved_grid(world[f + steps], translation((steps, 0, 0))) for f in range(FRAMES - steps)
+    }
 
 
 def score(source, truth, **options):
@@ -62,13 +70,18 @@ def score(source, truth, **options):
 
 
 def test_a_forecast_that_comes_true_is_perfect_in_the_axes_of_its_own_frame(tmp_path, truth, world):
-    source = write(tmp_path / "a", {"net_0.5s": exact(world, 1), "net_1.0s": exact(world, 2), "evaluation": world})
+    source = write(
+        tmp_path / "a",
+        {"net_0.5s": exact(world, 1), "net_1.0s": exact(world, 2), "evaluation": world},
+    )
     found = score(source, truth)
     assert list(found) == [0.5, 1.0]
     assert [result.frames for result in found.values()] == [5, 4]  # the others have no later frame
     assert all(result.matrix.accuracy == 1 and not result.failures for result in found.values())
     assert score(source, truth, frames="2:4")[0.5].frames == 2
-    assert found[1.0].matrix.total == sum(int(grid.known.sum()) for grid in exact(world, 2).values())
+    assert found[1.0].matrix.total == sum(
+        int(grid.known.sum()) for grid in exact(world, 2).values()
+    )
     assert score(source, truth, around="future")[0.5].matrix.accuracy < 0.9
 
 
@@ -81,12 +94,17 @@ def test_forecasts_around_the_future_sensor_need_no_poses(tmp_path, world):
 
 
 def test_to_repeat_the_present_is_worse_the_farther_ahead(tmp_path, world):
-    """A block that moves by a voxel in every frame: repeating what is there now is wrong at its ends."""
+    """A block that moves by a voxel in every frame: repeating what is there now is wrong at its
+    ends.
+    """
     for frame, grid in world.items():
         grid.labels[:], grid.counts[:] = 0, 1
         grid.labels[frame : frame + 4] = 10
-    truth = write(tmp_path / "truth", {"evaluation": world}, pose=lambda frame: np.eye(4), times=False)
-    source = write(tmp_path / "a", {"same_0.1s": world, "same_0.2s": world})  # ten frames a second without times.txt
+    truth = write(
+        tmp_path / "truth", {"evaluation": world}, pose=lambda frame: np.eye(4), times=False
+    )
+    # ten frames a second without times.txt
+    source = write(tmp_path / "a", {"same_0.1s": world, "same_0.2s": world})
     found = score(source, truth)
     assert [result.score.iou for result in found.values()] == pytest.approx([3 / 5, 2 / 6])
 
@@ -105,8 +123,16 @@ def test_a_missing_forecast_is_a_failure_of_its_frame(tmp_path, truth, world):
         (["a_1s", "b_1s"], {}, "grid: expected one forecast grid per horizon, found a_1s and b_1s"),
         (["a_1s"], {"grid": "b"}, "expected grids of forecasts such as b_1s, found a_1s"),
         (["a_9s"], {}, r"evaluation: expected frames that are 9 s apart, found frames of 2.51 s"),
-        (["a_1s"], {"scoring": Scoring(rays=True)}, "scoring: expected .* for forecasts, found rays"),
-        (["a_1s"], {"frames": "5:"}, "expected labels of a frame to score, found none in the range 5:"),
+        (
+            ["a_1s"],
+            {"scoring": Scoring(rays=True)},
+            "scoring: expected .* for forecasts, found rays",
+        ),
+        (
+            ["a_1s"],
+            {"frames": "5:"},
+            "expected labels of a frame to score, found none in the range 5:",
+        ),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, truth, world, names, options, message):
@@ -119,7 +145,9 @@ def test_mistakes_are_one_line(tmp_path, truth, world, names, options, message):
 def test_files_of_other_benchmarks_have_no_later_frames(tmp_path, truth, world):
     source = write(tmp_path / "a", {"a_1s": exact(world, 2)})
     (truth / PATH / layout.params_file("evaluation")).unlink()
-    with pytest.raises(MissingDataError, match="expected a sequence with poses and times, found files of grids"):
+    with pytest.raises(
+        MissingDataError, match="expected a sequence with poses and times, found files of grids"
+    ):
         score(source, truth / PATH / "evaluation")
 
 
@@ -134,6 +162,9 @@ def test_the_command_prints_a_row_for_each_time_ahead(tmp_path, truth, world):
     values = json.loads(CliRunner().invoke(app, [*given, "--json"]).stdout)["forecasts"]
     assert [(row["horizon_s"], row["accuracy"]) for row in values] == [(0.5, 1), (1, 1)]
     result = CliRunner().invoke(app, [*given, "--all-conventions"])
-    assert (result.exit_code, result.output.count("\n")) == (2, 1) and "--all-conventions" in result.output
+    assert (result.exit_code, result.output.count("\n")) == (
+        2,
+        1,
+    ) and "--all-conventions" in result.output
     with pytest.raises(ArgumentError):
         score(source, truth, scoring=Scoring(by=("motion",)))

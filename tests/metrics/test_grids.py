@@ -14,11 +14,22 @@ def grid(labels, counts=None):
 
 
 def test_each_kind_of_error_is_found_where_the_truth_is_known():
-    prediction, truth = grid([7, 7, 0, 7, 0, 7, 0]), grid([7, 10, 7, 0, 0, 7, 7], [1, 1, 1, 1, 1, 0, 0])
+    prediction, truth = (
+        grid([7, 7, 0, 7, 0, 7, 0]),
+        grid([7, 10, 7, 0, 0, 7, 7], [1, 1, 1, 1, 1, 0, 0]),
+    )
     outcomes = compare_grids(prediction, truth)
     assert outcomes.dtype == np.uint8 and outcomes.shape == SPEC.size
     none = VoxelOutcome.NOT_COMPARED
-    expected = [VoxelOutcome.RIGHT, VoxelOutcome.WRONG, VoxelOutcome.MISSED, VoxelOutcome.INVENTED, none, none, none]
+    expected = [
+        VoxelOutcome.RIGHT,
+        VoxelOutcome.WRONG,
+        VoxelOutcome.MISSED,
+        VoxelOutcome.INVENTED,
+        none,
+        none,
+        none,
+    ]
     assert outcomes.reshape(-1).tolist() == expected
 
 
@@ -29,7 +40,9 @@ def test_a_truth_without_counts_is_known_everywhere():
 
 def test_counts_of_the_prediction_are_ignored():
     truth, labels = grid([1, 2, 0, 0, 0, 0, 5]), [1, 3, 0, 4, 0, 0, 0]
-    np.testing.assert_array_equal(compare_grids(grid(labels), truth), compare_grids(grid(labels, [0] * 7), truth))
+    np.testing.assert_array_equal(
+        compare_grids(grid(labels), truth), compare_grids(grid(labels, [0] * 7), truth)
+    )
 
 
 @pytest.mark.parametrize(

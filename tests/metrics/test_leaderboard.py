@@ -45,14 +45,21 @@ def test_the_page_has_a_bar_per_class_escapes_names_and_asks_no_other_host(files
     page = scores(files).to_html()
     assert "Net 2 &lt;b&gt;" in page and "<b>" not in page
     bars = re.findall(r'height="([\d.]+)"><title>(\w+): ([\d.-]+)', page)
-    assert bars == [("16.8", "Road", "70.0"), ("6.0", "Car", "25.0"), ("16.8", "Road", "70.0"), ("0.6", "Car", "-")]
+    assert bars == [
+        ("16.8", "Road", "70.0"),
+        ("6.0", "Car", "25.0"),
+        ("16.8", "Road", "70.0"),
+        ("0.6", "Car", "-"),
+    ]
     assert "http" not in page
 
 
 def test_conventions_are_not_mixed_silently(files, tmp_path):
     other = tmp_path / "other.json"
     other.write_text(json.dumps(result("Third", "sscbench")))
-    with pytest.raises(ArgumentError, match="files: expected results by one convention, found carlasc, sscbench"):
+    with pytest.raises(
+        ArgumentError, match="files: expected results by one convention, found carlasc, sscbench"
+    ):
         scores([*files, other])
     mixed = scores([*files, other], mixed=True).table()
     assert mixed.header[1] == "Convention"

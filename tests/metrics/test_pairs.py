@@ -12,15 +12,24 @@ from carlasc.metrics import Scoring, distance_band, evaluate
 def write_occ3d(root, seed, keep=1.0, name="semantics", masks=True):
     """Two scenes of two frames each; returns {(scene, token): (labels, lidar mask)}."""
     frames = {}
-    for scene, token in (("scene-0001", "aa"), ("scene-0001", "bb"), ("scene-0002", "cc"), ("scene-0002", "dd")):
+    for scene, token in (
+        ("scene-0001", "aa"),
+        ("scene-0001", "bb"),
+        ("scene-0002", "cc"),
+        ("scene-0002", "dd"),
+    ):
         rng = np.random.default_rng([seed, *token.encode()])
-        labels = rng.choice([0, 4, 11, 17], (200, 200, 16), p=[0.02, 0.02, 0.06, 0.9]).astype(np.uint8)
+        labels = rng.choice([0, 4, 11, 17], (200, 200, 16), p=[0.02, 0.02, 0.06, 0.9]).astype(
+            np.uint8
+        )
         lidar, camera = rng.random((2, 200, 200, 16)) < [[[[0.5]]], [[[0.2]]]]
         if rng.random() < keep:
             folder = root / scene / token
             folder.mkdir(parents=True)
             arrays = {name: labels} | (
-                {"mask_lidar": lidar.astype(np.uint8), "mask_camera": camera.astype(np.uint8)} if masks else {}
+                {"mask_lidar": lidar.astype(np.uint8), "mask_camera": camera.astype(np.uint8)}
+                if masks
+                else {}
             )
             np.savez_compressed(folder / "labels.npz", **arrays)
         frames[scene, token] = labels, lidar, camera
@@ -61,9 +70,14 @@ def test_damaged_files_of_occ3d_are_named(tmp_path):
     bad = tmp_path / "pred" / "scene-0001"
     (bad / "aa" / "labels.npz").write_bytes(b"no archive")
     np.savez(bad / "bb" / "labels.npz", semantics=np.zeros((2, 2, 2), np.uint8))
-    messages = dict(evaluate(tmp_path / "pred", tmp_path / "gts", convention="occ3d-lidar").failures)
+    messages = dict(
+        evaluate(tmp_path / "pred", tmp_path / "gts", convention="occ3d-lidar").failures
+    )
     assert "labels.npz: expected an .npz file, found something else" in messages["scene-0001:aa"]
-    assert "semantics: expected an array of 200 x 200 x 16 values, found 2 x 2 x 2" in messages["scene-0001:bb"]
+    assert (
+        "semantics: expected an array of 200 x 200 x 16 values, found 2 x 2 x 2"
+        in messages["scene-0001:bb"]
+    )
 
 
 def test_a_pickle_in_an_npz_is_never_loaded(tmp_path):
@@ -72,7 +86,9 @@ def test_a_pickle_in_an_npz_is_never_loaded(tmp_path):
     hostile = np.empty(1, object)
     hostile[0] = {"any": "object"}
     np.savez(tmp_path / "pred" / "scene-0001" / "aa" / "labels.npz", semantics=hostile)
-    failures = dict(evaluate(tmp_path / "pred", tmp_path / "gts", convention="occ3d-lidar").failures)
+    failures = dict(
+        evaluate(tmp_path / "pred", tmp_path / "gts", convention="occ3d-lidar").failures
+    )
     assert "semantics: expected numeric values, found object" in failures["scene-0001:aa"]
 
 
@@ -138,25 +154,38 @@ def test_a_truncated_label_file_is_named(tmp_path):
     result = evaluate(tmp_path / "b", tmp_path / "a", convention="semantickitti")
     assert "expected 64 labels of 2 or 4 bytes, found 126 bytes" in result.failures[0][1]
     with pytest.raises(FormatError, match="with a map in the convention"):
-        evaluate(tmp_path / "a", tmp_path / "a", convention="occ3d-lidar", source_classes="semanticposs")
+        evaluate(
+            tmp_path / "a", tmp_path / "a", convention="occ3d-lidar", source_classes="semanticposs"
+        )
 
 
-def write_kitti(root, rng, shape=(256, 256, 32), folders=("voxels", "predictions"), parent="sequences/08"):
-    """One frame in the files of SemanticKITTI; returns the true labels, the prediction and the invalid voxels."""
-    truth = rng.choice([0, 10, 40, 50, 52, 99], shape, p=[0.9, 0.02, 0.05, 0.01, 0.01, 0.01]).astype("<u2")
-    prediction = np.where(rng.random(shape) < 0.9, np.where(np.isin(truth, (52, 99)), 50, truth), 40).astype("<u2")
+def write_kitti(
+    root, rng, shape=(256, 256, 32), folders=("voxels", "predictions"), parent="sequences/08"
+):
+    """One frame in the files of SemanticKITTI; returns the true labels, the prediction and the
+    invalid voxels.
+    """
+    truth = rng.choice(
+        [0, 10, 40, 50, 52, 99], shape, p=[0.9, 0.02, 0.05, 0.01, 0.01, 0.01]
+    ).astype("<u2")
+    prediction = np.where(
+        rng.random(shape) < 0.9, np.where(np.isin(truth, (52, 99)), 50, truth), 40
+    ).astype("<u2")
     invalid = (rng.random(shape) < 0.3) & (truth == 0)
     for folder, labels in zip(folders, (truth, prediction), strict=True):
         (root / parent / folder).mkdir(parents=True, exist_ok=True)
         labels.tofile(root / parent / folder / "000000.label")
     (root / parent / "voxels" / "000000.invalid").write_bytes(np.packbits(invalid).tobytes())
     (root / parent / "voxels" / "000000.occluded").write_bytes(np.packbits(truth > 0).tobytes())
-    (root / parent / "voxels" / "000000.bin").write_bytes(np.packbits(truth > 0).tobytes())  # occupancy, no counts
+    # occupancy, no counts
+    (root / parent / "voxels" / "000000.bin").write_bytes(np.packbits(truth > 0).tobytes())
     return truth, prediction, invalid
 
 
 def official_ious(truth, prediction, invalid):
-    """The scores of the benchmark's script: raw ids by its table, ignored classes and invalid voxels masked, class 0 empty."""
+    """The scores of the benchmark's script: raw ids by its table, ignored classes and invalid
+    voxels masked, class 0 empty.
+    """
     learning = {0: 0, 52: 255, 99: 255, 10: 1, 40: 9, 50: 13}
     table = np.zeros(300, int)
     table[list(learning)] = list(learning.values())
@@ -166,7 +195,9 @@ def official_ious(truth, prediction, invalid):
     for name, c in (("car", 1), ("road", 9), ("building", 13)):
         a, b = pred[mask] == c, true[mask] == c
         ious[name] = (a & b).sum() / (a | b).sum()
-    completion = ((pred[mask] > 0) & (true[mask] > 0)).sum() / ((pred[mask] > 0) | (true[mask] > 0)).sum()
+    completion = ((pred[mask] > 0) & (true[mask] > 0)).sum() / (
+        (pred[mask] > 0) | (true[mask] > 0)
+    ).sum()
     return ious, completion
 
 
@@ -181,8 +212,12 @@ def test_files_of_semantickitti_are_read_as_they_are(tmp_path):
 
 def test_the_geometry_of_semantickitti_is_known(tmp_path):
     truth, prediction, invalid = write_kitti(tmp_path, np.random.default_rng(2))
-    near = evaluate(tmp_path, tmp_path, scoring=Scoring(region=lambda spec: distance_band(spec, 0, 10)))
-    x, y = np.meshgrid((np.arange(256) + 0.5) * 0.2, (np.arange(256) + 0.5) * 0.2 - 25.6, indexing="ij")
+    near = evaluate(
+        tmp_path, tmp_path, scoring=Scoring(region=lambda spec: distance_band(spec, 0, 10))
+    )
+    x, y = np.meshgrid(
+        (np.arange(256) + 0.5) * 0.2, (np.arange(256) + 0.5) * 0.2 - 25.6, indexing="ij"
+    )
     beyond = np.broadcast_to((np.hypot(x, y) >= 10)[:, :, None], truth.shape)
     ious, _ = official_ious(truth, prediction, invalid | beyond)
     assert {name: near.class_iou[name] for name in ious} == pytest.approx(ious)
@@ -217,7 +252,9 @@ def test_a_mask_that_is_cut_short_is_named(tmp_path):
         first.with_name("000001.label").write_bytes(first.read_bytes())
     second.write_bytes(mask.read_bytes()[:-3])
     failures = dict(evaluate(tmp_path, tmp_path).failures)
-    assert "000001.invalid: expected 1024 bytes, or 128 of packed bits, found 125" in failures["08:1"]
+    assert (
+        "000001.invalid: expected 1024 bytes, or 128 of packed bits, found 125" in failures["08:1"]
+    )
 
 
 def test_drives_of_sscbench_are_found(tmp_path):

@@ -22,7 +22,10 @@ def frame(seed, shape=(12, 10, 3)):
     classes[..., 0] = rng.choice([1, 2])
     for number in range(1, 7):
         x, y = rng.integers(0, 9, 2)
-        classes[x : x + 3, y : y + 2, 1:], ids[x : x + 3, y : y + 2, 1:] = rng.choice([3, 4]), number
+        classes[x : x + 3, y : y + 2, 1:], ids[x : x + 3, y : y + 2, 1:] = (
+            rng.choice([3, 4]),
+            number,
+        )
     pred, pred_ids = np.roll(classes, rng.integers(0, 2), 0), np.roll(ids, rng.integers(0, 2), 0)
     wrong = rng.random(shape) < 0.1
     pred[wrong] = rng.integers(0, K, wrong.sum())
@@ -50,7 +53,11 @@ def plain(frames, variant="standard"):
             fp += sum(("p", i) not in matched for i in range(len(sides[0])))
             fn += sum(("t", j) not in matched for j in range(len(sides[1])))
         if tp + fp + fn:
-            found[:, c] = iou_sum / (tp + fp / 2 + fn / 2), iou_sum / tp if tp else 0, tp / (tp + fp / 2 + fn / 2)
+            found[:, c] = (
+                iou_sum / (tp + fp / 2 + fn / 2),
+                iou_sum / tp if tp else 0,
+                tp / (tp + fp / 2 + fn / 2),
+            )
     return found
 
 
@@ -74,7 +81,11 @@ def test_pq_dagger_takes_the_iou_of_stuff():
     score = PanopticQuality(K, THINGS).update(pred, truth).compute()
     occurs = ~np.isnan(score.pq)
     iou = np.array(
-        [((pred[0] == c) & (truth[0] == c)).sum() / max(1, ((pred[0] == c) | (truth[0] == c)).sum()) for c in range(K)]
+        [
+            ((pred[0] == c) & (truth[0] == c)).sum()
+            / max(1, ((pred[0] == c) | (truth[0] == c)).sum())
+            for c in range(K)
+        ]
     )
     expected = [score.pq[c] if c in THINGS else iou[c] for c in range(K) if occurs[c]]
     assert score.pq_dagger == pytest.approx(np.mean(expected))
@@ -85,9 +96,9 @@ def test_a_stuff_segment_that_overlaps_a_little_is_wrong_unless_pasco_scores():
     truth[:5], pred[4:9] = 1, 1
     ids = np.zeros(10, int)
     assert PanopticQuality(K, THINGS).update((pred, ids), (truth, ids)).compute().pq[1] == 0.0
-    assert PanopticQuality(K, THINGS, variant="pasco").update((pred, ids), (truth, ids)).compute().pq[
-        1
-    ] == pytest.approx(1 / 9)
+    assert PanopticQuality(K, THINGS, variant="pasco").update(
+        (pred, ids), (truth, ids)
+    ).compute().pq[1] == pytest.approx(1 / 9)
 
 
 @settings(max_examples=20, deadline=None)

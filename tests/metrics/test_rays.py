@@ -17,13 +17,17 @@ K = 5
 
 def scene(seed, density=0.04):
     rng = np.random.default_rng(seed)
-    labels = np.where(rng.random(SPEC.size) < density, rng.integers(1, K, SPEC.size), 0).astype(np.uint8)
+    labels = np.where(rng.random(SPEC.size) < density, rng.integers(1, K, SPEC.size), 0).astype(
+        np.uint8
+    )
     labels[:, :, 0] = 1
     return labels
 
 
 def walk(labels, origin, direction, free=0):
-    """Follow one ray from face to face, every distance computed anew: (voxel, depth) as METRICS says."""
+    """Follow one ray from face to face, every distance computed anew: (voxel, depth) as METRICS
+    says.
+    """
     low, high, size = (np.array(v, float) for v in (SPEC.lower, SPEC.upper, SPEC.voxel_size))
     faces = []
     for axis in range(3):
@@ -51,11 +55,15 @@ def test_there_are_14040_rays_of_39_pitches():
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
     pitch = np.rad2deg(np.arcsin(directions[::360, 2]))
     assert len(pitch) == 39
-    np.testing.assert_allclose(pitch[:3], [-45, -math.degrees(math.pi / 2 - math.atan(2)), -18.4349488])
+    np.testing.assert_allclose(
+        pitch[:3], [-45, -math.degrees(math.pi / 2 - math.atan(2)), -18.4349488]
+    )
     assert pitch[-1] == pytest.approx(12.55, abs=0.005)
     np.testing.assert_allclose(np.diff(pitch[9:]), pitch[9] - pitch[8])
     np.testing.assert_allclose(
-        np.rad2deg(np.arctan2(directions[:360, 1], directions[:360, 0])) % 360, np.arange(360), atol=1e-9
+        np.rad2deg(np.arctan2(directions[:360, 1], directions[:360, 0])) % 360,
+        np.arange(360),
+        atol=1e-9,
     )
 
 
@@ -122,7 +130,9 @@ def plain_rayiou(pred, truth, origins, thresholds=(1, 2, 4)):
 def test_rayiou_is_that_of_a_plain_count():
     pred, truth = scene(1), scene(2)
     origins = np.array([[0.13, 0.21, 0.4], [-2.2, 1.1, 0.9]])
-    score = RayIoU(K, directions=rayiou_directions()[::97]).update(pred, truth, SPEC, origins).compute()
+    score = (
+        RayIoU(K, directions=rayiou_directions()[::97]).update(pred, truth, SPEC, origins).compute()
+    )
     expected = plain_rayiou(pred, truth, origins)
     np.testing.assert_allclose(score.class_iou[:, 1:], expected)
     assert score.rayiou == pytest.approx(np.nanmean(expected))
@@ -185,7 +195,9 @@ def test_origins_are_places_on_the_way_inside_the_grid_at_most_eight_evenly():
     assert np.abs(origins[:, 0]).max() < 3.0
     near = (np.arange(41) - 20) * 0.5
     near = near[np.abs(near) < 3]
-    np.testing.assert_allclose(origins[:, 0], near[np.round(np.linspace(0, len(near) - 1, 8)).astype(int)])
+    np.testing.assert_allclose(
+        origins[:, 0], near[np.round(np.linspace(0, len(near) - 1, 8)).astype(int)]
+    )
     assert len(ray_origins(poses[:1], 0, SPEC)) == 1
 
 
@@ -196,17 +208,21 @@ def plain_raypq(pred, truth, origins, things, threshold, fewest=10):
         for direction in rayiou_directions()[::29]:
             (vp, dp), (vt, dt) = walk(pred[0], origin, direction), walk(truth[0], origin, direction)
             if truth[0][vt]:
-                rays.append((pred[0][vp], pred[1][vp], truth[0][vt], truth[1][vt], abs(dp - dt) < threshold))
+                rays.append(
+                    (pred[0][vp], pred[1][vp], truth[0][vt], truth[1][vt], abs(dp - dt) < threshold)
+                )
     pq = []
     for c in range(1, K):
         mine = {
-            i: {n for n, r in enumerate(rays) if r[0] == c and r[1] == i} for i in {r[1] for r in rays if r[0] == c}
+            i: {n for n, r in enumerate(rays) if r[0] == c and r[1] == i}
+            for i in {r[1] for r in rays if r[0] == c}
         }
         if c not in things:
             theirs = {0: {n for n, r in enumerate(rays) if r[2] == c}}
         else:
             theirs = {
-                i: {n for n, r in enumerate(rays) if r[2] == c and r[3] == i} for i in {r[3] for r in rays if r[2] == c}
+                i: {n for n, r in enumerate(rays) if r[2] == c and r[3] == i}
+                for i in {r[3] for r in rays if r[2] == c}
             }
         theirs = {i: s for i, s in theirs.items() if s}
         near = {n for n, r in enumerate(rays) if r[4]}
@@ -244,13 +260,24 @@ def test_raypq_is_that_of_sets_of_rays():
         np.testing.assert_allclose(
             score.pq[1:], plain_raypq((pred, pred_ids), (labels, ids), origins, {3, 4}, threshold)
         )
-    assert RayPQ(K, frozenset({3})).update((labels, ids), (labels, ids), SPEC, origins).compute()[1.0].mean() == 1.0
+    assert (
+        RayPQ(K, frozenset({3}))
+        .update((labels, ids), (labels, ids), SPEC, origins)
+        .compute()[1.0]
+        .mean()
+        == 1.0
+    )
 
 
 def test_wrong_input_is_named():
     cylinder = GridSpec.published("cylindrical")
     with pytest.raises(ArgumentError, match="Cartesian"):
-        RayIoU(K).update(np.zeros(cylinder.size, np.uint8), np.zeros(cylinder.size, np.uint8), cylinder, [[0, 0, 0]])
+        RayIoU(K).update(
+            np.zeros(cylinder.size, np.uint8),
+            np.zeros(cylinder.size, np.uint8),
+            cylinder,
+            [[0, 0, 0]],
+        )
     with pytest.raises(FormatError, match=r"prediction: expected shape \(16, 12, 6\)"):
         RayIoU(K).update(np.zeros((2, 2, 2), np.uint8), scene(0), SPEC, [[0, 0, 0]])
     with pytest.raises(FormatError, match=r"class ids 0\.\.4, found uint8 from 9 to 9"):
@@ -269,7 +296,9 @@ def test_tensors_are_cast_on_their_device_as_arrays_are_on_the_cpu(seed):
     origins = rng.uniform((-3.9, -2.9, -0.4), (3.9, 2.9, 1.9), (3, 3))
     directions = np.concatenate([rayiou_directions()[::41], np.eye(3), -np.eye(3)])
     expected = cast_rays(labels, SPEC, origins, directions)
-    found = cast_rays_on_device(torch.from_numpy(labels.astype(np.int32)), SPEC, origins, directions)
+    found = cast_rays_on_device(
+        torch.from_numpy(labels.astype(np.int32)), SPEC, origins, directions
+    )
     np.testing.assert_array_equal(found[0].numpy(), expected[0])
     np.testing.assert_allclose(found[1].numpy(), expected[1], atol=1e-9)
     tensors = [torch.from_numpy(grid) for grid in labels]

@@ -46,7 +46,8 @@ def test_a_voxel_is_hidden_exactly_where_something_lies_before_it():
         crossed = np.unique(((places - low) / size).astype(int), axis=0)
         blocked = any(labels[tuple(v)] for v in crossed if tuple(v) != tuple(voxel))
         grazed = any(
-            labels[tuple(v)] and np.all(((places - low) / size).astype(int) == v, axis=1).sum() < 8 for v in crossed
+            labels[tuple(v)] and np.all(((places - low) / size).astype(int) == v, axis=1).sum() < 8
+            for v in crossed
         )
         if not grazed:  # a corner that is only touched may fall on either side of the sampling
             assert visible[tuple(voxel)] == (not blocked), voxel
@@ -63,7 +64,9 @@ def test_an_unknown_voxel_hides_nothing():
 def test_moving_and_standing_things_are_told_by_the_flow_of_the_points_in_them():
     labels = np.zeros(SPEC.size, np.uint8)
     labels[2, 2], labels[5, 5], labels[9, 9] = 3, 3, 1
-    points = np.array([[-2.75, -2.75, 0.1], [-1.25, -1.25, 0.1], [0.75, 0.75, 0.1], [99, 0, 0]], np.float32)
+    points = np.array(
+        [[-2.75, -2.75, 0.1], [-1.25, -1.25, 0.1], [0.75, 0.75, 0.1], [99, 0, 0]], np.float32
+    )
     flow = np.array([[2, 0, 0], [0, 0, 0], [5, 0, 0], [5, 0, 0]], np.float32)
     masks = motion(Grid(SPEC, labels), Scan(points, flow=flow), [3])
     assert np.argwhere(masks["moving"]).tolist() == [[2, 2, 2]]
@@ -114,28 +117,40 @@ def test_vertical_field_of_view_leaves_out_what_is_above():
     assert not seen[..., 1].any()
 
 
-LINE = GridSpec("cartesian", (4, 1, 3), (0.0, -0.5, -1.5), (4.0, 0.5, 1.5))  # centres at x = 0.5..3.5, y = 0, z = -1..1
+# centres at x = 0.5..3.5, y = 0, z = -1..1
+LINE = GridSpec("cartesian", (4, 1, 3), (0.0, -0.5, -1.5), (4.0, 0.5, 1.5))
 
 
 def test_a_distance_band_includes_its_near_end_and_not_its_far_end():
-    np.testing.assert_array_equal(distance_band(LINE, 1.5, 2.5)[:, 0, 0], [False, True, False, False])
+    np.testing.assert_array_equal(
+        distance_band(LINE, 1.5, 2.5)[:, 0, 0], [False, True, False, False]
+    )
 
 
 def test_a_vertical_field_of_view_includes_both_ends_and_is_measured_from_the_horizontal_distance():
-    np.testing.assert_array_equal(field_of_view(LINE, vertical_rad=(0.0, 1.5))[0, 0], [False, True, True])
-    np.testing.assert_array_equal(field_of_view(LINE, vertical_rad=(-1.5, 0.0))[0, 0], [True, True, False])
-    corner = GridSpec("cartesian", (1, 1, 1), (0.5, 0.5, 0.5), (1.5, 1.5, 1.5))  # elevation of (1, 1, 1): 35.3 degrees
+    np.testing.assert_array_equal(
+        field_of_view(LINE, vertical_rad=(0.0, 1.5))[0, 0], [False, True, True]
+    )
+    np.testing.assert_array_equal(
+        field_of_view(LINE, vertical_rad=(-1.5, 0.0))[0, 0], [True, True, False]
+    )
+    # elevation of (1, 1, 1): 35.3 degrees
+    corner = GridSpec("cartesian", (1, 1, 1), (0.5, 0.5, 0.5), (1.5, 1.5, 1.5))
     assert field_of_view(corner, vertical_rad=(0.0, math.radians(36))).all()
     assert not field_of_view(corner, vertical_rad=(0.0, math.radians(35))).any()
 
 
 def test_masks_that_can_hold_nothing_are_refused():
-    with pytest.raises(ArgumentError, match="far_m: expected more than 5, the value of `near_m`, found 5"):
+    with pytest.raises(
+        ArgumentError, match="far_m: expected more than 5, the value of `near_m`, found 5"
+    ):
         distance_band(SMALL, 5, 5)
     with pytest.raises(ArgumentError, match="near_m: expected 0 or more, found -1"):
         distance_band(SMALL, -1, 5)
     for angle in (0.0, 6.3):
-        with pytest.raises(ArgumentError, match=r"horizontal_rad: expected an angle in \(0, 2 pi\]"):
+        with pytest.raises(
+            ArgumentError, match=r"horizontal_rad: expected an angle in \(0, 2 pi\]"
+        ):
             field_of_view(SMALL, angle)
     with pytest.raises(ArgumentError, match="vertical_rad"):
         field_of_view(SMALL, vertical_rad=(0.1, 0.1))

@@ -27,14 +27,17 @@ def test_an_interval_holds_the_score_and_is_wide_where_sequences_differ():
     for interval in (alike, apart):
         assert interval.low <= interval.value <= interval.high
     assert alike.high - alike.low < 0.03 < apart.high - apart.low
-    assert bootstrap(list(matrices([0.6] * 8).values()), accuracy) == alike  # the same draws each time
+    # the same draws each time
+    assert bootstrap(list(matrices([0.6] * 8).values()), accuracy) == alike
 
 
 def test_95_percent_of_intervals_hold_the_true_value():
     rng = np.random.default_rng(1)
     held = 0
     for trial in range(60):
-        interval = bootstrap(list(matrices(rng.normal(0.6, 0.1, 12), trial, 600).values()), accuracy)
+        interval = bootstrap(
+            list(matrices(rng.normal(0.6, 0.1, 12), trial, 600).values()), accuracy
+        )
         held += interval.low <= 0.6 + 0.4 / 3 <= interval.high
     assert held >= 50
 
@@ -47,7 +50,9 @@ def test_a_clear_difference_is_seen():
     assert found.p_value < 0.05
     assert 0 < found.difference.low < found.difference.value < found.difference.high
     assert compare(base, base, accuracy).p_value == 1.0
-    assert compare(base, better, accuracy).difference.value == pytest.approx(-found.difference.value)
+    assert compare(base, better, accuracy).difference.value == pytest.approx(
+        -found.difference.value
+    )
     assert found.sequences == tuple(sorted(base))
 
 
@@ -56,7 +61,9 @@ def test_the_test_of_equals_is_wrong_as_often_as_it_says():
     p_values = []
     for trial in range(60):
         hard = rng.uniform(0.3, 0.8, 6)
-        p_values.append(compare(matrices(hard, trial, 400), matrices(hard, 1000 + trial, 400), accuracy).p_value)
+        p_values.append(
+            compare(matrices(hard, trial, 400), matrices(hard, 1000 + trial, 400), accuracy).p_value
+        )
     assert np.mean(np.array(p_values) < 0.1) < 0.25
     assert np.mean(np.array(p_values) < 0.5) > 0.25
 

@@ -15,7 +15,9 @@ SPEC = GridSpec("cartesian", (10, 8, 2), (-5.0, -4.0, -1.0), (5.0, 4.0, 1.0))
 
 def grid(seed, density=0.3):
     rng = np.random.default_rng(seed)
-    labels = np.where(rng.random(SPEC.size) < density, rng.integers(1, 4, SPEC.size), 0).astype(np.uint8)
+    labels = np.where(rng.random(SPEC.size) < density, rng.integers(1, 4, SPEC.size), 0).astype(
+        np.uint8
+    )
     return Grid(SPEC, labels, (rng.random(SPEC.size) < 0.9).astype(np.float32))
 
 
@@ -55,7 +57,9 @@ def test_things_that_may_move_are_left_out_and_so_is_what_is_ignored():
 def test_grids_of_other_geometry_are_refused():
     other = GridSpec("cartesian", (5, 4, 2), (-5.0, -4.0, -1.0), (5.0, 4.0, 1.0))
     with pytest.raises(FormatError, match="later"):
-        Consistency(4, moving=()).update(grid(0), Grid(other, np.zeros(other.size, np.uint8)), np.eye(4))
+        Consistency(4, moving=()).update(
+            grid(0), Grid(other, np.zeros(other.size, np.uint8)), np.eye(4)
+        )
 
 
 def test_shapes_are_compared_as_sets_of_voxels():

@@ -16,15 +16,25 @@ def test_the_example_of_semantickittis_evaluation():
     pred = np.array([0] * 5 + [1] * 5 + [2] * 10)
     metric = TrackingQuality(3, {1, 2}, ignored={0}, fewest=1)
     score = metric.update("1", (pred_class, pred), (true_class, true)).compute()
-    assert score.lstq == pytest.approx(math.sqrt(1 / 3)) and score.association == pytest.approx(2 / 3)
+    assert score.lstq == pytest.approx(math.sqrt(1 / 3)) and score.association == pytest.approx(
+        2 / 3
+    )
     assert score.classification == 0.5 and score.actors == 3
 
 
 def plain(frames, things, ignored, fewest):
-    """Return LSTQ by its definition: loops over sequences, classes, true actors and predicted numbers."""
+    """Return LSTQ by its definition: loops over sequences, classes, true actors and predicted
+    numbers.
+    """
     confusion, qualities = np.zeros((5, 5), int), []
     frames = [
-        (name, *(array[~np.isin(true_class, ignored)] for array in (pred_class, pred, true_class, true)))
+        (
+            name,
+            *(
+                array[~np.isin(true_class, ignored)]
+                for array in (pred_class, pred, true_class, true)
+            ),
+        )
         for name, pred_class, pred, true_class, true in frames
     ]
     for _, pred_class, _, true_class, _ in frames:
@@ -32,7 +42,9 @@ def plain(frames, things, ignored, fewest):
     for name in {frame[0] for frame in frames}:
         own = [frame[1:] for frame in frames if frame[0] == name]
         for label in things:
-            for actor in {int(n) for *_, true_class, true in own for n in true[true_class == label]} - {0}:
+            for actor in {
+                int(n) for *_, true_class, true in own for n in true[true_class == label]
+            } - {0}:
                 held = [(t_c == label) & (t == actor) for *_, t_c, t in own]
                 held = [mask * (mask.sum() > fewest) for mask in held]
                 size = sum(mask.sum() for mask in held)
@@ -40,8 +52,13 @@ def plain(frames, things, ignored, fewest):
                     continue
                 total = 0.0
                 for number in {int(n) for _, pred, *_ in own for n in pred} - {0}:
-                    whole = sum(((p == number) & ~np.isin(p_c, ignored)).sum() for p_c, p, *_ in own)
-                    common = sum((mask & (p == number)).sum() for mask, (_, p, *_) in zip(held, own, strict=True))
+                    whole = sum(
+                        ((p == number) & ~np.isin(p_c, ignored)).sum() for p_c, p, *_ in own
+                    )
+                    common = sum(
+                        (mask & (p == number)).sum()
+                        for mask, (_, p, *_) in zip(held, own, strict=True)
+                    )
                     if whole:
                         total += common * common / (size + whole - common)
                 qualities.append(total / size)
@@ -72,7 +89,9 @@ def test_nothing_is_no_number_and_wrong_input_is_refused():
     metric = TrackingQuality(3, {1})
     assert math.isnan(metric.compute().lstq)
     with pytest.raises(FormatError, match="classes and numbers with the shape of the ground truth"):
-        metric.update("", (np.zeros(3, int), np.zeros(3, int)), (np.zeros(3, int), np.zeros(2, int)))
+        metric.update(
+            "", (np.zeros(3, int), np.zeros(3, int)), (np.zeros(3, int), np.zeros(2, int))
+        )
     with pytest.raises(FormatError, match="truth"):
         metric.update("", (np.zeros(3, int), np.zeros(3, int)), (np.full(3, 3), np.zeros(3, int)))
     with pytest.raises(ArgumentError, match=r"expected a \w+ with \w+ "):

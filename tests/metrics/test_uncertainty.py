@@ -26,7 +26,9 @@ def plain_ece(prob, truth, bins=15):
     for b in range(bins):
         inside = (confidence > b / bins) & (confidence <= (b + 1) / bins)
         if inside.any():
-            error += inside.sum() / len(truth) * abs(confidence[inside].mean() - right[inside].mean())
+            error += (
+                inside.sum() / len(truth) * abs(confidence[inside].mean() - right[inside].mean())
+            )
     return error
 
 
@@ -36,9 +38,14 @@ def test_errors_are_means_of_frames_and_likelihoods_are_pooled():
     for prob, truth in frames:
         metric.update(prob, truth)
     score = metric.compute()
-    for name, chosen in (("empty", lambda p: p.argmax(1) == 0), ("occupied", lambda p: p.argmax(1) != 0)):
+    for name, chosen in (
+        ("empty", lambda p: p.argmax(1) == 0),
+        ("occupied", lambda p: p.argmax(1) != 0),
+    ):
         parts = [(p[chosen(p)], t[chosen(p)]) for p, t in frames]
-        assert getattr(score, f"ece_{name}") == pytest.approx(np.mean([plain_ece(*part) for part in parts]))
+        assert getattr(score, f"ece_{name}") == pytest.approx(
+            np.mean([plain_ece(*part) for part in parts])
+        )
         pooled = np.concatenate([-np.log(p[np.arange(len(t)), t] + 1e-12) for p, t in parts])
         assert getattr(score, f"nll_{name}") == pytest.approx(pooled.mean())
         reliability = getattr(score, name)
@@ -53,7 +60,9 @@ def test_certain_and_right_has_no_error_and_certain_and_wrong_has_all():
     assert score.ece_occupied == 0.0
     assert score.nll_occupied == pytest.approx(0.0, abs=1e-9)
     assert math.isnan(score.ece_empty)
-    assert Uncertainty(K).update(prob, np.roll(truth, 1)).compute().ece_occupied == pytest.approx(0.75)
+    assert Uncertainty(K).update(prob, np.roll(truth, 1)).compute().ece_occupied == pytest.approx(
+        0.75
+    )
 
 
 def test_merged_in_any_order_it_is_the_same():

@@ -50,7 +50,9 @@ def test_a_face_counts_from_twelve_points_and_two_percent_of_them():
 
 def test_single_points_far_away_do_not_make_a_body_larger():
     points = np.concatenate([box(500), [[30.0, 9.0, 4.0], [-30.0, -9.0, -4.0]]])
-    assert np.allclose(measure([points], np.array([[-20.0, 0, 1]])).size, (4.0, 1.8, 1.5), atol=0.15)
+    assert np.allclose(
+        measure([points], np.array([[-20.0, 0, 1]])).size, (4.0, 1.8, 1.5), atol=0.15
+    )
 
 
 @pytest.mark.parametrize(
@@ -88,7 +90,11 @@ NO_SURFACE = np.empty((0, 3), np.float32)
 
 
 def test_what_is_known_stays_as_it_was_seen_and_nothing_gets_smaller():
-    for size, faces in (((3.9, 1.7, 1.4), EVERY_SIDE), ((5.5, 1.9, 1.5), REAR), ((4.4, 2.1, 1.5), LOW)):
+    for size, faces in (
+        ((3.9, 1.7, 1.4), EVERY_SIDE),
+        ((5.5, 1.9, 1.5), REAR),
+        ((4.4, 2.1, 1.5), LOW),
+    ):
         lower, upper = Sizes([]).complete(CAR, extent(size, faces))
         assert np.allclose(upper - lower, size)
 
@@ -101,8 +107,15 @@ def test_an_actor_of_which_no_face_was_seen_well_is_as_large_as_its_points():
 def test_sizes_are_learned_from_three_similar_actors_of_the_same_class():
     seen = extent((1.0, 1.8, 1.5), REAR)
     vans = [(CAR, extent((5.2, 1.8 + 0.02 * i, 2.0), EVERY_SIDE)) for i in range(3)]
-    others = [(CAR, extent((5.2, 2.2, 2.0), EVERY_SIDE))] * 3 + [(CAR, extent((5.2, 1.8, 2.0), REAR))] * 3
-    for known, length in ((vans, 5.2), (vans[:2], 4.4), (others, 4.4), ([(BUS, e) for _, e in vans], 4.4)):
+    others = [(CAR, extent((5.2, 2.2, 2.0), EVERY_SIDE))] * 3 + [
+        (CAR, extent((5.2, 1.8, 2.0), REAR))
+    ] * 3
+    for known, length in (
+        (vans, 5.2),
+        (vans[:2], 4.4),
+        (others, 4.4),
+        ([(BUS, e) for _, e in vans], 4.4),
+    ):
         lower, upper = Sizes([(*one, NO_SURFACE) for one in known]).complete(CAR, seen)
         assert upper[0] - lower[0] == pytest.approx(length)
 
@@ -114,7 +127,9 @@ def test_a_length_that_no_vehicle_of_this_width_has_is_completed_although_its_si
     assert upper[0] - lower[0] == pytest.approx(4.4)
     assert lower[0] == pytest.approx(-0.75)
     examples = [(CAR, part, NO_SURFACE)] * 5  # nor is it an example for others
-    assert np.ptp(Sizes(examples).complete(CAR, extent((1.0, 1.9, 1.5), REAR)), axis=0)[0] == pytest.approx(4.4)
+    assert np.ptp(Sizes(examples).complete(CAR, extent((1.0, 1.9, 1.5), REAR)), axis=0)[
+        0
+    ] == pytest.approx(4.4)
 
 
 @pytest.mark.parametrize(
@@ -124,11 +139,16 @@ def test_a_length_that_no_vehicle_of_this_width_has_is_completed_although_its_si
         (extent((1.8, 0.3, 1.7), LOW, (0.0, -20.0)), (1.8, 0.7, 1.7)),
         (extent((1.0, 2.5, 3.2), REAR), (7.5, 2.5, 3.2)),  # a lorry, by its width
         (extent((1.0, 2.0, 2.6), REAR), (5.4, 2.0, 2.6)),  # a van, by its height
+        # a rear that was hidden in part
         (
             extent((11.0, 1.9, 2.0), (True, False, True, False), (0.0, -20.0)),
             (11.0, 2.5, 2.8),
-        ),  # a rear that was hidden in part
-        (extent((11.0, 3.3, 2.9), EVERY_SIDE, (0.0, -20.0)), (11.0, 2.5, 2.9)),  # with points of a neighbour
+        ),
+        # with points of a neighbour
+        (
+            extent((11.0, 3.3, 2.9), EVERY_SIDE, (0.0, -20.0)),
+            (11.0, 2.5, 2.9),
+        ),
         (extent((11.0, 0.4, 2.0), LOW, (0.0, -20.0)), (11.0, 2.5, 2.8)),  # by its length
     ],
 )
@@ -170,7 +190,9 @@ class TestUsualShell:
 
 
 class TestLearnedShapes:
-    """Cars with a box on their hood, which only those show that were seen from the front and from one side."""
+    """Cars with a box on their hood, which only those show that were seen from the front and from
+    one side.
+    """
 
     HALF = np.array([2.2, 0.9, 0.75])
 
@@ -180,9 +202,15 @@ class TestLearnedShapes:
         x, y, z = (np.arange(-h, h + 0.01, 0.05) for h in half)
         side = np.stack(np.meshgrid(x, [-half[1]], z), axis=-1).reshape(-1, 3)
         ends = np.stack(np.meshgrid([-half[0], half[0]], y, z), axis=-1).reshape(-1, 3)
-        box = np.stack(np.meshgrid(np.arange(1.3, 1.8, 0.05), y[y < 0], [half[2]]), axis=-1).reshape(-1, 3)
+        box = np.stack(
+            np.meshgrid(np.arange(1.3, 1.8, 0.05), y[y < 0], [half[2]]), axis=-1
+        ).reshape(-1, 3)
         points = np.concatenate([side, ends, box])
-        return CAR, Extent(-half, half, (True, True, True, False), len(points), (0.0, -9.0)), surface_of(points)
+        return (
+            CAR,
+            Extent(-half, half, (True, True, True, False), len(points), (0.0, -9.0)),
+            surface_of(points),
+        )
 
     def surface(self, examples, size=(4.3, 1.8, 1.5)):
         half = np.array(size) / 2
@@ -205,7 +233,13 @@ class TestLearnedShapes:
         bare = (
             label,
             whole,
-            surface[~((np.abs(surface[:, 0] - 1.55) < 0.3) & (surface[:, 2] > 0.6) & (surface[:, 1] > -0.8))],
+            surface[
+                ~(
+                    (np.abs(surface[:, 0] - 1.55) < 0.3)
+                    & (surface[:, 2] > 0.6)
+                    & (surface[:, 1] > -0.8)
+                )
+            ],
         )
         found = self.surface([self.example(), bare, bare])
         assert not ((np.abs(found[:, 0] - 1.55) < 0.2) & (np.abs(found[:, 1]) < 0.6)).any()

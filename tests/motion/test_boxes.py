@@ -1,4 +1,6 @@
-"""Tracks from annotated boxes: what stands stands in every frame, what moves follows its path, and nobody swallows the road."""
+"""Tracks from annotated boxes: what stands stands in every frame, what moves follows its path, and
+nobody swallows the road.
+"""
 
 import numpy as np
 import pytest
@@ -19,12 +21,18 @@ def sensor_pose(frame: int) -> np.ndarray:
     """A vehicle that drives 0.8 m a frame on a bend, and nods."""
     pose = translation((0.8 * frame, 0.01 * frame**2, 0.0)) @ rotation_z(0.02 * frame)
     nod = 0.02 * np.sin(frame)
-    pose[:3, :3] = pose[:3, :3] @ [[np.cos(nod), 0, np.sin(nod)], [0, 1, 0], [-np.sin(nod), 0, np.cos(nod)]]
+    pose[:3, :3] = pose[:3, :3] @ [
+        [np.cos(nod), 0, np.sin(nod)],
+        [0, 1, 0],
+        [-np.sin(nod), 0, np.cos(nod)],
+    ]
     return pose
 
 
 def tracked(paths, frames=range(40), seconds=0.1, size=SIZE, label=VEHICLE):
-    """Return the tracks of objects whose world poses at a frame `paths[number](frame)` gives; None where there is no box."""
+    """Return the tracks of objects whose world poses at a frame `paths[number](frame)` gives; None
+    where there is no box.
+    """
     boxes, poses = {}, {frame: sensor_pose(frame) for frame in frames}
     for frame in frames:
         seen = {number: pose for number, path in paths.items() if (pose := path(frame)) is not None}
@@ -43,14 +51,20 @@ def straight(speed, heading=0.0, seconds=0.1):
 
 
 def jittering(step_m, drift_m, seed=0):
-    """Boxes of a parked van: each moves by some decimetres, and slowly away and back while it is passed."""
+    """Boxes of a parked van: each moves by some decimetres, and slowly away and back while it is
+    passed.
+    """
     rng = np.random.default_rng(seed)
     moves = rng.normal(size=(200, 3)) * [step_m, step_m, step_m / 3]
     turns = rng.normal(size=200) * 0.02
 
     def path(frame):
         drift = drift_m * np.sin(frame / 12)
-        return translation((20, 5, 0)) @ translation(moves[frame] + [drift, 0, 0]) @ rotation_z(1 + turns[frame])
+        return (
+            translation((20, 5, 0))
+            @ translation(moves[frame] + [drift, 0, 0])
+            @ rotation_z(1 + turns[frame])
+        )
 
     return path
 
@@ -74,15 +88,23 @@ def test_what_moves_follows_its_path_at_its_speed(speed):
     assert track.moves and track.instance == 3 and track.label == VEHICLE
     for frame in range(40):
         assert np.abs(track.pose(frame) - straight(speed, 0.7)(frame)).max() < 1e-6
-        assert np.abs(track.velocity_at(frame) - speed * np.array([np.cos(0.7), np.sin(0.7), 0])).max() < 1e-6
+        assert (
+            np.abs(track.velocity_at(frame) - speed * np.array([np.cos(0.7), np.sin(0.7), 0])).max()
+            < 1e-6
+        )
 
 
 def test_a_walk_of_a_few_frames_is_a_motion_and_jitter_of_a_few_frames_is_none():
-    (walk,) = tracked({1: lambda frame: straight(1.4)(frame) if frame < 5 else None}, label=PEDESTRIAN)
-    (parked,) = tracked({1: lambda frame: jittering(0.1, 0.0, seed=1)(frame) if frame < 5 else None})
+    (walk,) = tracked(
+        {1: lambda frame: straight(1.4)(frame) if frame < 5 else None}, label=PEDESTRIAN
+    )
+    (parked,) = tracked(
+        {1: lambda frame: jittering(0.1, 0.0, seed=1)(frame) if frame < 5 else None}
+    )
     assert np.linalg.norm(walk.velocity_at(2)) == pytest.approx(1.4)
     assert not parked.velocity.any()
-    assert len(walk.world_T_actor) == 9 and walk.first == 0  # frames 0 to 4, and 4 more; none before the drive
+    # frames 0 to 4, and 4 more; none before the drive
+    assert len(walk.world_T_actor) == 9 and walk.first == 0
     assert len(parked.world_T_actor) == 9  # too short to say where it is later
 
 
@@ -94,7 +116,9 @@ def test_pose_drift_does_not_make_a_parked_car_move():
 def test_gaps_are_interpolated_and_boxes_of_two_a_second_are_enough():
     bend = lambda frame: rotation_z(0.01 * frame) @ translation((30, 0, 0)) @ rotation_z(np.pi / 2)  # noqa: E731
     for shown in ({f for f in range(60) if not 20 < f < 28}, set(range(0, 60, 5))):
-        (track,) = tracked({1: lambda frame, shown=shown: bend(frame) if frame in shown else None}, range(60))
+        (track,) = tracked(
+            {1: lambda frame, shown=shown: bend(frame) if frame in shown else None}, range(60)
+        )
         for frame in range(max(shown)):
             assert np.linalg.norm(track.pose(frame)[:3, 3] - bend(frame)[:3, 3]) < 0.06
             assert np.abs(track.pose(frame)[:3, :3] - bend(frame)[:3, :3]).max() < 0.03
@@ -104,7 +128,9 @@ def test_gaps_are_interpolated_and_boxes_of_two_a_second_are_enough():
 def test_noise_of_moving_boxes_is_smoothed():
     rng = np.random.default_rng(0)
     moves = rng.normal(size=(60, 3)) * 0.1
-    (track,) = tracked({1: lambda frame: translation(moves[frame]) @ straight(8.0)(frame)}, range(60))
+    (track,) = tracked(
+        {1: lambda frame: translation(moves[frame]) @ straight(8.0)(frame)}, range(60)
+    )
     errors = [np.linalg.norm(track.pose(f)[:3, 3] - straight(8.0)(f)[:3, 3]) for f in range(60)]
     assert np.mean(errors) < 0.6 * np.linalg.norm(moves, axis=1).mean()
 
@@ -114,14 +140,21 @@ def test_boxes_that_look_backwards_do_not_turn_the_actor():
         return straight(8.0, 0.3)(frame) @ rotation_z(np.pi if frame % 4 == 1 else 0.0)
 
     (track,) = tracked({1: path})
-    assert np.abs(np.stack([track.pose(f)[:3, :3] for f in range(40)]) - rotation_z(0.3)[:3, :3]).max() < 1e-6
+    assert (
+        np.abs(np.stack([track.pose(f)[:3, :3] for f in range(40)]) - rotation_z(0.3)[:3, :3]).max()
+        < 1e-6
+    )
 
 
 def test_a_number_that_is_used_for_two_objects_gives_two_tracks():
     far = translation((60, 30, 0))
-    first, second = tracked({5: lambda frame: straight(8.0)(frame) if frame < 20 else far @ straight(2.0)(frame)})
+    first, second = tracked(
+        {5: lambda frame: straight(8.0)(frame) if frame < 20 else far @ straight(2.0)(frame)}
+    )
     assert first.instance == second.instance == 5
-    assert first.pose(19)[0, 3] == pytest.approx(15.2) and second.pose(20)[0, 3] == pytest.approx(64.0)
+    assert first.pose(19)[0, 3] == pytest.approx(15.2) and second.pose(20)[0, 3] == pytest.approx(
+        64.0
+    )
     assert np.linalg.norm(first.velocity, axis=1).max() < 8.01
 
 
@@ -139,7 +172,9 @@ def test_times_that_do_not_rise_give_finite_tracks(seconds):
     one = (np.array([1], np.uint32), np.array([VEHICLE], np.uint32))
     boxes = {f: Boxes.from_poses(*one, straight(8.0)(f)[None], SIZE[None]) for f in range(12)}
     tracks = tracks_from_boxes(boxes, {f: np.eye(4) for f in range(12)}, dict(enumerate(seconds)))
-    assert tracks and all(np.isfinite(t.world_T_actor).all() and np.isfinite(t.velocity).all() for t in tracks)
+    assert tracks and all(
+        np.isfinite(t.world_T_actor).all() and np.isfinite(t.velocity).all() for t in tracks
+    )
 
 
 def test_filled_in_boxes_count_less():
@@ -151,22 +186,39 @@ def test_filled_in_boxes_count_less():
         one = (np.array([1], np.uint32), np.array([VEHICLE], np.uint32), place[None], SIZE[None])
         boxes[frame] = Boxes.from_poses(*one, np.array([annotated]))
     (mixed,) = tracks_from_boxes(boxes, poses, {f: f * 0.1 for f in frames})
-    equal = {f: Boxes.from_poses(b.tracks, b.labels, b.sensor_T_box, b.sizes) for f, b in boxes.items()}
+    equal = {
+        f: Boxes.from_poses(b.tracks, b.labels, b.sensor_T_box, b.sizes) for f, b in boxes.items()
+    }
     (same,) = tracks_from_boxes(equal, poses, {f: f * 0.1 for f in frames})
     assert mixed.pose(10)[1, 3] < same.pose(10)[1, 3] - 0.02
 
 
 def make_scan(points, labels):
-    return Scan(np.array(points, np.float32), None if labels is None else np.array(labels, np.uint32))
+    return Scan(
+        np.array(points, np.float32), None if labels is None else np.array(labels, np.uint32)
+    )
 
 
 def test_points_in_the_box_are_members_but_not_the_road():
     (track,) = tracked({1: straight(8.0)}, range(20))
-    world = [[8, 0, 0], [8, 0, -0.82], [8, 0, -0.7], [8, 1.03, 0], [8, 1.2, 0], [8, 0, 0.3], [np.nan, 0, 0]]
+    world = [
+        [8, 0, 0],
+        [8, 0, -0.82],
+        [8, 0, -0.7],
+        [8, 1.03, 0],
+        [8, 1.2, 0],
+        [8, 0, 0.3],
+        [np.nan, 0, 0],
+    ]
     points = transform_points(invert(sensor_pose(10)), np.array(world))
     labelled = make_scan(points, [VEHICLE, ROAD, VEHICLE, VEHICLE, VEHICLE, ROAD, VEHICLE])
     (segment,) = segment_by_boxes(10, labelled, sensor_pose(10), [track], ground=CARLA.ground)
-    assert segment.members.tolist() == [0, 2, 3]  # the margin belongs to the box; ground and what is beside it do not
+    # the margin belongs to the box; ground and what is beside it do not
+    assert segment.members.tolist() == [
+        0,
+        2,
+        3,
+    ]
     assert (segment.instance, segment.label, segment.frame) == (1, VEHICLE, 10)
     assert np.allclose(segment.points, np.array(world)[[0, 2, 3]], atol=1e-5)
     assert np.allclose(segment.velocity, [8, 0, 0])
@@ -177,24 +229,40 @@ def test_points_in_the_box_are_members_but_not_the_road():
 
 def test_a_point_in_two_boxes_belongs_to_the_smaller_one():
     (car,) = tracked({1: straight(8.0)}, range(20))
-    (person,) = tracked({2: straight(8.0)}, range(20), size=np.array([0.6, 0.6, 1.7]), label=PEDESTRIAN)
+    (person,) = tracked(
+        {2: straight(8.0)}, range(20), size=np.array([0.6, 0.6, 1.7]), label=PEDESTRIAN
+    )
     points = transform_points(invert(sensor_pose(10)), np.array([[8, 0, 0.2], [9.5, 0, 0.2]]))
     for tracks in ([car, person], [person, car]):
         segments = segment_by_boxes(10, make_scan(points, None), sensor_pose(10), tracks)
-        assert {segment.instance: segment.members.tolist() for segment in segments} == {2: [0], 1: [1]}
+        assert {segment.instance: segment.members.tolist() for segment in segments} == {
+            2: [0],
+            1: [1],
+        }
         assert [segment.instance for segment in segments] == [track.instance for track in tracks]
 
 
 @pytest.fixture(scope="module")
 def town():
-    """Frames of a simulated drive: scans, poses, and the true boxes of all actors but the ego vehicle, with noise and gaps."""
+    """Frames of a simulated drive: scans, poses, and the true boxes of all actors but the ego
+    vehicle, with noise and gaps.
+    """
     rng, town, frames = np.random.default_rng(0), TownDrive(5, "light"), range(0, 30, 3)
     poses = {frame: town.sensor_poses(frame, 1)[0] for frame in frames}
     boxes = {}
     for frame in frames:
-        actors = [actor for actor in town.snapshot(frame).actors.values() if actor.id != 1 and rng.random() < 0.8]
-        corners = [(actor.mesh.vertices.min(axis=0), actor.mesh.vertices.max(axis=0)) for actor in actors]
-        world = [a.world_T_actor @ translation((lo + hi) / 2) for a, (lo, hi) in zip(actors, corners, strict=True)]
+        actors = [
+            actor
+            for actor in town.snapshot(frame).actors.values()
+            if actor.id != 1 and rng.random() < 0.8
+        ]
+        corners = [
+            (actor.mesh.vertices.min(axis=0), actor.mesh.vertices.max(axis=0)) for actor in actors
+        ]
+        world = [
+            a.world_T_actor @ translation((lo + hi) / 2)
+            for a, (lo, hi) in zip(actors, corners, strict=True)
+        ]
         moved = [translation(rng.normal(size=3) * [0.05, 0.05, 0]) @ pose for pose in world]
         boxes[frame] = Boxes.from_poses(
             np.array([actor.id for actor in actors], np.uint32),
@@ -228,7 +296,9 @@ def test_in_a_simulated_town_what_is_parked_stands_and_what_drives_moves(town):
         for actor in simulated.snapshot(frame).actors.values():
             speeds.setdefault(actor.id, []).append(float(np.linalg.norm(actor.velocity)))
     still = [track for track in tracks if max(speeds[track.instance]) == 0]
-    moving = [track for track in tracks if min(speeds[track.instance]) > 1.0 and len(track.velocity) >= 10]
+    moving = [
+        track for track in tracks if min(speeds[track.instance]) > 1.0 and len(track.velocity) >= 10
+    ]
     assert still and not any(track.velocity.any() for track in still)
     assert moving and all(track.moves for track in moving)
 
@@ -243,7 +313,9 @@ def true_pose(actor, frame):
 
 
 def drawn(actor, metres=0.1, degrees=1.0, count=300, deformable=()):
-    """Return the track of an actor's boxes as somebody drew them, the same as its points place it, and the segments."""
+    """Return the track of an actor's boxes as somebody drew them, the same as its points place it,
+    and the segments.
+    """
     rng, boxes = np.random.default_rng(6), {}
     for frame in FRAMES:
         turn = rotation_z(np.radians(rng.normal(0, degrees)))
@@ -251,16 +323,24 @@ def drawn(actor, metres=0.1, degrees=1.0, count=300, deformable=()):
         boxes[frame] = Boxes.from_poses(
             np.array([7], np.uint32), np.array([10], np.uint32), pose[None], np.array([actor.size])
         )
-    (track,) = tracks_from_boxes(boxes, {frame: np.eye(4) for frame in FRAMES}, TIMES, deformable=deformable)
+    (track,) = tracks_from_boxes(
+        boxes, {frame: np.eye(4) for frame in FRAMES}, TIMES, deformable=deformable
+    )
     scans = [scan_of([actor], frame, count=count, view_from=(0, 0, 1.5)) for frame in FRAMES]
-    segments = [s for f, scan in enumerate(scans) for s in segment_by_boxes(f, scan, np.eye(4), [track])]
+    segments = [
+        s for f, scan in enumerate(scans) for s in segment_by_boxes(f, scan, np.eye(4), [track])
+    ]
     return track, register_boxes(track, segments, TIMES), segments
 
 
 def blur(track, actor):
-    """Return by how much the poses of a track differ from each other, seen from the actor: metres along and across, and radians."""
+    """Return by how much the poses of a track differ from each other, seen from the actor: metres
+    along and across, and radians.
+    """
     off = np.stack([invert(true_pose(actor, frame)) @ track.pose(frame) for frame in FRAMES])
-    return np.array([*np.std(off[:, :2, 3], axis=0), np.std(np.arctan2(off[:, 1, 0], off[:, 0, 0]))])
+    return np.array(
+        [*np.std(off[:, :2, 3], axis=0), np.std(np.arctan2(off[:, 1, 0], off[:, 0, 0]))]
+    )
 
 
 def test_boxes_come_nearer_to_the_truth():
@@ -295,7 +375,9 @@ def test_frames_without_a_box_in_between_are_moved_too():
     assert 0 < off.max() < 0.06
 
 
-@pytest.mark.parametrize("seconds", [[0.0] * 30, [0.1 * (f % 4) for f in FRAMES], [0.1 * (30 - f) for f in FRAMES]])
+@pytest.mark.parametrize(
+    "seconds", [[0.0] * 30, [0.1 * (f % 4) for f in FRAMES], [0.1 * (30 - f) for f in FRAMES]]
+)
 def test_boxes_follow_points_also_where_times_do_not_rise(seconds):
     track, _, segments = drawn(CAR)
     after = register_boxes(track, segments, dict(enumerate(seconds)))

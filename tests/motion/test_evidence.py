@@ -34,7 +34,9 @@ def passing(seconds):
 def test_a_passing_car_is_found_and_a_parked_one_is_not(channels):
     lidar = Lidar(channels=channels, points=channels * 900, noise_m=0.0)
     scans = [(scan, labels) for scan, labels in film(passing, lidar=lidar)]
-    parked = [(s, np.where((labels == CAR) & (s.points[:, 1] < 0), 11, labels)) for s, labels in scans]
+    parked = [
+        (s, np.where((labels == CAR) & (s.points[:, 1] < 0), 11, labels)) for s, labels in scans
+    ]
     share = shares(parked)
     assert share[CAR] > 0.95
     assert share[11] < 0.01
@@ -79,7 +81,9 @@ def test_nothing_moves_on_empty_ground_or_in_a_single_scan():
 
 def test_explained_points_are_no_evidence():
     def without(scan, labels):
-        return EvidenceScan(scan.frame, scan.points, scan.world_T_sensor, scan.seconds, None, None, labels == CAR)
+        return EvidenceScan(
+            scan.frame, scan.points, scan.world_T_sensor, scan.seconds, None, None, labels == CAR
+        )
 
     filmed = [(without(*pair), pair[1]) for pair in film(passing)]
     assert shares(filmed)[CAR] == 0
@@ -110,7 +114,10 @@ def test_scans_are_given_back_after_the_horizon():
 
 
 def test_times_that_do_not_rise_are_replaced():
-    wrong = [(EvidenceScan(s.frame, s.points, s.world_T_sensor, 3.0), labels) for s, labels in film(passing)]
+    wrong = [
+        (EvidenceScan(s.frame, s.points, s.world_T_sensor, 3.0), labels)
+        for s, labels in film(passing)
+    ]
     assert shares(wrong)[CAR] == pytest.approx(shares(film(passing))[CAR], abs=0.02)
 
 

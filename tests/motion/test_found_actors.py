@@ -1,4 +1,6 @@
-"""Actors are followed over time, and only actors whose observations align better along a path than without motion are found."""
+"""Actors are followed over time, and only actors whose observations align better along a path than
+without motion are found.
+"""
 
 from dataclasses import replace
 
@@ -36,7 +38,9 @@ def test_two_cars_that_meet_are_two_actors():
     def meet(seconds):
         return [*WALLS, car(-16.0 + 8.0 * seconds, 4.0), car(16.0 - 8.0 * seconds, 8.0)]
 
-    speeds = sorted(float(np.median([s.velocity[0] for s in m.segments])) for m in actors(meet).tracked)
+    speeds = sorted(
+        float(np.median([s.velocity[0] for s in m.segments])) for m in actors(meet).tracked
+    )
     assert np.allclose([speeds[0], speeds[-1]], [-8.0, 8.0], atol=0.4)
     assert all(abs(abs(speed) - 8.0) < 1.0 for speed in speeds)
 
@@ -53,7 +57,10 @@ def test_labels_say_what_moved():
 
     scans = [scan for scan, _ in film(both, labels=True)]
     found = find_actors(scans, movable={CAR, PERSON}, deformable={PERSON})
-    assert sorted((m.segments[0].label, m.rigid) for m in found.tracked) == [(PERSON, False), (CAR, True)]
+    assert sorted((m.segments[0].label, m.rigid) for m in found.tracked) == [
+        (PERSON, False),
+        (CAR, True),
+    ]
 
 
 def test_segments_become_tracks_as_those_of_labelled_actors():
@@ -77,11 +84,16 @@ def test_nothing_moves_without_scans_or_with_one():
 
 
 COARSE = Lidar(channels=16, points=16 * 1800, noise_m=0.0)
-LEAVES = np.random.default_rng(3).uniform((-0.1, 0.1, 0.2, 0.9), (0.1, 0.3, 0.5, 1.3), (113, 4)).tolist()
+LEAVES = (
+    np.random.default_rng(3).uniform((-0.1, 0.1, 0.2, 0.9), (0.1, 0.3, 0.5, 1.3), (113, 4)).tolist()
+)
 STATIC = {
     "fence": (8.0, [box(x, 6.0, (0.1, 0.1, 1.2), WALL) for x in np.arange(-15.0, 30.0, 0.5)]),
     "rail": (4.0, [box(x, 4.0, (4.0, 0.1, 0.3), WALL) for x in np.arange(-15.0, 30.0, 4.5)]),
-    "hedge": (4.0, [box(-15.0 + 0.4 * i, 6.0 + y, size, WALL) for i, (y, *size) in enumerate(LEAVES)]),
+    "hedge": (
+        4.0,
+        [box(-15.0 + 0.4 * i, 6.0 + y, size, WALL) for i, (y, *size) in enumerate(LEAVES)],
+    ),
 }
 """What repeats: the speed of the sensor, m/s, at which most of it seems to move, and the boxes."""
 
@@ -89,12 +101,15 @@ STATIC = {
 @pytest.mark.parametrize("name", STATIC)
 def test_what_repeats_along_the_street_is_no_actor(name):
     speed, boxes = STATIC[name]
-    filmed = film(lambda _: [*WALLS, *boxes], 24, ego_m_s=speed, noise_m=0.02, noise_deg=0.1, lidar=COARSE)
+    filmed = film(
+        lambda _: [*WALLS, *boxes], 24, ego_m_s=speed, noise_m=0.02, noise_deg=0.1, lidar=COARSE
+    )
     assert find_actors(scan for scan, _ in filmed).tracked == ()
 
 
 @pytest.mark.parametrize(
-    ("size", "speed", "y"), [((4.4, 1.8, 1.5), 8.0, 3.5), ((1.7, 0.5, 1.6), 5.0, 5.0), ((0.5, 0.5, 1.7), 1.4, -4.0)]
+    ("size", "speed", "y"),
+    [((4.4, 1.8, 1.5), 8.0, 3.5), ((1.7, 0.5, 1.6), 5.0, 5.0), ((0.5, 0.5, 1.7), 1.4, -4.0)],
 )
 def test_actors_are_found_beside_what_repeats_and_are_sure(size, speed, y):
     def scene(seconds):
@@ -102,12 +117,18 @@ def test_actors_are_found_beside_what_repeats_and_are_sure(size, speed, y):
 
     filmed = film(scene, 30, ego_m_s=4.0, noise_m=0.02, noise_deg=0.1)
     found = find_actors(scan for scan, _ in filmed).tracked
-    assert [round(float(np.median([s.velocity[0] for s in m.segments])) / speed, 0) for m in found] == [1.0]
+    assert [
+        round(float(np.median([s.velocity[0] for s in m.segments])) / speed, 0) for m in found
+    ] == [1.0]
     assert all(actor.confidence > 0.8 for actor in found)
 
 
 def test_points_on_the_recording_vehicle_are_found_and_are_no_actor():
-    rack = np.random.default_rng(1).uniform((-2.4, 0.2, -0.6), (-2.1, 0.5, -0.4), (25, 3)).astype(np.float32)
+    rack = (
+        np.random.default_rng(1)
+        .uniform((-2.4, 0.2, -0.6), (-2.1, 0.5, -0.4), (25, 3))
+        .astype(np.float32)
+    )
     filmed = [
         replace(scan, points=np.concatenate([scan.points, rack]))
         for scan, _ in film(lambda _: WALLS, 24, ego_m_s=6.0, lidar=COARSE)
@@ -115,7 +136,11 @@ def test_points_on_the_recording_vehicle_are_found_and_are_no_actor():
     own = []
     assert list(follow_actors(find_evidence(filmed), {}, own=own)) == []
     (corners,) = own
-    assert (rack > corners[:3]).all() and (rack < corners[3:]).all() and np.ptp(corners.reshape(2, 3), axis=0).max() < 1
+    assert (
+        (rack > corners[:3]).all()
+        and (rack < corners[3:]).all()
+        and np.ptp(corners.reshape(2, 3), axis=0).max() < 1
+    )
 
 
 def test_a_car_beside_the_sensor_that_keeps_its_speed_is_not_the_recording_vehicle():

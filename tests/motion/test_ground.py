@@ -1,4 +1,6 @@
-"""Ground is found without labels: flat, sloping, under a tilted sensor, beside objects, above mirror images."""
+"""Ground is found without labels: flat, sloping, under a tilted sensor, beside objects, above
+mirror images.
+"""
 
 import math
 
@@ -81,5 +83,7 @@ def test_a_scan_without_a_plane_has_no_ground(count):
 def test_points_beyond_every_ring_are_in_the_last_one():
     points, _ = cast(translation((0.0, 0.0, HEIGHT_M)), BOXES)
     far = np.array([[1e18, 0, 0], [0, -1e19, -1.7], [3e38, 0, 0]], np.float32)
-    assert (ground_points(np.concatenate([points, far]))[: len(points)] == ground_points(points)).all()
+    assert (
+        ground_points(np.concatenate([points, far]))[: len(points)] == ground_points(points)
+    ).all()
     assert ground_height(np.concatenate([far, points])) == pytest.approx(-HEIGHT_M, abs=0.02)

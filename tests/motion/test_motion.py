@@ -27,19 +27,32 @@ def tracks_by_flow(actors, frames=FRAMES, hidden=(), **options):
 
 
 def carried_error(track, actor, frames):
-    """How far, at most, the track carries points of the actor from where they really go, over pairs of frames."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 2)]) * np.array(actor.size) / 2
+    """How far, at most, the track carries points of the actor from where they really go, over pairs
+    of frames.
+    """
+    corners = (
+        np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 2)])
+        * np.array(actor.size)
+        / 2
+    )
     worst = 0.0
     for there in frames:
         for here in frames:
             moved = track.pose(here) @ invert(track.pose(there)) @ actor.pose(there * PERIOD_S)
             truth = actor.pose(here * PERIOD_S)
-            worst = max(worst, np.abs(transform_points(moved, corners) - transform_points(truth, corners)).max())
+            worst = max(
+                worst,
+                np.abs(transform_points(moved, corners) - transform_points(truth, corners)).max(),
+            )
     return worst
 
 
 def test_a_scan_splits_into_its_actors():
-    actors = [MovingBox((10, 5, 0)), MovingBox((10, 9, 0), speed=5.0), MovingBox((-10, 0, 0), heading=2.0)]
+    actors = [
+        MovingBox((10, 5, 0)),
+        MovingBox((10, 9, 0), speed=5.0),
+        MovingBox((-10, 0, 0), heading=2.0),
+    ]
     segments = segment_by_flow(0, scan_of(actors, 0), np.eye(4))
     assert len(segments) == 3
     assert sorted(len(segment.members) for segment in segments) == [600] * 3
@@ -124,6 +137,8 @@ def test_a_numbered_actor_that_stands_does_not_move():
     actor = MovingBox((12, 7, 0), speed=0.0)
     segments = []
     for frame in FRAMES:
-        segments += segment_by_instances(frame, replace(scan_of([actor], frame), flow=None), np.eye(4))
+        segments += segment_by_instances(
+            frame, replace(scan_of([actor], frame), flow=None), np.eye(4)
+        )
     (track,) = link_segments(segments, TIMES)
     assert not track.moves

@@ -24,7 +24,9 @@ def street_scans(poses, seed=0):
     for pose in poses:
         points = transform_points(invert(pose), world)
         points = points[np.linalg.norm(points, axis=1) < 45]
-        yield (points[rng.random(len(points)) < 0.5] + rng.uniform(-0.02, 0.02, 3)).astype(np.float32)
+        yield (points[rng.random(len(points)) < 0.5] + rng.uniform(-0.02, 0.02, 3)).astype(
+            np.float32
+        )
 
 
 def test_kiss_icp_finds_a_known_trajectory_that_starts_at_rest():
@@ -34,7 +36,9 @@ def test_kiss_icp_finds_a_known_trajectory_that_starts_at_rest():
         poses.append(pose)
     poses = np.linalg.inv(poses[0]) @ np.stack(poses)
     seen = []
-    estimated = estimate_poses(street_scans(poses), max_range_m=50.0, total=30, progress=lambda *a: seen.append(a))
+    estimated = estimate_poses(
+        street_scans(poses), max_range_m=50.0, total=30, progress=lambda *a: seen.append(a)
+    )
     driven = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
     assert np.linalg.norm(estimated[-1, :3, 3] - poses[-1, :3, 3]) < 0.02 * driven
     assert np.allclose(estimated[0], np.eye(4))
@@ -79,7 +83,11 @@ def bend():
     things = tuple(houses_about(0.0, 12.0))
     drive = Bend(frames=20, rolling=True, speed=8.0, channels=32, columns=540, things=things)
     world_T_sensor = drive.world_T_vehicle(drive.times) @ drive.sensors[0].vehicle_T_sensor
-    return drive, [drive.scan(frame) for frame in range(20)], invert(world_T_sensor[0]) @ world_T_sensor
+    return (
+        drive,
+        [drive.scan(frame) for frame in range(20)],
+        invert(world_T_sensor[0]) @ world_T_sensor,
+    )
 
 
 def step_errors(estimated, true):
@@ -98,7 +106,9 @@ def test_the_sensor_may_be_at_any_height(height_m):
     sensors = (Sensor("lidar", translation((0.0, 0.0, height_m))),)
     drive = SimulatedDrive(frames=20, speed=10.0, channels=32, columns=540, sensors=sensors)
     true = invert(drive.world_T_vehicle(0.0)) @ drive.world_T_vehicle(drive.times)
-    estimated = estimate_poses([drive.scan(frame).points[:, :3] for frame in range(20)], max_range_m=50.0)
+    estimated = estimate_poses(
+        [drive.scan(frame).points[:, :3] for frame in range(20)], max_range_m=50.0
+    )
     assert np.linalg.norm((estimated - true)[-1, :2, 3]) < 0.15
     assert step_errors(estimated, true).max() < 0.06
 
@@ -130,7 +140,9 @@ def long_street(speed):
             length, away = rng.uniform(8, 20), rng.uniform(13, 20)
             yield Thing("building", (x + length / 2, side * away, 4.0), (length, 8.0, 8.0))
             yield Thing("pole", (x, side * rng.uniform(7, 9), 3.5), (0.25, 0.25, 7.0))
-            yield Thing("vegetation", (x + length / 2, side * rng.uniform(7, 9), 3.5), (2.0, 2.0, 4.0))
+            yield Thing(
+                "vegetation", (x + length / 2, side * rng.uniform(7, 9), 3.5), (2.0, 2.0, 4.0)
+            )
             x += length + rng.uniform(1, 12)
     for ahead in (-24.0, -12.0, 12.0, 24.0, 36.0):
         yield Thing("car", (ahead, rng.choice([0.0, 3.5, -3.5]), 0.8), (4.4, 1.8, 1.5), speed=speed)
@@ -138,13 +150,17 @@ def long_street(speed):
 
 def test_a_drive_may_start_fast_at_a_low_rate():
     things = tuple(long_street(11.0))
-    drive = SimulatedDrive(frames=12, period_s=0.5, speed=11.0, channels=32, columns=540, things=things)
+    drive = SimulatedDrive(
+        frames=12, period_s=0.5, speed=11.0, channels=32, columns=540, things=things
+    )
     true = invert(drive.world_T_vehicle(0.0)) @ drive.world_T_vehicle(drive.times)
     scans = [drive.scan(frame).points[:, :3] for frame in range(12)]
     estimated = estimate_poses(scans, times=drive.times, max_range_m=60.0)
     assert step_errors(estimated, true).max() < 0.3  # by KISS-ICP alone, the vehicle stands: 5.5 m
     turned = rotation_z(2.0)  # the sensor may be mounted in any direction
-    estimated = estimate_poses([transform_points(turned, scan) for scan in scans], times=drive.times, max_range_m=60.0)
+    estimated = estimate_poses(
+        [transform_points(turned, scan) for scan in scans], times=drive.times, max_range_m=60.0
+    )
     assert step_errors(invert(turned) @ estimated @ turned, true).max() < 0.3
 
 

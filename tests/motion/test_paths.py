@@ -1,4 +1,6 @@
-"""Velocities from points alone, of actors with known motion; the compiled loops against plain NumPy."""
+"""Velocities from points alone, of actors with known motion; the compiled loops against plain
+NumPy.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +22,10 @@ SECONDS = np.array(FRAMES) * PERIOD_S
 
 
 def observations_of(actor, view=None, count=400):
-    return [scan_of([actor], frame, count=count, view_from=view).points.astype(np.float64) for frame in FRAMES]
+    return [
+        scan_of([actor], frame, count=count, view_from=view).points.astype(np.float64)
+        for frame in FRAMES
+    ]
 
 
 def truth(actor):
@@ -32,13 +37,17 @@ def truth(actor):
 @pytest.mark.parametrize("speed", [5.0, 12.0])
 def test_a_vehicle_is_as_fast_as_it_is_whichever_side_is_seen(view, yaw_rate, speed):
     actor = MovingBox((10, 6, 0), heading=0.4, yaw_rate=yaw_rate, speed=speed)
-    errors = np.linalg.norm(estimate_path(observations_of(actor, view), SECONDS, rigid=True)[1] - truth(actor), axis=1)
+    errors = np.linalg.norm(
+        estimate_path(observations_of(actor, view), SECONDS, rigid=True)[1] - truth(actor), axis=1
+    )
     assert np.median(errors) < 0.15
 
 
 def test_a_vehicle_that_brakes_is_followed():
     actor = MovingBox((10, 6, 0), speed=lambda time: max(0.0, 8 - 4 * time))
-    errors = np.linalg.norm(estimate_path(observations_of(actor), SECONDS, rigid=True)[1] - truth(actor), axis=1)
+    errors = np.linalg.norm(
+        estimate_path(observations_of(actor), SECONDS, rigid=True)[1] - truth(actor), axis=1
+    )
     assert np.median(errors) < 0.3
     assert errors[-1] < 0.5
 
@@ -54,7 +63,9 @@ def test_observations_of_few_points_inherit_from_their_track():
 
 def test_people_are_followed_by_their_middle():
     rng = np.random.default_rng(0)
-    observations = [rng.uniform(-0.3, 0.3, (80, 3)) * (1, 1, 3) + (1.4 * time, 0, 1) for time in SECONDS]
+    observations = [
+        rng.uniform(-0.3, 0.3, (80, 3)) * (1, 1, 3) + (1.4 * time, 0, 1) for time in SECONDS
+    ]
     velocities = estimate_path(observations, SECONDS, rigid=False)[1]
     assert np.abs(np.median(velocities, axis=0) - (1.4, 0, 0)).max() < 0.1
 
@@ -62,7 +73,10 @@ def test_people_are_followed_by_their_middle():
 def test_an_actor_seen_once_or_never_has_no_velocity():
     once = [box_surface((4, 2, 1.5), 100)]
     assert not estimate_path(once, np.zeros(1), rigid=True)[1].any()
-    assert estimate_path([np.empty((0, 3))] * 3, np.arange(3.0), rigid=True)[1].tolist() == [[0, 0, 0]] * 3
+    assert (
+        estimate_path([np.empty((0, 3))] * 3, np.arange(3.0), rigid=True)[1].tolist()
+        == [[0, 0, 0]] * 3
+    )
 
 
 def people(rng, count=80):
@@ -81,7 +95,9 @@ def test_nine_points_are_too_few_to_follow_and_ten_are_enough():
 def test_a_velocity_changes_by_no_more_than_six_metres_per_second_squared():
     observations = people(np.random.default_rng(2))
     observations[-2:] = [points + (3.0, 0, 0) for points in observations[-2:]]
-    changes = np.linalg.norm(np.diff(estimate_path(observations, SECONDS, rigid=False)[1], axis=0), axis=1)
+    changes = np.linalg.norm(
+        np.diff(estimate_path(observations, SECONDS, rigid=False)[1], axis=0), axis=1
+    )
     assert changes.max() == pytest.approx(6.0 * PERIOD_S)
 
 
@@ -128,7 +144,10 @@ class TestStatic:
         assert self.static([box_surface((4, 2, 1.5), 300, seed) for seed in range(25)], (0.5, 0, 0))
 
     def test_observations_that_overlap_only_after_their_motion_are_of_a_moving_one(self):
-        moving = [box_surface((4, 2, 1.5), 300, seed) + (8 * time, 0, 0) for seed, time in enumerate(SECONDS)]
+        moving = [
+            box_surface((4, 2, 1.5), 300, seed) + (8 * time, 0, 0)
+            for seed, time in enumerate(SECONDS)
+        ]
         assert not self.static(moving, (8.0, 0, 0))
 
     def test_observations_that_never_overlap_are_not_of_a_static_one(self):

@@ -6,7 +6,15 @@ from helpers.scenes.box_actors import box_surface
 
 from carlasc.core.cells import first_of_cells
 from carlasc.core.geometry import invert, rotation_z, thin, transform_points, translation
-from carlasc.motion.planes import Planes, covariances, extend_sums, nearest_points, nearest_within, pose_of, register
+from carlasc.motion.planes import (
+    Planes,
+    covariances,
+    extend_sums,
+    nearest_points,
+    nearest_within,
+    pose_of,
+    register,
+)
 
 CELL_M, MOST, RADIUS_M = 0.15, 1200, 0.5
 
@@ -50,7 +58,9 @@ def test_covariances_are_those_of_the_points_within_the_radius():
     assert extend_sums(model, 0, RADIUS_M, sums).all()
     for point, covariance in zip(model, covariances(sums), strict=True):
         near = model[np.square(model - point).sum(axis=1) < RADIUS_M**2]
-        assert np.allclose(covariance, np.cov(near, rowvar=False, bias=True) if len(near) > 1 else 0, atol=1e-12)
+        assert np.allclose(
+            covariance, np.cov(near, rowvar=False, bias=True) if len(near) > 1 else 0, atol=1e-12
+        )
 
 
 def test_sums_that_grow_have_the_same_bits_as_sums_over_all_points():
@@ -64,9 +74,8 @@ def test_sums_that_grow_have_the_same_bits_as_sums_over_all_points():
     assert not changed[:90].all()  # few of the old points are near the last ones
 
 
-@pytest.mark.parametrize(
-    "size", [1.0, 4.0]
-)  # the larger actor has more points than a model may have, so that it is thinned
+# the larger actor has more points than a model may have, so that it is thinned
+@pytest.mark.parametrize("size", [1.0, 4.0])
 def test_a_model_that_grows_is_the_model_of_all_points(size):
     rng = np.random.default_rng(2)
     model, plain, thinned = None, np.empty((0, 3)), False
@@ -174,7 +183,8 @@ def test_an_observation_is_laid_on_the_planes_wherever_it_is_expected(box):
 def test_the_order_of_the_points_of_the_model_does_not_matter(box):
     seen = transform_points(pose_of(STATE), box[1])
     one, other = (
-        register(seen, model_of(points), STATE + 0.1, ERROR, STATE[:3], NO_SHIFTS) for points in (box[0], box[0][::-1])
+        register(seen, model_of(points), STATE + 0.1, ERROR, STATE[:3], NO_SHIFTS)
+        for points in (box[0], box[0][::-1])
     )
     assert np.abs(one - other).max() < 0.03
 
@@ -193,4 +203,6 @@ def test_a_side_alone_says_nothing_along_it_but_the_shift_of_its_ends_does(box):
 
 def test_what_has_no_pair_stays_where_it_is_expected(box):
     far = box[1][:50] + (500, 0, 0)
-    assert np.array_equal(register(far, model_of(box[0]), STATE, ERROR, STATE[:3], NO_SHIFTS), STATE)
+    assert np.array_equal(
+        register(far, model_of(box[0]), STATE, ERROR, STATE[:3], NO_SHIFTS), STATE
+    )

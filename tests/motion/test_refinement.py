@@ -1,4 +1,6 @@
-"""Refined poses: scans of simulated streets under poses with known errors, and places where scans do not tell enough."""
+"""Refined poses: scans of simulated streets under poses with known errors, and places where scans
+do not tell enough.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,9 @@ def refine(scans, given, **options):
 
 
 def errors(found, true, lag=30):
-    """Return root mean square errors of motions over some scans, metres on the axes of the sensor, and radians."""
+    """Return root mean square errors of motions over some scans, metres on the axes of the sensor,
+    and radians.
+    """
     motions = [invert(poses[:-lag]) @ poses[lag:] for poses in (true, found)]
     off = invert(motions[0]) @ motions[1]
     turns = np.stack([off[:, 2, 1], off[:, 0, 2], off[:, 1, 0]], axis=1)
@@ -121,7 +125,10 @@ class TestStreet:
     def test_scans_without_points_keep_their_motion_among_the_others(self, street):
         scans, true = street
         given = wrong_poses(true, **ROWS["jitter"], seed=4)[:40]
-        some = [np.empty((0, 3), np.float32) if 15 <= row < 18 else scan for row, scan in enumerate(scans[:40])]
+        some = [
+            np.empty((0, 3), np.float32) if 15 <= row < 18 else scan
+            for row, scan in enumerate(scans[:40])
+        ]
         found = refine(some, given)
         assert np.isnan(found.before_m[15:18]).all() and np.isfinite(found.poses).all()
         rows = np.r_[:15, 18:40]
@@ -175,7 +182,9 @@ class TestPlacesThatTellLittle:
     def test_a_vehicle_that_stands(self, street):
         scans, true = street
         rng = np.random.default_rng(5)
-        still = [scans[0] + rng.normal(0, 0.01, scans[0].shape).astype(np.float32) for _ in range(70)]
+        still = [
+            scans[0] + rng.normal(0, 0.01, scans[0].shape).astype(np.float32) for _ in range(70)
+        ]
         given = np.repeat(true[:1], 70, axis=0)
         assert not refine(still, given).refined.any()
         wrong = wrong_poses(given, jitter_m=0.05)
@@ -212,7 +221,9 @@ def test_clusters_are_the_sums_of_the_points_of_each_cell(street):
     cells = np.floor(seen + pose[:3, 3] + 0.5).astype(int)
     _, row = np.unique(cells, axis=0, return_inverse=True)
     assert len(keys) == len(set(keys.tolist())) == row.max() + 1
-    columns = np.column_stack([np.ones(len(seen)), seen, (seen[:, :, None] * seen[:, None, :])[:, *np.triu_indices(3)]])
+    columns = np.column_stack(
+        [np.ones(len(seen)), seen, (seen[:, :, None] * seen[:, None, :])[:, *np.triu_indices(3)]]
+    )
     expected = np.zeros((row.max() + 1, 10))
     np.add.at(expected, row.reshape(-1), columns)
     order, wanted = np.lexsort(sums.T), np.lexsort(expected.T)
@@ -224,7 +235,9 @@ def test_fixed_scans_stay_and_the_others_come_to_them(street):
     given = wrong_poses(true[:30], jitter_m=0.05)
     start = given.copy()
     start[:10] = true[:10]
-    thinned = [ThinnedScan.of(points, pose).used for points, pose in zip(scans[:30], start, strict=True)]
+    thinned = [
+        ThinnedScan.of(points, pose).used for points, pose in zip(scans[:30], start, strict=True)
+    ]
     found = align(thinned, start, given, 10)
     assert np.array_equal(found[:10], true[:10])
     assert np.linalg.norm((found - true[:30])[:, :3, 3], axis=1).max() < 0.02
@@ -234,7 +247,10 @@ def test_fixed_scans_stay_and_the_others_come_to_them(street):
 def test_a_disagreement_grows_with_the_error_of_the_poses(street):
     scans, true = street
     points = scans[:20]
-    values = [np.nanmean(disagreement(points, wrong_poses(true[:20], jitter_m=m))) for m in (0.0, 0.02, 0.05, 0.1)]
+    values = [
+        np.nanmean(disagreement(points, wrong_poses(true[:20], jitter_m=m)))
+        for m in (0.0, 0.02, 0.05, 0.1)
+    ]
     assert values == sorted(values) and values[0] < 0.02 and 0.03 < values[2] < 0.07
 
 
@@ -277,10 +293,14 @@ class TestWrongPoses:
         assert steps[:, 1, 0].std() == pytest.approx(0.01, rel=0.15)
         assert np.array_equal(drift[0], np.eye(4))
         height = wrong_poses(self.POSES, height_drift_m=0.1)
-        assert not height[:, :2, 3].any() and np.diff(height[:, 2, 3]).std() == pytest.approx(0.1, rel=0.15)
+        assert not height[:, :2, 3].any() and np.diff(height[:, 2, 3]).std() == pytest.approx(
+            0.1, rel=0.15
+        )
 
     @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
-    @pytest.mark.parametrize("name", ["jitter_m", "jitter_rad", "drift_m", "drift_rad", "height_drift_m"])
+    @pytest.mark.parametrize(
+        "name", ["jitter_m", "jitter_rad", "drift_m", "drift_rad", "height_drift_m"]
+    )
     def test_a_deviation_is_a_positive_number(self, name, value):
         with pytest.raises(ArgumentError, match=f"{name}: expected a standard deviation"):
             wrong_poses(self.POSES, **{name: value})
@@ -291,7 +311,10 @@ def test_transforming_the_thinned_points_gives_points_of_both_kinds(street):
     thinned = ThinnedScan.of(scans[0], true[0])
     assert 0.1 < len(thinned.measured) / (len(thinned.used) + len(thinned.measured)) < 0.4
     places = [
-        {tuple(cell) for cell in np.floor(transform_points(true[0], points) / 2.0).astype(int).tolist()}
+        {
+            tuple(cell)
+            for cell in np.floor(transform_points(true[0], points) / 2.0).astype(int).tolist()
+        }
         for points in (thinned.used, thinned.measured)
     ]
     assert not places[0] & places[1]

@@ -10,7 +10,9 @@ CAR, PERSON = 10, 4
 
 
 def scan(*groups, instances=None):
-    """A scan of groups (x, y, label, velocity in x) of twenty points each, within a tenth of a metre."""
+    """A scan of groups (x, y, label, velocity in x) of twenty points each, within a tenth of a
+    metre.
+    """
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-0.1, 0.1, (20, 3)) + (x, y, 0) for x, y, _, _ in groups])
     labels = np.repeat([label for *_, label, _ in groups], 20).astype(np.uint32)
@@ -25,13 +27,24 @@ def count(*groups, **options):
 
 def test_points_up_to_two_metres_apart_are_one_actor():
     assert count((0, 0, CAR, 8.0), (1.6, 0, CAR, 8.0)) == 1
-    assert count((0, 0, CAR, 8.0), (1.6, 0, CAR, 8.0), (3.2, 0, CAR, 8.0), (4.8, 0, CAR, 8.0), (6.4, 0, CAR, 8.0)) == 1
+    assert (
+        count(
+            (0, 0, CAR, 8.0),
+            (1.6, 0, CAR, 8.0),
+            (3.2, 0, CAR, 8.0),
+            (4.8, 0, CAR, 8.0),
+            (6.4, 0, CAR, 8.0),
+        )
+        == 1
+    )
     assert count((0, 0, CAR, 8.0), (3.0, 0, CAR, 8.0)) == 2
 
 
 def test_actors_of_different_velocities_are_kept_apart_and_wrong_classes_do_not_divide_one():
     assert count((0, 0, CAR, 8.0), (0.5, 0, PERSON, 8.0)) == 1
-    (one,) = segment_by_flow(0, scan((0, 0, CAR, 8.0), (0.5, 0, CAR, 8.0), (0.2, 0, PERSON, 8.0)), np.eye(4))
+    (one,) = segment_by_flow(
+        0, scan((0, 0, CAR, 8.0), (0.5, 0, CAR, 8.0), (0.2, 0, PERSON, 8.0)), np.eye(4)
+    )
     assert one.label == CAR
     assert count((0, 0, CAR, 8.0), (0.5, 0, CAR, 7.2)) == 2
     assert count((0, 0, CAR, 8.0), (0.5, 0, CAR, 7.9)) == 1
@@ -53,7 +66,9 @@ def test_a_segment_has_the_velocity_and_the_centre_of_its_points():
 
 
 def test_numbered_actors_are_segments_whether_they_move_or_not():
-    numbered = scan((0, 0, CAR, 8.0), (1, 0, CAR, 0.0), (2, 0, 0, 8.0), (3, 0, 7, 0.0), instances=[5, 2, 6, 0])
+    numbered = scan(
+        (0, 0, CAR, 8.0), (1, 0, CAR, 0.0), (2, 0, 0, 8.0), (3, 0, 7, 0.0), instances=[5, 2, 6, 0]
+    )
     segments = segment_by_instances(0, numbered, np.eye(4))
     assert [segment.instance for segment in segments] == [5, 2]
     assert [segment.velocity[0] for segment in segments] == [8.0, 0.0]
@@ -105,4 +120,6 @@ def test_a_number_in_two_places_or_of_two_velocities_has_a_segment_for_each():
         seen = scan((0, 0, CAR, 8.0), other, instances=[3, 3])
         segments = segment_by_instances(0, seen, np.eye(4))
         assert [segment.instance for segment in segments] == [3] * parts
-        assert np.sort(np.concatenate([segment.members for segment in segments])).tolist() == list(range(40))
+        assert np.sort(np.concatenate([segment.members for segment in segments])).tolist() == list(
+            range(40)
+        )

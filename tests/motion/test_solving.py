@@ -4,14 +4,24 @@ import numpy as np
 import pytest
 
 from carlasc.core.geometry import rotation_z
-from carlasc.motion.solving import _median, least_squares, nearest_rotation, principal_axes, resample, smooth, smooth_at
+from carlasc.motion.solving import (
+    _median,
+    least_squares,
+    nearest_rotation,
+    principal_axes,
+    resample,
+    smooth,
+    smooth_at,
+)
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 1), (2, 2), (4, 2), (9, 3), (60, 3), (4, 4)])
 def test_parameters_are_those_of_lapack(rows, columns):
     rng = np.random.default_rng(rows)
     design, values = rng.normal(size=(rows, columns)), rng.normal(size=(rows, 3))
-    assert np.allclose(least_squares(design, values), np.linalg.lstsq(design, values, rcond=None)[0], atol=1e-12)
+    assert np.allclose(
+        least_squares(design, values), np.linalg.lstsq(design, values, rcond=None)[0], atol=1e-12
+    )
 
 
 def test_a_column_that_says_nothing_new_gets_no_parameter():
@@ -58,7 +68,9 @@ def test_parabolas_and_their_slopes_are_kept():
 
 def test_noise_is_averaged_over_the_whole_window():
     noise = np.random.default_rng(0).normal(0, 0.1, (40, 3))
-    smoothed = [np.std(smooth(noise, TIMES, np.ones(40), half_s)[0][10:30]) for half_s in (0.5, 1.0)]
+    smoothed = [
+        np.std(smooth(noise, TIMES, np.ones(40), half_s)[0][10:30]) for half_s in (0.5, 1.0)
+    ]
     assert smoothed[1] < smoothed[0] < 0.065
 
 
@@ -89,7 +101,9 @@ def test_one_time_alone_is_smoothed_as_among_all():
     weights = np.random.default_rng(2).uniform(1, 200, 40)
     smoothed, slopes = smooth(values, TIMES, weights, 0.4)
     for index in (0, 7, 39):
-        assert np.array_equal(smooth_at(index, values, TIMES, weights, 0.4), (smoothed[index], slopes[index]))
+        assert np.array_equal(
+            smooth_at(index, values, TIMES, weights, 0.4), (smoothed[index], slopes[index])
+        )
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 8])

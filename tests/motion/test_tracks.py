@@ -13,11 +13,21 @@ TIMES = {frame: 0.1 * frame for frame in range(100)}
 
 
 def segment(frame, x, speed=8.0, *, y=0.0, label=CAR, instance=0, size=(4.0, 2.0, 1.5)):
-    """The corners of a box, and its centre, at a place, seen from behind and beside it: its length and width are known."""
-    corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)] + [[0, 0, 0]]) / 2
+    """The corners of a box, and its centre, at a place, seen from behind and beside it: its length
+    and width are known.
+    """
+    corners = (
+        np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)] + [[0, 0, 0]]) / 2
+    )
     points = corners * size + (x, y, 0.0)
     return Segment(
-        frame, label, np.arange(9), points, np.array([speed, 0.0, 0.0]), instance, np.array([x - 10, y - 10, 0])
+        frame,
+        label,
+        np.arange(9),
+        points,
+        np.array([speed, 0.0, 0.0]),
+        instance,
+        np.array([x - 10, y - 10, 0]),
     )
 
 
@@ -69,7 +79,8 @@ def test_times_beyond_the_scans_go_on_at_their_mean_period():
     (track,) = link_segments([segment(frame, 1.6 * frame) for frame in range(10)], times)
     for frame in (-2, 0, 9, 11):
         assert track.pose(frame)[0, 3] == pytest.approx(1.6 * frame)
-    assert track.pose(-3) is None and track.pose(12) is None  # half a second is two frames and a half
+    # half a second is two frames and a half
+    assert track.pose(-3) is None and track.pose(12) is None
 
 
 def test_the_box_holds_the_points_and_a_margin_but_not_single_outliers():
@@ -77,13 +88,16 @@ def test_the_box_holds_the_points_and_a_margin_but_not_single_outliers():
     assert np.allclose(track.size, (4.2, 2.2, 1.7))
     segments = drive(range(40))
     outlier = np.concatenate([segments[20].points, [[16.0, 9.0, 0.0]]])
-    segments[20] = Segment(20, CAR, np.arange(10), outlier, np.array([8.0, 0.0, 0.0]), origin=segments[20].origin)
+    segments[20] = Segment(
+        20, CAR, np.arange(10), outlier, np.array([8.0, 0.0, 0.0]), origin=segments[20].origin
+    )
     (track,) = link_segments(segments, TIMES)
     assert np.allclose(track.size, (4.2, 2.2, 1.7), atol=0.05)
 
 
 @pytest.mark.parametrize(
-    ("speed", "frames", "moves"), [(8.0, 10, True), (0.29, 60, False), (0.31, 60, True), (0.6, 3, True)]
+    ("speed", "frames", "moves"),
+    [(8.0, 10, True), (0.29, 60, False), (0.31, 60, True), (0.6, 3, True)],
 )
 def test_an_actor_moves_if_it_is_fast_and_gets_somewhere(speed, frames, moves):
     (track,) = link_segments(drive(range(frames), speed), TIMES)
@@ -119,16 +133,19 @@ def test_a_slow_actor_that_stops_is_followed_and_a_fast_one_is_not():
 
 def test_numbered_actors_are_linked_by_their_numbers_wherever_they_are():
     first, second = link_segments(
-        [segment(0, 0.0, instance=3), segment(30, 500.0, instance=3), segment(0, 0.5, instance=4)], TIMES
+        [segment(0, 0.0, instance=3), segment(30, 500.0, instance=3), segment(0, 0.5, instance=4)],
+        TIMES,
     )
     assert (first.instance, len(first.members)) == (3, 2)
     assert (second.instance, len(second.members)) == (4, 1)
 
 
 def test_a_body_is_completed_away_from_the_face_that_was_seen():
-    behind = [replace(one, origin=one.center - (10, 0, 0)) for one in drive(range(20))]  # it drives ahead
+    # it drives ahead
+    behind = [replace(one, origin=one.center - (10, 0, 0)) for one in drive(range(20))]
     (track,) = link_segments(behind, TIMES)
-    assert np.allclose(track.size, (4.6, 2.2, 1.7))  # 4.4 m, a usual length of cars, and the margins
+    # 4.4 m, a usual length of cars, and the margins
+    assert np.allclose(track.size, (4.6, 2.2, 1.7))
     rear = track.pose(10)[0, 3] + track.lower[0] + 0.1
     assert rear == pytest.approx(8.0 - 2.0)
     assert np.allclose(track.lower, -track.upper)  # the origin is the centre of the body
@@ -137,7 +154,8 @@ def test_a_body_is_completed_away_from_the_face_that_was_seen():
 
 def test_people_are_as_large_as_their_points():
     people = [
-        replace(one, label=PERSON, origin=one.center - (10, 0, 0)) for one in drive(range(20), size=(0.5, 0.5, 1.7))
+        replace(one, label=PERSON, origin=one.center - (10, 0, 0))
+        for one in drive(range(20), size=(0.5, 0.5, 1.7))
     ]
     (track,) = link_segments(people, TIMES, deformable={PERSON})
     assert not track.rigid

@@ -1,4 +1,6 @@
-"""The same input gives the same bytes: with any number of workers, order and threads, and on every version of Python and processor."""
+"""The same input gives the same bytes: with any number of workers, order and threads, and on every
+version of Python and processor.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,20 @@ def test_files_are_those_that_every_version_of_python_writes(tmp_path: Path) -> 
     assert found == {name: KEPT[name] for name in found}
 
 
-def test_parts_in_any_order_write_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_in_any_order_write_the_same_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sums.write_inputs(tmp_path)
     monkeypatch.chdir(tmp_path)
     command = [*sums.STEPS["regrid"].split(), "--workers", "1"]
     for part in ("3/3", "1/3", "2/3"):
         assert run_here([*command, "--part", part]) == 0
     found = sums.sums_in(tmp_path / "grids")
-    assert found == {name.removeprefix("grids/"): kept for name, kept in KEPT.items() if name.startswith("grids/")}
+    assert found == {
+        name.removeprefix("grids/"): kept
+        for name, kept in KEPT.items()
+        if name.startswith("grids/")
+    }
 
 
 @pytest.mark.slow
@@ -52,7 +60,8 @@ def test_any_number_of_threads_writes_the_same_files(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.needs("trimesh", "embreex")
 @pytest.mark.skipif(
-    platform.machine() not in ("x86_64", "AMD64"), reason="the names of instruction sets are those of x86"
+    platform.machine() not in ("x86_64", "AMD64"),
+    reason="the names of instruction sets are those of x86",
 )
 def test_a_processor_without_avx_writes_the_same_files(tmp_path: Path) -> None:
     dispatched = np._core._multiarray_umath.__cpu_dispatch__  # type: ignore[attr-defined]
@@ -79,7 +88,11 @@ def run_elsewhere(folder: Path, *arguments: str, **environment: str) -> dict[str
         ]
     )
     ran = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": paths, **environment}, capture_output=True, text=True, check=False
+        command,
+        env={**os.environ, "PYTHONPATH": paths, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert ran.returncode == 0, ran.stderr
     return json.loads(ran.stdout)

@@ -8,7 +8,9 @@ import pytest
 from faults import calls, preload
 from faults.commands import COMMANDS
 
-pytestmark = pytest.mark.skipif(preload.reason_to_skip() is not None, reason=str(preload.reason_to_skip()))
+pytestmark = pytest.mark.skipif(
+    preload.reason_to_skip() is not None, reason=str(preload.reason_to_skip())
+)
 
 QUICK = ("convert", "download-extract")
 """Commands whose data are quickly made."""
@@ -22,7 +24,9 @@ def test_a_failing_call_leaves_whole_files_and_the_next_run_finishes_them(tmp_pa
 
 
 @pytest.mark.slow
-def test_a_failing_call_of_any_command_leaves_whole_files_and_the_next_run_finishes_them(tmp_path: Path) -> None:
+def test_a_failing_call_of_any_command_leaves_whole_files_and_the_next_run_finishes_them(
+    tmp_path: Path,
+) -> None:
     outcome = calls.run(200, 0, tmp_path)
     assert outcome.found == []
     assert outcome.tried == 200

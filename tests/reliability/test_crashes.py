@@ -11,14 +11,18 @@ from faults.commands import COMMANDS
 from faults.comparing import content_of
 from faults.crashes import Call, Disk
 
-needs_compiler = pytest.mark.skipif(preload.reason_to_skip() is not None, reason=str(preload.reason_to_skip()))
+needs_compiler = pytest.mark.skipif(
+    preload.reason_to_skip() is not None, reason=str(preload.reason_to_skip())
+)
 
 QUICK = ("convert", "download-extract")
 """Commands whose data are quickly made."""
 
 
 @needs_compiler
-def test_after_a_power_failure_files_are_whole_or_absent_and_the_next_run_finishes(tmp_path: Path) -> None:
+def test_after_a_power_failure_files_are_whole_or_absent_and_the_next_run_finishes(
+    tmp_path: Path,
+) -> None:
     outcome = crashes.run(10, 0, tmp_path, [name for name in QUICK if name in COMMANDS])
     assert outcome.found == []
     assert outcome.tried == 10
@@ -60,10 +64,22 @@ NAMED = _call("rename", "t", "a")
 CASES = {
     "nothing synced": ([*WRITTEN, NAMED], {}),
     "only the file": ([*WRITTEN, _call("sync", "t"), NAMED], {}),
-    "only the folder, so that the file is empty": ([*WRITTEN, NAMED, _call("sync", ".")], {"a": b""}),
-    "the file, then the folder": ([*WRITTEN, _call("sync", "t"), NAMED, _call("sync", ".")], {"a": b"abc"}),
+    "only the folder, so that the file is empty": (
+        [*WRITTEN, NAMED, _call("sync", ".")],
+        {"a": b""},
+    ),
+    "the file, then the folder": (
+        [*WRITTEN, _call("sync", "t"), NAMED, _call("sync", ".")],
+        {"a": b"abc"},
+    ),
     "written after it was synced": (
-        [*WRITTEN, _call("sync", "t"), NAMED, _call("sync", "."), _call("write", "a", data=b"d", offset=3)],
+        [
+            *WRITTEN,
+            _call("sync", "t"),
+            NAMED,
+            _call("sync", "."),
+            _call("write", "a", data=b"d", offset=3),
+        ],
         {"a": b"abc"},
     ),
     "in a new folder whose own name is not stored": (
@@ -71,10 +87,19 @@ CASES = {
         {},
     ),
     "linked and unlinked": (
-        [*WRITTEN, _call("sync", "t"), _call("link", "t", "a"), _call("sync", "."), _call("unlink", "t")],
+        [
+            *WRITTEN,
+            _call("sync", "t"),
+            _call("link", "t", "a"),
+            _call("sync", "."),
+            _call("unlink", "t"),
+        ],
         {"a": b"abc", "t": b"abc"},
     ),
-    "cut": ([*WRITTEN, _call("truncate", "t", offset=2), _call("sync", "t"), _call("sync", ".")], {"t": b"ab"}),
+    "cut": (
+        [*WRITTEN, _call("truncate", "t", offset=2), _call("sync", "t"), _call("sync", ".")],
+        {"t": b"ab"},
+    ),
 }
 
 

@@ -1,4 +1,6 @@
-"""Damaged files: a slice of the mutations in fresh processes, and the engine itself on readers with known faults."""
+"""Damaged files: a slice of the mutations in fresh processes, and the engine itself on readers with
+known faults.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,12 @@ SEED = 7
 
 
 def test_a_few_damaged_files_of_the_common_kinds_are_read_or_refused() -> None:
-    available = [target.name for target in TARGETS if target.name in QUICK and target.is_available()]
-    assert run_apart(",".join(available), SEED, 300).count(" 0 kinds of faults") == len(available) >= 6
+    available = [
+        target.name for target in TARGETS if target.name in QUICK and target.is_available()
+    ]
+    assert (
+        run_apart(",".join(available), SEED, 300).count(" 0 kinds of faults") == len(available) >= 6
+    )
 
 
 @pytest.mark.slow
@@ -53,7 +59,9 @@ def write(root: Path) -> None:
 
 
 def reading(look: Callable[[bytes], object]) -> Target:
-    """Return a target whose reader gives the bytes of b.bin to a function; the whole file goes well."""
+    """Return a target whose reader gives the bytes of b.bin to a function; the whole file goes
+    well.
+    """
 
     def read(root: Path, attempt: mutations.Reading) -> None:
         data = (root / "b.bin").read_bytes() if (root / "b.bin").is_file() else b""
@@ -132,10 +140,22 @@ def test_a_number_repeats_its_case_and_others_differ() -> None:
 
 
 def test_every_operator_changes_bytes_of_any_kind() -> None:
-    for data in (b"", b"\0", b"{}", b"[1]", b"PK\x03\x04", b"\x93NUMPY", b"1 2 3\n4 5 6\n", bytes(300)):
+    for data in (
+        b"",
+        b"\0",
+        b"{}",
+        b"[1]",
+        b"PK\x03\x04",
+        b"\x93NUMPY",
+        b"1 2 3\n4 5 6\n",
+        bytes(300),
+    ):
         assert sum(change(data, Random(number)) != data for number in range(60)) > 15, data
 
 
 def test_cases_are_divided_by_weight() -> None:
-    targets = [Target(str(weight), write, lambda root, attempt: None, weight=weight) for weight in (1, 2, 7)]
+    targets = [
+        Target(str(weight), write, lambda root, attempt: None, weight=weight)
+        for weight in (1, 2, 7)
+    ]
     assert [count for _, count in shares(1003, targets)] == [100, 200, 703]

@@ -27,14 +27,21 @@ def run(where: str, count: int = 4, workers: int | None = None) -> list[int]:
         return list(run_all(jobs.square, range(count), run=Run(executor=cluster)))
 
 
-@pytest.mark.parametrize("where", ["nonsense", "local:0", "local:x", "no.such.Class", "carlasc.NoSuchClass", ""])
+@pytest.mark.parametrize(
+    "where", ["nonsense", "local:0", "local:x", "no.such.Class", "carlasc.NoSuchClass", ""]
+)
 def test_what_is_no_cluster(where):
-    with pytest.raises(ArgumentError, match=r"cluster: expected local, local:N, tcp://HOST:PORT, slurm, or the dotted"):
+    with pytest.raises(
+        ArgumentError,
+        match=r"cluster: expected local, local:N, tcp://HOST:PORT, slurm, or the dotted",
+    ):
         run(where)
 
 
 def test_two_numbers_of_workers_contradict_each_other():
-    with pytest.raises(ArgumentError, match="workers: expected no number of workers with local:2, found 3"):
+    with pytest.raises(
+        ArgumentError, match="workers: expected no number of workers with local:2, found 3"
+    ):
         run("local:2", workers=3)
 
 
@@ -45,11 +52,15 @@ def test_no_scheduler_at_the_address():
 
     with dask.config.set({"carlasc.connect-timeout": "0.5s"}):
         for where in ("tcp://127.0.0.1:1", "tls://127.0.0.1:1", "tcp://nowhere.invalid:8786"):
-            with pytest.raises(CarlascError, match=f"^cluster {where}: no scheduler answers: ") as caught:
+            with pytest.raises(
+                CarlascError, match=f"^cluster {where}: no scheduler answers: "
+            ) as caught:
                 run(where)
             assert "\n" not in str(caught.value)
             # the finalizer of one that is not closed would block a client that starts
-            left = [value for value in gc.get_objects() if issubclass(type(value), distributed.Client)]
+            left = [
+                value for value in gc.get_objects() if issubclass(type(value), distributed.Client)
+            ]
             assert all(client.status == "closed" for client in left)
 
 
@@ -62,10 +73,13 @@ def test_no_work_opens_nothing():
 def test_a_cluster_without_workers(tmp_path: Path):
     import dask
 
-    with pytest.raises(ArgumentError, match="workers: expected the number of jobs or workers that helpers"):
+    with pytest.raises(
+        ArgumentError, match="workers: expected the number of jobs or workers that helpers"
+    ):
         run("helpers.servers.dask_cluster.no_workers")
     with pytest.raises(
-        CarlascError, match="cluster helpers.servers.dask_cluster.broken: it does not start: no more machines"
+        CarlascError,
+        match="cluster helpers.servers.dask_cluster.broken: it does not start: no more machines",
     ):
         run("helpers.servers.dask_cluster.broken")
     with (
@@ -100,7 +114,10 @@ def test_a_worker_with_other_versions_that_comes_later(tmp_path: Path):
     ):
         results = run_all(jobs.name_of_process, range(1000), run=Run(executor=cluster))
         next(results)
-        with dask_cluster.worker(address, OTHER_VERSION), pytest.raises(CarlascError, match=r"found carlasc 0\.0\.1"):
+        with (
+            dask_cluster.worker(address, OTHER_VERSION),
+            pytest.raises(CarlascError, match=r"found carlasc 0\.0\.1"),
+        ):
             list(results)
 
 
@@ -115,7 +132,8 @@ def test_the_scheduler_is_lost_in_the_middle(tmp_path: Path):
         next(results)
         process.send_signal(signal.SIGKILL)
         with pytest.raises(
-            CarlascError, match=f"^the scheduler {address}: the connection was lost: check that the scheduler"
+            CarlascError,
+            match=f"^the scheduler {address}: the connection was lost: check that the scheduler",
         ) as caught:
             list(results)
     assert "\n" not in str(caught.value)

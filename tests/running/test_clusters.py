@@ -25,7 +25,9 @@ def cluster() -> Iterator[LazyClient]:
 
 
 def test_results_come_in_the_order_of_the_items_and_from_other_processes(cluster):
-    assert list(run_all(jobs.square, range(40), run=Run(executor=cluster))) == [n * n for n in range(40)]
+    assert list(run_all(jobs.square, range(40), run=Run(executor=cluster))) == [
+        n * n for n in range(40)
+    ]
     workers = set(run_all(jobs.name_of_process, range(8), run=Run(executor=cluster)))
     assert len(workers) == 2 and os.getpid() not in workers
 
@@ -73,11 +75,16 @@ def test_what_a_killed_worker_worked_on_is_done_by_another(cluster, tmp_path: Pa
 @pytest.mark.slow
 def test_what_always_kills_its_worker_is_given_up_and_nothing_else(cluster):
     results = run_all(
-        jobs.kill_itself_at_three, range(8), run=Run(executor=cluster), lost=lambda item, message: f"{item}: {message}"
+        jobs.kill_itself_at_three,
+        range(8),
+        run=Run(executor=cluster),
+        lost=lambda item, message: f"{item}: {message}",
     )
     found = list(results)
     assert found[:3] + found[4:] == [0, 1, 2, 4, 5, 6, 7]
-    assert found[3].startswith("3: a task: 3 worker processes died while running it: they ran out of memory")
+    assert found[3].startswith(
+        "3: a task: 3 worker processes died while running it: they ran out of memory"
+    )
     with pytest.raises(CarlascError, match="a task: 3 worker processes died"):
         list(run_all(jobs.kill_itself, [0], run=Run(executor=cluster)))
 

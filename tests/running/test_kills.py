@@ -23,7 +23,9 @@ from carlasc.running.pools import LostTaskError
 
 
 class Killer:
-    """Kills a worker process of this process every now and then, at random moments, but not before there is a result since the last kill."""
+    """Kills a worker process of this process every now and then, at random moments, but not before
+    there is a result since the last kill.
+    """
 
     def __init__(self, kills: int) -> None:
         self.wanted, self.kills, self.results = kills, 0, 0
@@ -32,7 +34,11 @@ class Killer:
     def run(self) -> None:
         before = 0
         while self.kills < self.wanted and not self._over.wait(self._random.uniform(0.0, 0.4)):
-            workers = [process for process in psutil.Process().children(recursive=True) if is_spawned(process)]
+            workers = [
+                process
+                for process in psutil.Process().children(recursive=True)
+                if is_spawned(process)
+            ]
             if workers and self.results > before:
                 before = self.results
                 with suppress(ProcessLookupError):
@@ -62,15 +68,18 @@ def work_until_killed_often_enough(killer: Killer, folder: Path, executor: Engin
         while killer.kills < killer.wanted:
             paths = [folder / str(number) for number in range(len(made), len(made) + 100)]
             results = run_all(jobs.write_own_number, paths, run=Run(workers=2, executor=executor))
+            # one that three workers died of is said to be lost: run again
             with (
                 suppress(LostTaskError),
                 closing(results),
-            ):  # one that three workers died of is said to be lost: run again
+            ):
                 for number in results:
                     made.append(number)
                     killer.results += 1
     assert made == list(range(len(made)))
-    written = {file.name: file.read_text() for file in folder.iterdir() if not file.name.startswith(".")}
+    written = {
+        file.name: file.read_text() for file in folder.iterdir() if not file.name.startswith(".")
+    }
     assert written == {str(number): str(number) for number in made}
 
 
@@ -79,7 +88,11 @@ def work_until_killed_often_enough(killer: Killer, folder: Path, executor: Engin
 @pytest.mark.parametrize("kills", [3, 50])
 def test_workers_of_a_cluster_are_killed(kills, tmp_path: Path):
     with open_cluster("local:2") as cluster:
-        assert list(run_all(jobs.square, range(2), run=Run(executor=cluster))) == [0, 1]  # it has started
+        # it has started
+        assert list(run_all(jobs.square, range(2), run=Run(executor=cluster))) == [
+            0,
+            1,
+        ]
         work_until_killed_often_enough(Killer(kills), tmp_path, cluster)
 
 
@@ -88,8 +101,12 @@ def test_processes_of_our_own_are_killed(kills, tmp_path: Path):
     work_until_killed_often_enough(Killer(kills), tmp_path, None)
 
 
-@pytest.mark.parametrize("is_first", [True, False], ids=["before it is started", "after it was started"])
-def test_a_worker_that_dies_while_another_is_started_stops_nothing(monkeypatch: pytest.MonkeyPatch, is_first: bool):
+@pytest.mark.parametrize(
+    "is_first", [True, False], ids=["before it is started", "after it was started"]
+)
+def test_a_worker_that_dies_while_another_is_started_stops_nothing(
+    monkeypatch: pytest.MonkeyPatch, is_first: bool
+):
     start, killed = SpawnProcess.start, list[int]()
 
     def start_while_another_dies(process: SpawnProcess) -> None:
@@ -102,8 +119,11 @@ def test_a_worker_that_dies_while_another_is_started_stops_nothing(monkeypatch: 
                 os.kill(killed[0], signal.SIGKILL)
             else:
                 start(process)
-            time.sleep(0.1)  # the pool sees it: it closes its queues, and ends the processes that it knows
+            # the pool sees it: it closes its queues, and ends the processes that it knows
+            time.sleep(0.1)
 
     monkeypatch.setattr(SpawnProcess, "start", start_while_another_dies)
-    assert list(run_all(jobs.square, range(20), run=Run(workers=3))) == [number**2 for number in range(20)]
+    assert list(run_all(jobs.square, range(20), run=Run(workers=3))) == [
+        number**2 for number in range(20)
+    ]
     assert killed

@@ -37,7 +37,9 @@ class RecordingExecutor(Executor):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_the_order_of_the_items(workers):
-    assert list(run_all(jobs.square, range(20), run=Run(workers=workers))) == [n * n for n in range(20)]
+    assert list(run_all(jobs.square, range(20), run=Run(workers=workers))) == [
+        n * n for n in range(20)
+    ]
 
 
 def test_one_worker_works_in_this_process_and_two_in_others():
@@ -56,7 +58,9 @@ def test_an_error_of_the_function_is_raised_in_its_place(workers):
 
 def test_a_callers_executor_gets_a_bounded_number_of_tasks_and_stays_open():
     executor = RecordingExecutor()
-    assert list(run_all(jobs.square, range(50), run=Run(workers=3, executor=executor))) == [n * n for n in range(50)]
+    assert list(run_all(jobs.square, range(50), run=Run(workers=3, executor=executor))) == [
+        n * n for n in range(50)
+    ]
     assert len(executor.submitted) == 50
     assert executor.most_pending == 6
     with ThreadPoolExecutor(2) as threads:
@@ -84,15 +88,22 @@ def test_what_a_killed_worker_worked_on_is_done_by_another(tmp_path: Path):
 
 def test_what_always_kills_its_worker_is_given_up_and_nothing_else():
     results = run_all(
-        jobs.kill_itself_at_three, range(8), run=Run(workers=2), lost=lambda item, message: f"{item}: {message}"
+        jobs.kill_itself_at_three,
+        range(8),
+        run=Run(workers=2),
+        lost=lambda item, message: f"{item}: {message}",
     )
     found = list(results)
     assert found[:3] + found[4:] == [0, 1, 2, 4, 5, 6, 7]
-    assert found[3].startswith("3: a task: 3 worker processes died while running it: they ran out of memory")
+    assert found[3].startswith(
+        "3: a task: 3 worker processes died while running it: they ran out of memory"
+    )
 
 
 def test_without_a_result_for_what_is_given_up_there_is_one_clear_line():
-    with pytest.raises(CarlascError, match="a task: 3 worker processes died while running it") as caught:
+    with pytest.raises(
+        CarlascError, match="a task: 3 worker processes died while running it"
+    ) as caught:
         list(run_all(jobs.kill_itself, range(2), run=Run(workers=2)))
     assert "\n" not in str(caught.value)
 
@@ -107,7 +118,10 @@ def test_workers_that_cannot_start_are_one_clear_line(tmp_path: Path):
         "    raise SystemExit(f'{type(error).__name__}: {error}')\n"
     )
     result = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
-    assert "CarlascError: worker processes die as soon as they start: " in result.stderr.splitlines()[-1]
+    assert (
+        "CarlascError: worker processes die as soon as they start: "
+        in result.stderr.splitlines()[-1]
+    )
 
 
 def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file(tmp_path: Path):
@@ -115,7 +129,9 @@ def test_stopping_in_the_middle_ends_the_workers_at_once_and_leaves_no_half_file
     started = time.monotonic()
     with (
         pytest.raises(KeyboardInterrupt),
-        closing(run_all(jobs.write_for_a_minute, [Path("nothing"), *slow], run=Run(workers=2))) as results,
+        closing(
+            run_all(jobs.write_for_a_minute, [Path("nothing"), *slow], run=Run(workers=2))
+        ) as results,
     ):
         next(results)
         while not all(path.with_suffix(".begun").exists() for path in slow):
@@ -145,19 +161,23 @@ def is_alive(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    status = Path(f"/proc/{process}/stat")  # an ended process whose parent was killed may wait to be forgotten
+    # an ended process whose parent was killed may wait to be forgotten
+    status = Path(f"/proc/{process}/stat")
     return not status.is_file() or status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def test_a_worker_that_is_told_to_end_between_tasks_leaves_the_next_one_whole():
     code = (
-        "import os, signal, threading; from multiprocessing import Pipe; from carlasc.running import pools\n"
+        "import os, signal, threading; from multiprocessing import Pipe; from carlasc.running "
+        "import pools\n"
         "pools._prepare_worker(None, ()); tasks, _writer = Pipe(duplex=False)\n"
         "threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()\n"
         "try: tasks.recv()\n"
         "except BaseException: print('the rest of the task is in the pipe', flush=True)"
     )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
+    )
     assert (ran.returncode, ran.stdout, ran.stderr) == (143, "", "")
 
 

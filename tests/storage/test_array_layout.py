@@ -1,4 +1,7 @@
-"""What zarr and HDF5 stores share: chunks, types, leftovers of interrupted runs. HDF5 stands for both where they do the same."""
+"""What zarr and HDF5 stores share: chunks, types, leftovers of interrupted runs.
+
+HDF5 stands for both where they do the same.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,9 @@ def points_of(count: int, seed: int = 0) -> np.ndarray:
     return points
 
 
-def write(path: Path, scans: list[np.ndarray], options: PackOptions | None = None, field: str = "points") -> Sequence:
+def write(
+    path: Path, scans: list[np.ndarray], options: PackOptions | None = None, field: str = "points"
+) -> Sequence:
     with open_sink(path, options or PackOptions(), False) as sink, sink.sequence(SCANS) as writer:
         for frame, array in enumerate(scans):
             writer.write(field, frame, array)
@@ -51,7 +56,9 @@ def test_memory_is_used_again_only_where_shape_and_type_are_the_same(tmp_path: P
     assert exact.read_xyz([2], first)[0].base is memory
 
 
-@pytest.mark.parametrize("bits", [0x80000000, 0x7FC00123, 0x3F800000], ids=["-0.0", "a NaN with a payload", "1.0"])
+@pytest.mark.parametrize(
+    "bits", [0x80000000, 0x7FC00123, 0x3F800000], ids=["-0.0", "a NaN with a payload", "1.0"]
+)
 def test_a_4th_column_comes_back_bit_for_bit(tmp_path: Path, bits: int) -> None:
     points = points_of(50)
     points.view(np.uint32)[7, 3] = bits
@@ -61,22 +68,34 @@ def test_a_4th_column_comes_back_bit_for_bit(tmp_path: Path, bits: int) -> None:
 
 
 @pytest.mark.parametrize(("count", "chunk"), [(1, 16_384), (14_600, 16_640), (40_000, 45_056)])
-def test_a_chunk_has_nine_eighths_of_the_first_scan_in_whole_pages(tmp_path: Path, count: int, chunk: int) -> None:
+def test_a_chunk_has_nine_eighths_of_the_first_scan_in_whole_pages(
+    tmp_path: Path, count: int, chunk: int
+) -> None:
     write(tmp_path / "x.h5", [points_of(0), points_of(count), points_of(3)])
     with h5py.File(tmp_path / "x.h5") as file:
         assert file[SCANS]["scans/points/xyz"].chunks == (1, 3, chunk)
 
 
 def test_a_grid_of_another_size_than_the_first_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"frame 1: its array: expected shape \(2, 3, 4\).*found \(2, 3, 5\)"):
-        write(tmp_path / "x.h5", [np.zeros((2, 3, 4), np.uint8), np.zeros((2, 3, 5), np.uint8)], None, "fine/labels")
+    with pytest.raises(
+        FormatError, match=r"frame 1: its array: expected shape \(2, 3, 4\).*found \(2, 3, 5\)"
+    ):
+        write(
+            tmp_path / "x.h5",
+            [np.zeros((2, 3, 4), np.uint8), np.zeros((2, 3, 5), np.uint8)],
+            None,
+            "fine/labels",
+        )
 
 
 def test_text_files_that_are_not_numbers_are_kept_without_arrays_of_them(tmp_path: Path) -> None:
     with open_sink(tmp_path / "x.h5", PackOptions(), False) as sink, sink.sequence(SCANS) as writer:
         writer.write_document("poses.txt", b"not numbers")
         writer.write_document("times.txt", b"0\n1\n")
-    assert carlasc.open(tmp_path / "x.h5").sequences()[SCANS].read_document("poses.txt") == b"not numbers"
+    assert (
+        carlasc.open(tmp_path / "x.h5").sequences()[SCANS].read_document("poses.txt")
+        == b"not numbers"
+    )
     with h5py.File(tmp_path / "x.h5") as file:
         assert set(file[SCANS]) == {"documents", "times", "frames", "counts"}
 
@@ -106,14 +125,18 @@ def test_what_an_interrupted_run_left_of_a_sequence_of_tables_is_removed(tmp_pat
     assert not any("instances" in name for name in files_of(tmp_path))
 
 
-def test_what_a_run_left_that_was_killed_while_it_finished_a_store_of_tables_is_removed(tmp_path: Path) -> None:
+def test_what_a_run_left_that_was_killed_while_it_finished_a_store_of_tables_is_removed(
+    tmp_path: Path,
+) -> None:
     pytest.importorskip("pyarrow")
     code = (
         "import os, sys; from carlasc.storage import files; from pathlib import Path\n"
         "files.write_atomic(Path(sys.argv[1]), lambda file: os.kill(os.getpid(), 9))"
     )
     ParquetSink(tmp_path / "x.parquet")
-    subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.parquet.part" / TABLES_MARK)], check=False)
+    subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "x.parquet.part" / TABLES_MARK)], check=False
+    )
     assert len(list((tmp_path / "x.parquet.part").glob(".*.part"))) == 1
     write(tmp_path / "x.parquet", [np.arange(3, dtype=np.uint32)], None, "labels")
     assert not list(tmp_path.rglob(".*.part"))
@@ -130,7 +153,9 @@ def test_what_a_run_left_that_was_killed_while_it_finished_a_store_of_tables_is_
         ("x.parquet", "x.parquet.part"),
     ],
 )
-def test_an_unfinished_store_of_any_format_says_the_same(tmp_path: Path, name: str, opened: str) -> None:
+def test_an_unfinished_store_of_any_format_says_the_same(
+    tmp_path: Path, name: str, opened: str
+) -> None:
     pytest.importorskip("pyarrow")
     sink = open_sink(tmp_path / name, PackOptions(), False)
     with sink.sequence(SCANS) as writer:
@@ -138,8 +163,10 @@ def test_an_unfinished_store_of_any_format_says_the_same(tmp_path: Path, name: s
     with pytest.raises(FormatError) as error:
         carlasc.open(tmp_path / opened)
     assert str(error.value) == (
-        f"{tmp_path / opened}: expected a finished store, found an unfinished one: a run is writing it, or was interrupted: "
-        "run the same command again to finish it (`carlasc finish` if all parts of a .zarr store are written)"
+        f"{tmp_path / opened}: expected a finished store, found an unfinished one: a run is "
+        f"writing it, or was interrupted: "
+        "run the same command again to finish it (`carlasc finish` if all parts of a .zarr store "
+        "are written)"
     )
 
 
@@ -153,5 +180,7 @@ def test_a_frame_is_written_once(tmp_path: Path, kind: str, package: str) -> Non
     pytest.importorskip(package)
     writer = open_sink(tmp_path / f"x.{kind}", PackOptions(), False).sequence(SCANS)
     writer.write("labels", 3, np.arange(3, dtype=np.uint32))
-    with pytest.raises(FormatError, match="frame 3: its number: expected frames in rising order, above 3, found 3"):
+    with pytest.raises(
+        FormatError, match="frame 3: its number: expected frames in rising order, above 3, found 3"
+    ):
         writer.write("labels", 3, np.arange(3, dtype=np.uint32))

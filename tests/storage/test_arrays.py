@@ -32,7 +32,9 @@ def npz(**arrays):
 
 
 def bomb(shape, dtype, size, name="voxel"):
-    """Return an .npz whose header claims a shape, and whose member unpacks to `size` zeros after the header."""
+    """Return an .npz whose header claims a shape, and whose member unpacks to `size` zeros after
+    the header.
+    """
     buffer = io.BytesIO()
     header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
     with (
@@ -51,7 +53,11 @@ def test_an_array_comes_back_in_c_order(tmp_path, order):
     array = np.asarray(np.arange(12, dtype="<f4").reshape(4, 3), order=order)
     (tmp_path / "a.npy").write_bytes(npy(array))
     with open_npz(npz(a=array), "a.npz") as archive:
-        for found in (parse_npy(npy(array), ROWS, "a"), read_npy(tmp_path / "a.npy", ROWS), archive.read("a", ROWS)):
+        for found in (
+            parse_npy(npy(array), ROWS, "a"),
+            read_npy(tmp_path / "a.npy", ROWS),
+            archive.read("a", ROWS),
+        ):
             assert found.flags.c_contiguous
             assert found.dtype == array.dtype
             assert np.array_equal(found, array)
@@ -70,25 +76,55 @@ def test_an_empty_list_counts_as_rows_and_a_single_value_as_an_array_of_any_shap
         (npy(np.zeros((2, 3), ">f4")), "expected float32 values"),
         (npy(np.zeros((2, 4), "<f4")), "expected an array of N x 3 values, found 2 x 4"),
         (npy(np.zeros(3, "<f4")), "expected an array of N x 3 values, found 3"),
-        (npy(np.zeros((2, 3), "<f4"))[:-1], r"expected 152 bytes \(2 x 3 float32\), found 151: the file is cut short"),
+        (
+            npy(np.zeros((2, 3), "<f4"))[:-1],
+            r"expected 152 bytes \(2 x 3 float32\), found 151: the file is cut short",
+        ),
         (npy(np.zeros((2, 3), "<f4")) + b"x", "expected 152 bytes"),
         (b"", "expected a .npy array, found something else"),
         (b"PK nonsense", "expected a .npy array, found something else"),
-        (with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (3"), "expected a .npy array"),
+        (
+            with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (3"),
+            "expected a .npy array",
+        ),
         (with_header(b"{'descr': '<f4', \n'fortran_order': (", version=2), "expected a .npy array"),
         (with_header(b"(" * 9000), "expected a .npy array"),
         (with_header(b"-" * 9000 + b"1"), "expected a .npy array"),
         (with_header(b"{}" * 20_000, version=2), "expected a .npy array"),
-        (with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 3)}"), "found -1 x 3"),
-        (with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (10**9, 3)}"), "expected a .npy array"),
-        (with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 3)}"), "expected 1200000"),
         (
-            with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"9" * 4000 + b", 3)}"),
+            with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 3)}"),
+            "found -1 x 3",
+        ),
+        (
+            with_header(b"{'descr': '<f4', 'fortran_order': False, 'shape': (10**9, 3)}"),
+            "expected a .npy array",
+        ),
+        (
+            with_header(
+                b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000000, 3)}"
+            ),
+            "expected 1200000",
+        ),
+        (
+            with_header(
+                b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"9" * 4000 + b", 3)}"
+            ),
             "fits into memory",
         ),
-        (with_header(b"{'descr': '|O', 'fortran_order': False, 'shape': (1, 3)}", b"cos\nsystem\n"), "found object"),
-        (with_header(b"{'descr': [('a', '|O')], 'fortran_order': False, 'shape': (1, 3)}"), "expected float32 values"),
-        (npy(np.zeros((2, 3), "<f4"))[:6] + b"\x03\x00" + npy(np.zeros((2, 3), "<f4"))[8:], "version"),
+        (
+            with_header(
+                b"{'descr': '|O', 'fortran_order': False, 'shape': (1, 3)}", b"cos\nsystem\n"
+            ),
+            "found object",
+        ),
+        (
+            with_header(b"{'descr': [('a', '|O')], 'fortran_order': False, 'shape': (1, 3)}"),
+            "expected float32 values",
+        ),
+        (
+            npy(np.zeros((2, 3), "<f4"))[:6] + b"\x03\x00" + npy(np.zeros((2, 3), "<f4"))[8:],
+            "version",
+        ),
     ],
 )
 def test_another_array_or_none_is_one_clear_error(data, message):
@@ -148,7 +184,10 @@ def test_an_array_that_is_packed_a_thousand_times_is_refused_where_nothing_else_
     size = 1 << 27
     with (
         open_npz(bomb((size,), "u1", size), "v.npz") as archive,
-        pytest.raises(FormatError, match="v.npz: voxel: expected at most 100 times the .* made to fill the memory"),
+        pytest.raises(
+            FormatError,
+            match="v.npz: voxel: expected at most 100 times the .* made to fill the memory",
+        ),
     ):
         archive.read("voxel", ArrayFormat(("u1",), (None,)))
     zeros = 1 << 25  # a flow of zeros is packed as well
@@ -159,7 +198,9 @@ def test_an_array_that_is_packed_a_thousand_times_is_refused_where_nothing_else_
 def test_a_member_that_the_zip_calls_longer_than_it_is_is_refused():
     good = npz(label=np.zeros(50_000, "u1"))
     claims_more = edit(good, 24, struct.pack("<I", 60_128))
-    with pytest.raises(FormatError, match=r"v.npz: label: expected 50128 bytes \(50000 uint8\), found 60128"):
+    with pytest.raises(
+        FormatError, match=r"v.npz: label: expected 50128 bytes \(50000 uint8\), found 60128"
+    ):
         read_votes(claims_more)
     with zipfile.ZipFile(io.BytesIO(good)) as archive:
         packed = archive.infolist()[0].compress_size
@@ -174,11 +215,15 @@ def test_columns_of_different_lengths_are_not_votes():
     with pytest.raises(FormatError, match="v.npz: expected an array votes, found label, voxel"):
         read_votes(npz(label=np.zeros(3, "u1"), voxel=np.zeros(3, "<i4")))
     with pytest.raises(FormatError, match="v.npz: votes: expected uint16 values, found object"):
-        read_votes(npz(label=np.zeros(1, "u1"), voxel=np.zeros(1, "<i4"), votes=np.array([{}], object)))
+        read_votes(
+            npz(label=np.zeros(1, "u1"), voxel=np.zeros(1, "<i4"), votes=np.array([{}], object))
+        )
 
 
 def edit(data, offset, value):
-    """Change bytes of each member's header and of each record of the central directory: `offset` is that of the latter."""
+    """Change bytes of each member's header and of each record of the central directory: `offset` is
+    that of the latter.
+    """
     changed = bytearray(data)
     place = data.index(b"PK\x01\x02")
     while place >= 0:
@@ -198,9 +243,15 @@ def edit(data, offset, value):
             "label: expected a stored or deflated array, found an enc",
         ),
         (edit(npz(label=np.zeros(9, "u1")), 10, b"\x0c\x00"), "label: .* found compression 12"),
-        (edit(npz(label=np.zeros(9, "u1")), 6, b"\xd2\x00"), "expected an .npz file, .*zip file version 21.0"),
+        (
+            edit(npz(label=np.zeros(9, "u1")), 6, b"\xd2\x00"),
+            "expected an .npz file, .*zip file version 21.0",
+        ),
         (edit(npz(label=np.zeros(9, "u1")), 16, b"oops"), "label: expected a .npy array.*CRC"),
-        (edit(npz(label=np.zeros(9, "u1")), 42, b"\x09\x00"), "label: expected a .npy array in a whole zip"),
+        (
+            edit(npz(label=np.zeros(9, "u1")), 42, b"\x09\x00"),
+            "label: expected a .npy array in a whole zip",
+        ),
     ],
 )
 def test_a_zip_that_numpy_does_not_write_is_one_clear_error(data, message):
@@ -212,7 +263,12 @@ def test_a_zip_that_numpy_does_not_write_is_one_clear_error(data, message):
 @pytest.mark.parametrize("seed", range(4))
 def test_damage_anywhere_gives_an_error_of_one_line_or_changes_nothing_that_can_be_told(seed):
     rng = np.random.default_rng(seed)
-    good = npz(**{n: np.arange(500).astype(t) for n, t in (("label", "u1"), ("voxel", "<i4"), ("votes", "<u2"))})
+    good = npz(
+        **{
+            n: np.arange(500).astype(t)
+            for n, t in (("label", "u1"), ("voxel", "<i4"), ("votes", "<u2"))
+        }
+    )
     refused = 0
     for _ in range(100):
         damaged = bytearray(good)

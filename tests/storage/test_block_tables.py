@@ -1,4 +1,6 @@
-"""Zarr stores that several processes write: nothing is lost, and the files are those of one process."""
+"""Zarr stores that several processes write: nothing is lost, and the files are those of one
+process.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ FRAMES = 40
 
 
 def arrays_of(frame: int) -> dict[str, np.ndarray]:
-    """The fields of a frame: some frames have a 4th column, wide labels, counts that are not whole, no points, or no grid."""
+    """The fields of a frame: some frames have a 4th column, wide labels, counts that are not whole,
+    no points, or no grid.
+    """
     rng = np.random.default_rng(frame)
     fields: dict[str, np.ndarray] = scan(rng, 0 if frame % 7 == 3 else 100 + frame)
     if frame % 5 == 1 and len(fields["points"]):
@@ -72,7 +76,9 @@ def start_sink(sink: ZarrSink) -> ZarrWriter:
 def write_block(task: tuple[ZarrWriter, int]) -> None:
     writer, block = task
     first = block * writer.block
-    writer.write_frames({frame: arrays_of(frame) for frame in range(first, min(first + writer.block, FRAMES))})
+    writer.write_frames(
+        {frame: arrays_of(frame) for frame in range(first, min(first + writer.block, FRAMES))}
+    )
 
 
 def assert_whole(out: Path) -> None:
@@ -94,7 +100,9 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return files_of(out)
 
 
-def test_two_processes_write_different_blocks_in_any_order(tmp_path: Path, reference: dict[str, bytes]) -> None:
+def test_two_processes_write_different_blocks_in_any_order(
+    tmp_path: Path, reference: dict[str, bytes]
+) -> None:
     writer = start(tmp_path / "x.zarr")
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
         list(pool.map(write_block, [(writer, block) for block in (2, 0, 1)]))
@@ -125,7 +133,9 @@ def test_two_processes_that_write_the_same_blocks_at_once_lose_nothing(
 ) -> None:
     tests = Path(__file__).parents[1]
     command = [sys.executable, "-c", WHOLE_RUN, tmp_path / "x.zarr", tests, tests.parent]
-    runs = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) for _ in range(2)]
+    runs = [
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) for _ in range(2)
+    ]
     pipes = [(run.stdin, run.stdout) for run in runs]
     for _, output in pipes:
         assert output is not None and output.readline() == b"ready\n"
@@ -237,7 +247,9 @@ def test_a_writer_sees_what_another_one_writes(tmp_path: Path) -> None:
     assert first.read("labels", 0) is None and first.read("flow", 0) is None
 
 
-def test_asking_for_all_frames_takes_few_listings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_asking_for_all_frames_takes_few_listings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, frames = tmp_path / "x.zarr", 2000
     labels = np.zeros(3, np.uint32)
     with ZarrSink(out).sequence(PATH) as writer:
@@ -245,10 +257,14 @@ def test_asking_for_all_frames_takes_few_listings(tmp_path: Path, monkeypatch: p
     asked: list[str] = []
     tree, listed = type(LocalTarget(out).tree), LocalTarget.paths
     read = tree.read
-    monkeypatch.setattr(LocalTarget, "paths", lambda self, folder="": asked.append(folder) or listed(self, folder))
+    monkeypatch.setattr(
+        LocalTarget, "paths", lambda self, folder="": asked.append(folder) or listed(self, folder)
+    )
     monkeypatch.setattr(tree, "read", lambda self, path: asked.append(path) or read(self, path))
     monkeypatch.setattr(
-        tree, "read_many", lambda self, paths: asked.append("many") or [*map(partial(read, self), paths)]
+        tree,
+        "read_many",
+        lambda self, paths: asked.append("many") or [*map(partial(read, self), paths)],
     )
     other = ZarrSink(out).sequence(PATH)
     assert [f for f in range(frames) if other.has("labels", f)] == list(range(0, frames, 100))
@@ -261,7 +277,8 @@ def test_a_store_with_missing_frames_is_not_finished_by_accident(tmp_path: Path)
     write_block((writer, 0))
     with pytest.raises(
         ConflictError,
-        match=rf"expected all frames that the run announced, found 16 of evaluation/counts missing in {PATH}, 128 in the whole "
+        match=rf"expected all frames that the run announced, found 16 of evaluation/counts "
+        rf"missing in {PATH}, 128 in the whole "
         "store: run the same command again, or give `incomplete=True`",
     ):
         finish(LocalTarget(out))
@@ -269,7 +286,8 @@ def test_a_store_with_missing_frames_is_not_finished_by_accident(tmp_path: Path)
         carlasc.open(out)
     found = finish(LocalTarget(out), incomplete=True)
     assert found.sequences == {
-        PATH: {"evaluation/counts": 10, "evaluation/labels": 10} | dict.fromkeys(scan(np.random.default_rng(0), 1), 16)
+        PATH: {"evaluation/counts": 10, "evaluation/labels": 10}
+        | dict.fromkeys(scan(np.random.default_rng(0), 1), 16)
     }
     assert found.missing[PATH]["points"] == 24
     assert carlasc.open(out).sequences()[PATH].frames("points").tolist() == list(range(16))
@@ -311,7 +329,9 @@ def test_a_scan_much_larger_than_announced_is_one_clear_error(tmp_path: Path) ->
     writer = ZarrSink(tmp_path / "x.zarr").sequence(PATH)
     writer.expect({}, {"points": 10})
     with pytest.raises(
-        FormatError, match=r"field labels, frame 3: its array: expected at most 262144 elements .*found 262145: leave"
+        FormatError,
+        match=r"field labels, frame 3: its array: expected at most 262144 elements .*found "
+        r"262145: leave",
     ):
         writer.write("labels", 3, np.zeros(262_145, np.uint32))
     writer.write("labels", 4, np.ones(262_144, np.uint32))
@@ -347,7 +367,9 @@ def test_a_grid_can_be_removed_and_made_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("small", [False, True])
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.slow
-def test_packing_in_processes_gives_the_same_files(tmp_path: Path, small: bool, workers: int) -> None:
+def test_packing_in_processes_gives_the_same_files(
+    tmp_path: Path, small: bool, workers: int
+) -> None:
     writer = FolderSink(tmp_path / "data").sequence(PATH)
     writer.write_document("evaluation/params.json", params(SIZE))
     for frame in range(FRAMES):
@@ -359,7 +381,9 @@ def test_packing_in_processes_gives_the_same_files(tmp_path: Path, small: bool, 
     assert files_of(tmp_path / "files") == files_of(tmp_path / "data")
 
 
-def test_a_source_names_the_files_that_hold_frames(tmp_path: Path, reference: dict[str, bytes]) -> None:
+def test_a_source_names_the_files_that_hold_frames(
+    tmp_path: Path, reference: dict[str, bytes]
+) -> None:
     for name, data in reference.items():
         (tmp_path / "x.zarr" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "x.zarr" / name).write_bytes(data)
@@ -386,7 +410,9 @@ def test_senseless_blocks_are_refused(block: int) -> None:
 def test_a_store_of_one_frame_in_blocks_of_one_frame_is_read(tmp_path: Path) -> None:
     with ZarrSink(tmp_path / "x.zarr", PackOptions(block=1)) as sink, sink.sequence(PATH) as writer:
         writer.write_frames({0: arrays_of(1)})
-        assert np.array_equal(writer.read("evaluation/counts", 0), arrays_of(1)["evaluation/counts"])
+        assert np.array_equal(
+            writer.read("evaluation/counts", 0), arrays_of(1)["evaluation/counts"]
+        )
     sequence = carlasc.open(tmp_path / "x.zarr").sequences()[PATH]
     for name, array in arrays_of(1).items():
         assert np.array_equal(sequence.read(name, 0), array), name
@@ -399,7 +425,9 @@ def test_a_store_in_blocks_of_one_frame_is_read(tmp_path: Path) -> None:
     assert len(list((tmp_path / "x.zarr" / PATH / "scans/labels/values/c").iterdir())) > 20
 
 
-def test_an_empty_table_that_a_power_failure_left_is_made_again(tmp_path: Path, reference: dict[str, bytes]) -> None:
+def test_an_empty_table_that_a_power_failure_left_is_made_again(
+    tmp_path: Path, reference: dict[str, bytes]
+) -> None:
     writer = start(tmp_path / "x.zarr")
     for block in range(3):
         write_block((writer, block))

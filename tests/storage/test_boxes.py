@@ -1,4 +1,6 @@
-"""Boxes on their way through the stores and a run: nothing is lost, and a frame without boxes stays one."""
+"""Boxes on their way through the stores and a run: nothing is lost, and a frame without boxes stays
+one.
+"""
 
 import shutil
 from pathlib import Path
@@ -37,13 +39,17 @@ def files(root: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("store", ["zip", "zarr", "h5", "parquet"])
 def test_boxes_go_through_every_store(folder, tmp_path, store):
-    pytest.importorskip({"zip": "zipfile", "zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}[store])
+    pytest.importorskip(
+        {"zip": "zipfile", "zarr": "zarr", "h5": "h5py", "parquet": "pyarrow"}[store]
+    )
     if store == "zip":
         out = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", folder))
     else:
         out = carlasc.pack(folder, tmp_path / f"packed.{store}").out
     (sequence,) = carlasc.open(out).sequences().values()
-    counts = {frame: found for frame in range(5) if (found := sequence.scan(frame).boxes) is not None}
+    counts = {
+        frame: found for frame in range(5) if (found := sequence.scan(frame).boxes) is not None
+    }
     assert {frame: len(found) for frame, found in counts.items()} == COUNTS
     carlasc.unpack(out, tmp_path / "back")
     assert files(tmp_path / "back") == files(folder)
@@ -62,16 +68,17 @@ def test_a_store_in_which_no_frame_has_objects_keeps_the_frames(folder, tmp_path
 def test_info_counts_their_frames(folder):
     (sequence,) = carlasc.info(folder).sequences
     assert sequence.fields["boxes"] == 3
-    assert not [finding for finding in carlasc.validate(folder).findings if finding.severity == "error"]
+    assert not [
+        finding for finding in carlasc.validate(folder).findings if finding.severity == "error"
+    ]
 
 
 def test_regrid_from_scans_carries_them_along(folder, tmp_path):
     spec = carlasc.GridSpec.published().with_size((8, 8, 4))
     carlasc.regrid(folder, spec, tmp_path / "out", observe=FromScans(), run=Run(workers=1))
     assert files(tmp_path / "out") == files(folder)
-    carlasc.regrid(
-        folder, spec, tmp_path / "out", observe=FromScans(), run=Run(workers=1)
-    )  # it continues with the same boxes
+    # it continues with the same boxes
+    carlasc.regrid(folder, spec, tmp_path / "out", observe=FromScans(), run=Run(workers=1))
 
 
 def test_a_scan_has_them_if_they_are_asked_for(folder):

@@ -1,4 +1,6 @@
-"""Trees of OctoMap hold exactly the cells that were written: for a plain reader, and for OctoMap's own library."""
+"""Trees of OctoMap hold exactly the cells that were written: for a plain reader, and for OctoMap's
+own library.
+"""
 
 import struct
 
@@ -13,19 +15,27 @@ RES = 0.25
 
 
 def some_cells(seed=0):
-    """Return scattered cells, and a block of eight that is one leaf, around the origin; and which are occupied."""
+    """Return scattered cells, and a block of eight that is one leaf, around the origin; and which
+    are occupied.
+    """
     rng = np.random.default_rng(seed)
     block = np.argwhere(np.ones((2, 2, 2))) + (40, -40, 8)
-    cells = np.unique(np.concatenate([rng.integers(-9, 9, (400, 3)), block, [[-32000, 31000, 5]]]), axis=0)
+    cells = np.unique(
+        np.concatenate([rng.integers(-9, 9, (400, 3)), block, [[-32000, 31000, 5]]]), axis=0
+    )
     occupied = rng.random(len(cells)) < 0.6
     occupied[np.isin(cells[:, 0], (40, 41))] = True
     return cells, occupied
 
 
 def read_tree(path):
-    """Return {cell: occupied} of a .bt file, one node after the other, and the number of nodes that its header gives."""
+    """Return {cell: occupied} of a .bt file, one node after the other, and the number of nodes that
+    its header gives.
+    """
     header, _, data = path.read_bytes().partition(b"\ndata\n")
-    words = dict(line.split(" ", 1) for line in header.decode().splitlines() if not line.startswith("#"))
+    words = dict(
+        line.split(" ", 1) for line in header.decode().splitlines() if not line.startswith("#")
+    )
     cells, at, nodes = {}, 0, 1
 
     def visit(corner, depth):
@@ -41,7 +51,9 @@ def read_tree(path):
                 inner.append(place)
             elif state:
                 for index in np.ndindex(side, side, side):
-                    cells[tuple(p + i - 32768 for p, i in zip(place, index, strict=True))] = state == 2
+                    cells[tuple(p + i - 32768 for p, i in zip(place, index, strict=True))] = (
+                        state == 2
+                    )
         for place in inner:
             visit(place, depth + 1)
 
@@ -54,12 +66,16 @@ def test_a_plain_reader_finds_every_cell(tmp_path):
     cells, occupied = some_cells()
     write_octomap(tmp_path / "map.bt", cells, occupied, RES)
     found, nodes, said = read_tree(tmp_path / "map.bt")
-    assert found == {tuple(cell): bool(full) for cell, full in zip(cells.tolist(), occupied, strict=True)}
+    assert found == {
+        tuple(cell): bool(full) for cell, full in zip(cells.tolist(), occupied, strict=True)
+    }
     assert nodes == said
 
 
 def test_cells_beyond_a_tree_are_refused(tmp_path):
-    with pytest.raises(ArgumentError, match=r"cell_m: expected cells within 8192 m .*, found 8192 m"):
+    with pytest.raises(
+        ArgumentError, match=r"cell_m: expected cells within 8192 m .*, found 8192 m"
+    ):
         write_octomap(tmp_path / "map.bt", np.array([[32768, 0, 0]]), np.ones(1, bool), RES)
     assert not (tmp_path / "map.bt").exists()
 

@@ -19,9 +19,19 @@ def test_labels_take_the_narrowest_type(highest: int, wanted: str) -> None:
 
 @pytest.mark.parametrize(
     ("count", "wanted"),
-    [(255.0, "u1"), (256.0, "<u2"), (2.0**31, "<u4"), (2.0**32, "<f4"), (0.5, "<f4"), (-0.0, "<f4"), (-1.0, "<f4")],
+    [
+        (255.0, "u1"),
+        (256.0, "<u2"),
+        (2.0**31, "<u4"),
+        (2.0**32, "<f4"),
+        (0.5, "<f4"),
+        (-0.0, "<f4"),
+        (-1.0, "<f4"),
+    ],
 )
-def test_counts_take_the_narrowest_type_that_gives_every_bit_back(count: float, wanted: str) -> None:
+def test_counts_take_the_narrowest_type_that_gives_every_bit_back(
+    count: float, wanted: str
+) -> None:
     counts = np.array([1, count], np.float32)
     assert narrow(counts).dtype == wanted
     assert narrow(counts).astype(np.float32).tobytes() == counts.tobytes()

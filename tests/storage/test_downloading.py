@@ -53,7 +53,9 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_zip_is_fetched_byte_for_byte_in_blocks_and_nothing_else_is_left(site: Site, tmp_path: Path) -> None:
+def test_a_zip_is_fetched_byte_for_byte_in_blocks_and_nothing_else_is_left(
+    site: Site, tmp_path: Path
+) -> None:
     assert get(site, tmp_path).read_bytes() == site.files[VAL]
     assert names(tmp_path) == ["val_cartesian.zip"]
     assert len(site.requests) > 5
@@ -74,11 +76,15 @@ def test_a_server_that_drops_every_connection_is_asked_again(site: Site, tmp_pat
 
 
 def test_tries_count_anew_after_each_byte_of_progress(site: Site, tmp_path: Path) -> None:
-    site.drop_after = 2_500  # eight connections per block, where seven without progress are the last
+    site.drop_after = (
+        2_500  # eight connections per block, where seven without progress are the last
+    )
     assert get(site, tmp_path).read_bytes() == site.files[VAL]
 
 
-def test_an_interrupted_download_continues_with_the_bytes_that_it_has(site: Site, tmp_path: Path) -> None:
+def test_an_interrupted_download_continues_with_the_bytes_that_it_has(
+    site: Site, tmp_path: Path
+) -> None:
     def stop_at_a_third(done: int, total: int) -> None:
         if done > total / 3:
             raise KeyboardInterrupt
@@ -124,7 +130,9 @@ def test_a_file_that_changed_between_two_runs_is_not_mixed(site: Site, tmp_path:
 
 
 @pytest.mark.parametrize("size_too", [False, True])
-def test_a_file_that_changes_during_the_download_is_fetched_again(site: Site, tmp_path: Path, size_too: bool) -> None:
+def test_a_file_that_changes_during_the_download_is_fetched_again(
+    site: Site, tmp_path: Path, size_too: bool
+) -> None:
     changed = make_zip(2, {**MEMBERS, "Val/more": 3_000} if size_too else None)
 
     def change(number: int) -> None:
@@ -150,19 +158,25 @@ def test_a_server_without_ranges_is_read_as_a_stream(site: Site, tmp_path: Path)
     assert get(site, tmp_path).read_bytes() == site.files[VAL]
 
 
-def test_a_server_that_promises_ranges_and_ignores_them_is_read_as_a_stream(site: Site, tmp_path: Path) -> None:
+def test_a_server_that_promises_ranges_and_ignores_them_is_read_as_a_stream(
+    site: Site, tmp_path: Path
+) -> None:
     site.ignore_ranges_after = 3
     assert get(site, tmp_path).read_bytes() == site.files[VAL]
 
 
-def test_a_stream_that_always_breaks_is_given_up_and_leaves_no_complete_file(site: Site, tmp_path: Path) -> None:
+def test_a_stream_that_always_breaks_is_given_up_and_leaves_no_complete_file(
+    site: Site, tmp_path: Path
+) -> None:
     site.ranges, site.drop_after = False, 50_000
     with pytest.raises(CarlascError, match="in 7 attempts.*again"):
         get(site, tmp_path)
     assert "val_cartesian.zip" not in names(tmp_path)
 
 
-def test_a_stream_without_a_length_that_breaks_is_found_by_looking_into_the_zip(site: Site, tmp_path: Path) -> None:
+def test_a_stream_without_a_length_that_breaks_is_found_by_looking_into_the_zip(
+    site: Site, tmp_path: Path
+) -> None:
     site.ranges = site.lengths = False
     site.drop_after = 50_000
     with pytest.raises(FormatError, match="whole zip"):
@@ -170,23 +184,31 @@ def test_a_stream_without_a_length_that_breaks_is_found_by_looking_into_the_zip(
     assert "val_cartesian.zip" not in names(tmp_path)
 
 
-def test_a_stream_of_more_bytes_than_the_published_zip_can_have_is_ended(site: Site, tmp_path: Path) -> None:
+def test_a_stream_of_more_bytes_than_the_published_zip_can_have_is_ended(
+    site: Site, tmp_path: Path
+) -> None:
     site.ranges = site.lengths = False
     fetch = FileFetch(f"{site.url}{VAL}", tmp_path / "x.zip", 3)
     assert fetch.file.size is None
-    with pytest.raises(FormatError, match="val_cartesian.zip: expected at most 1000 bytes, found more"):
+    with pytest.raises(
+        FormatError, match="val_cartesian.zip: expected at most 1000 bytes, found more"
+    ):
         fetch.run(lambda count: None, 1000)
     assert "x.zip" not in names(tmp_path)
 
 
-@pytest.mark.parametrize("place", ["file:///etc/passwd", "ftp://127.0.0.1/x", "data:,PK", "http://", VAL])
+@pytest.mark.parametrize(
+    "place", ["file:///etc/passwd", "ftp://127.0.0.1/x", "data:,PK", "http://", VAL]
+)
 def test_a_redirection_that_leads_to_no_web_server_or_nowhere_is_refused_at_once(
     site: Site, tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site.redirect[VAL] = place
     for name in ("BACKOFF_S", "LONGEST_WAIT_S"):  # the error would wait, if it were sent again
         monkeypatch.setenv(f"CARLASC_REMOTE_{name}", "10000")
-    with pytest.raises(CarlascError, match="val_cartesian.zip: expected a file, found a redirection in a loop"):
+    with pytest.raises(
+        CarlascError, match="val_cartesian.zip: expected a file, found a redirection in a loop"
+    ):
         get(site, tmp_path)
     assert names(tmp_path) == []
 
@@ -198,7 +220,9 @@ def test_bytes_under_a_wrong_content_range_are_never_taken(site: Site, tmp_path:
     assert "val_cartesian.zip" not in names(tmp_path)
 
 
-def test_a_file_without_an_etag_is_fetched_whole_and_not_continued(site: Site, tmp_path: Path) -> None:
+def test_a_file_without_an_etag_is_fetched_whole_and_not_continued(
+    site: Site, tmp_path: Path
+) -> None:
     site.etags = False
 
     def stop(done: int, total: int) -> None:
@@ -224,7 +248,9 @@ def test_a_redirect_is_followed_with_its_range(site: Site, tmp_path: Path) -> No
     assert all(site.requests)
 
 
-def test_a_page_instead_of_the_zip_is_refused_at_the_first_request(site: Site, tmp_path: Path) -> None:
+def test_a_page_instead_of_the_zip_is_refused_at_the_first_request(
+    site: Site, tmp_path: Path
+) -> None:
     site.files[VAL], site.content_type = b"<html>gone</html>" * 500, "text/html"
     with pytest.raises(FormatError, match="expected a zip, found text/html"):
         get(site, tmp_path)
@@ -233,11 +259,15 @@ def test_a_page_instead_of_the_zip_is_refused_at_the_first_request(site: Site, t
 
 def test_a_missing_file_is_one_line_with_its_address(site: Site, tmp_path: Path) -> None:
     site.files.clear()
-    with pytest.raises(MissingDataError, match="val_cartesian.zip: expected a file, found status 404"):
+    with pytest.raises(
+        MissingDataError, match="val_cartesian.zip: expected a file, found status 404"
+    ):
         get(site, tmp_path)
 
 
-def test_an_existing_zip_is_not_fetched_again_and_another_is_not_overwritten(site: Site, tmp_path: Path) -> None:
+def test_an_existing_zip_is_not_fetched_again_and_another_is_not_overwritten(
+    site: Site, tmp_path: Path
+) -> None:
     path = get(site, tmp_path)
     count = len(site.requests)
     get(site, tmp_path)
@@ -252,14 +282,18 @@ def test_too_little_free_space_is_an_error_before_anything_is_written(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(extraction.shutil, "disk_usage", lambda _: usage._replace(free=len(site.files[VAL]) + 10))
+    monkeypatch.setattr(
+        extraction.shutil, "disk_usage", lambda _: usage._replace(free=len(site.files[VAL]) + 10)
+    )
     with pytest.raises(CarlascError, match="free space for the zips and the files in them"):
         get(site, tmp_path, extract=True)
     assert names(tmp_path) == []
     assert get(site, tmp_path).exists()
 
 
-def test_extracting_gives_the_files_removes_the_zip_and_is_not_done_twice(site: Site, tmp_path: Path) -> None:
+def test_extracting_gives_the_files_removes_the_zip_and_is_not_done_twice(
+    site: Site, tmp_path: Path
+) -> None:
     assert not get(site, tmp_path, extract=True).exists()
     with zipfile.ZipFile(io.BytesIO(site.files[VAL])) as archive:
         for name in MEMBERS:
@@ -288,7 +322,9 @@ def test_the_table_answers_for_each_split_and_kind() -> None:
     assert chosen("Train") == ["train_cartesian_13.zip", "train_cartesian_46.zip"]
     assert chosen("val", "test") == ["val_cartesian.zip", "test_cartesian.zip"]
     assert len(chosen("all")) == 4
-    assert chosen(what="cylindrical") == chosen("all", what="cylindrical") == ["eval_cylindrical.zip"]
+    assert (
+        chosen(what="cylindrical") == chosen("all", what="cylindrical") == ["eval_cylindrical.zip"]
+    )
     assert all(archive.url.startswith("https://") for archive in downloading.ARCHIVES)
 
 
@@ -301,7 +337,9 @@ def test_the_table_answers_for_each_split_and_kind() -> None:
         ((), "coarse", "what"),
     ],
 )
-def test_a_senseless_choice_is_an_argument_error(splits: tuple[str, ...], what: str, message: str) -> None:
+def test_a_senseless_choice_is_an_argument_error(
+    splits: tuple[str, ...], what: str, message: str
+) -> None:
     with pytest.raises(ArgumentError, match=message):
         downloading.choose_archives(splits, what)
 
@@ -323,7 +361,9 @@ def test_the_record_beside_a_part_names_the_file_and_its_blocks(site: Site, tmp_
 
 
 @pytest.mark.parametrize("status", [401, 403, 404, 410])
-def test_a_file_that_is_not_for_us_is_missing_at_the_first_try(site: Site, tmp_path: Path, status: int) -> None:
+def test_a_file_that_is_not_for_us_is_missing_at_the_first_try(
+    site: Site, tmp_path: Path, status: int
+) -> None:
     site.status = status
     with pytest.raises(MissingDataError, match=f"expected a file, found status {status}"):
         get(site, tmp_path)
@@ -363,7 +403,9 @@ def test_with_weak_etags_a_file_that_changes_is_not_mixed(site: Site, tmp_path: 
     assert get(site, tmp_path).read_bytes() == changed
 
 
-def test_without_etags_a_change_of_size_begins_the_download_again(site: Site, tmp_path: Path) -> None:
+def test_without_etags_a_change_of_size_begins_the_download_again(
+    site: Site, tmp_path: Path
+) -> None:
     site.etags = False
     changed = make_zip(2, {**MEMBERS, "Val/more": 3_000})
 
@@ -385,17 +427,20 @@ def test_a_stream_that_changes_begins_again(site: Site, tmp_path: Path) -> None:
 
     site.before = change
     seen: list[int] = []
-    assert get(site, tmp_path, progress=lambda done, total: seen.append(done)).read_bytes() == changed
+    assert (
+        get(site, tmp_path, progress=lambda done, total: seen.append(done)).read_bytes() == changed
+    )
     assert seen[-1] == len(changed)
 
 
 @pytest.mark.parametrize(
     ("off", "message"),
     [
+        # aiohttp may see the byte too many
         (
             -1,
             r"found a Content-Length of|none in 7 attempts \(ClientResponseError\)",
-        ),  # aiohttp may see the byte too many
+        ),
         (1, "found a Content-Length of"),
     ],
 )
@@ -427,7 +472,9 @@ def test_progress_goes_back_where_bytes_are_thrown_away(site: Site, tmp_path: Pa
     assert max(seen) <= len(changed)
 
 
-def test_a_part_of_another_size_than_its_record_is_fetched_again(site: Site, tmp_path: Path) -> None:
+def test_a_part_of_another_size_than_its_record_is_fetched_again(
+    site: Site, tmp_path: Path
+) -> None:
     def stop(done: int, total: int) -> None:
         if done > total / 2:
             raise KeyboardInterrupt
@@ -449,16 +496,24 @@ def test_no_connection_is_an_argument_error(tmp_path: Path) -> None:
         download(tmp_path, split="val", connections=0)
 
 
-def test_a_zip_that_exists_needs_no_space(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_zip_that_exists_needs_no_space(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     get(site, tmp_path)
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(extraction.shutil, "disk_usage", lambda _: usage._replace(free=len(site.files[VAL]) // 2))
+    monkeypatch.setattr(
+        extraction.shutil, "disk_usage", lambda _: usage._replace(free=len(site.files[VAL]) // 2)
+    )
     get(site, tmp_path)
-    with pytest.raises(CarlascError, match="to extract val_cartesian.zip|for the zips and the files"):
+    with pytest.raises(
+        CarlascError, match="to extract val_cartesian.zip|for the zips and the files"
+    ):
         get(site, tmp_path, extract=True)
 
 
-def test_the_result_says_how_long_it_took_and_an_address_may_end_in_a_slash(site: Site, tmp_path: Path) -> None:
+def test_the_result_says_how_long_it_took_and_an_address_may_end_in_a_slash(
+    site: Site, tmp_path: Path
+) -> None:
     result = download(tmp_path, split="val", base_url=f"{site.url}/", connections=3)
     assert result.elapsed_s > 0
     assert result.archives[0].fetched == result.archives[0].size == len(site.files[VAL])

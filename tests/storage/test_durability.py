@@ -31,11 +31,15 @@ def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return found
 
 
-needs_proc = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs Linux to name open files")
+needs_proc = pytest.mark.skipif(
+    not Path("/proc/self/fd").is_dir(), reason="needs Linux to name open files"
+)
 
 
 @needs_proc
-def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_after_that(tmp_path: Path, synced: list[str]) -> None:
+def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_after_that(
+    tmp_path: Path, synced: list[str]
+) -> None:
     write_atomic(tmp_path / "new" / "a.bin", b"abc")
     assert synced[0] == tmp_path.name  # the new folder's own name
     assert synced[1].startswith(".a.bin.")
@@ -43,7 +47,9 @@ def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_after_that(tmp_
 
 
 @needs_proc
-def test_several_files_are_synced_before_any_gets_its_name(tmp_path: Path, synced: list[str]) -> None:
+def test_several_files_are_synced_before_any_gets_its_name(
+    tmp_path: Path, synced: list[str]
+) -> None:
     (tmp_path / "x").mkdir()
     write_many({tmp_path / "a": b"1", tmp_path / "x" / "b": b"2"}, {tmp_path / "c": b"3"})
     assert [name.split(".")[1] for name in sorted(synced[:3])] == ["a", "b", "c"]
@@ -56,7 +62,9 @@ def test_the_temporary_name_of_a_new_file_is_gone_before_its_folder_is_synced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names: list[str] = []
-    monkeypatch.setattr(files, "_sync", lambda _: names.append(",".join(path.name for path in tmp_path.iterdir())))
+    monkeypatch.setattr(
+        files, "_sync", lambda _: names.append(",".join(path.name for path in tmp_path.iterdir()))
+    )
     assert write_atomic(tmp_path / "a", b"1", create=True)
     assert names[-1] == "a"
 
@@ -85,7 +93,9 @@ def test_another_value_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         files.is_durable()
 
 
-def test_the_option_reaches_worker_processes_through_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_option_reaches_worker_processes_through_the_environment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv(files.DURABLE, "yes")
     with pytest.raises(SystemExit):
         app(["--no-durable", "stats", "nowhere"])
@@ -104,7 +114,9 @@ def test_a_disk_that_fails_while_files_are_synced_is_an_error_that_names_the_fil
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_system_that_cannot_sync_folders_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_that_cannot_sync_folders_is_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sync = files._sync
 
     def refuse_folders(descriptor: int) -> None:

@@ -15,7 +15,9 @@ from carlasc.storage import extraction
 
 
 @pytest.mark.parametrize("name", ["../evil", "/evil", "a/../../evil", "C:/evil", "a\\..\\evil"])
-def test_a_name_that_leads_out_of_the_folder_is_refused_before_anything_is_unpacked(tmp_path: Path, name: str) -> None:
+def test_a_name_that_leads_out_of_the_folder_is_refused_before_anything_is_unpacked(
+    tmp_path: Path, name: str
+) -> None:
     path = tmp_path / "x.zip"
     path.write_bytes(make_zip(0, {"good": 10, name: 10}))
     with pytest.raises(FormatError, match="names inside the folder"):
@@ -65,7 +67,9 @@ def test_extracting_continues_after_an_interruption_and_refuses_other_files(tmp_
         extraction.extract_zip(path, out, lambda _: None)
 
 
-def test_extracting_checks_the_space_for_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extracting_checks_the_space_for_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, out = tmp_path / "x.zip", tmp_path / "out"
     path.write_bytes(make_zip(0, {"a": 100, "b": 200}))
     usage = shutil.disk_usage(tmp_path)

@@ -40,11 +40,14 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path):
     code = (
         "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000));"
-        "from carlasc.storage.files import write_atomic; from carlasc.errors import CarlascError; from pathlib import Path\n"
+        "from carlasc.storage.files import write_atomic; from carlasc.errors import CarlascError; "
+        "from pathlib import Path\n"
         f"try: write_atomic(Path({str(tmp_path / 'x')!r}), bytes(5000))\n"
         "except CarlascError as error: print(error)"
     )
-    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    out = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout
     assert "cannot be written" in out
     assert out.count("\n") == 1
     assert os.listdir(tmp_path) == []
@@ -58,7 +61,9 @@ def test_a_folder_in_the_way_is_one_line(tmp_path):
 
 def test_json_is_written_as_the_published_files_are(tmp_path):
     write_json(tmp_path / "params.json", {"grid_size": [128.0], "max_bound": [25.600000381469727]})
-    assert (tmp_path / "params.json").read_text() == '{"grid_size": [128.0], "max_bound": [25.600000381469727]}'
+    assert (
+        tmp_path / "params.json"
+    ).read_text() == '{"grid_size": [128.0], "max_bound": [25.600000381469727]}'
 
 
 @pytest.mark.parametrize("data", [b"{", b"\xff", b"[1]", b'{"a": "\\ud800"}'])
@@ -73,7 +78,8 @@ def test_escaped_pairs_are_one_character():
 
 def test_what_killed_writers_left_is_removed_and_what_others_write_now_is_not(tmp_path):
     code = (
-        "import os, signal, sys; from pathlib import Path; from carlasc.storage.files import write_atomic\n"
+        "import os, signal, sys; from pathlib import Path; from carlasc.storage.files import "
+        "write_atomic\n"
         "write_atomic(Path(sys.argv[1]), lambda file: os.kill(os.getpid(), signal.SIGKILL))"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "velodyne/000000.bin")], check=False)
@@ -84,7 +90,9 @@ def test_what_killed_writers_left_is_removed_and_what_others_write_now_is_not(tm
         file.write(b"whole")
 
     write_atomic(tmp_path / "velodyne" / "000001.bin", sweep)
-    assert {path.name: path.read_bytes() for path in (tmp_path / "velodyne").iterdir()} == {"000001.bin": b"whole"}
+    assert {path.name: path.read_bytes() for path in (tmp_path / "velodyne").iterdir()} == {
+        "000001.bin": b"whole"
+    }
 
 
 def test_what_other_machines_left_is_removed_when_it_is_a_day_old(tmp_path):
@@ -96,7 +104,9 @@ def test_what_other_machines_left_is_removed_when_it_is_a_day_old(tmp_path):
     assert list(tmp_path.iterdir()) == [new]
 
 
-def test_a_single_file_is_written_where_a_killed_run_left_a_part_of_it_and_other_files_stay(tmp_path):
+def test_a_single_file_is_written_where_a_killed_run_left_a_part_of_it_and_other_files_stay(
+    tmp_path,
+):
     begun = "import os; from carlasc.storage.files import write_atomic; from pathlib import Path;"
     for name in ("film [1].mp4", "film 1.mp4"):
         path = tmp_path / name
@@ -104,4 +114,7 @@ def test_a_single_file_is_written_where_a_killed_run_left_a_part_of_it_and_other
         subprocess.run([sys.executable, "-c", code], check=False)
     assert len(os.listdir(tmp_path)) == 2
     write_output(tmp_path / "film [1].mp4", b"whole")
-    assert sorted(name.partition(".mp4")[0] for name in os.listdir(tmp_path)) == [".film 1", "film [1]"]
+    assert sorted(name.partition(".mp4")[0] for name in os.listdir(tmp_path)) == [
+        ".film 1",
+        "film [1]",
+    ]

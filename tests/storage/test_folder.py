@@ -45,7 +45,11 @@ def test_a_folder_around_the_root_is_understood(data: Path, up: int) -> None:
 @pytest.mark.parametrize("level", ["Train", "Train/Town01_Light", WHOLE])
 def test_a_split_a_sequence_or_its_coordinates_folder_is_understood(data: Path, level: str) -> None:
     (sequence,) = FolderSource(data / level).sequences().values()
-    assert (sequence.split, sequence.name, sequence.coordinates) == ("Train", "Town01_Light", "cartesian")
+    assert (sequence.split, sequence.name, sequence.coordinates) == (
+        "Train",
+        "Town01_Light",
+        "cartesian",
+    )
 
 
 @pytest.mark.parametrize("folder", ["velodyne", "evaluation", "bev"])
@@ -80,7 +84,9 @@ def test_a_truncated_scan_names_the_file_and_the_size(data: Path, tmp_path: Path
     root = write_dataset(tmp_path / "data")
     file = root / WHOLE / "velodyne" / "000005.bin"
     file.write_bytes(file.read_bytes()[:-3])
-    with pytest.raises(FormatError, match=r"000005\.bin: expected a multiple of 16 bytes.*found 16013"):
+    with pytest.raises(
+        FormatError, match=r"000005\.bin: expected a multiple of 16 bytes.*found 16013"
+    ):
         FolderSource(root).sequences()[WHOLE].read("points", 5)
 
 
@@ -138,7 +144,13 @@ def test_empty_folders_and_folders_without_params_are_no_fields(tmp_path: Path) 
     (root / "predictions").mkdir()
     (root / "depth").mkdir()
     (root / "depth" / "000000.label").write_bytes(bytes(4))
-    assert FolderSource(root).sequences()[""].fields() == {"points", "labels", "seconds", "sensor", "origins"}
+    assert FolderSource(root).sequences()[""].fields() == {
+        "points",
+        "labels",
+        "seconds",
+        "sensor",
+        "origins",
+    }
 
 
 def test_frames_are_sorted_whatever_the_order_of_the_files(tmp_path: Path) -> None:
@@ -162,7 +174,9 @@ def test_a_grid_is_removed_and_other_files_in_its_folder_stay(tmp_path: Path) ->
         FolderSink(root).sequence(WHOLE).remove_grid("../cartesian/velodyne")
 
 
-def test_unfinished_files_of_a_killed_run_are_removed_inside_the_sequence_only(tmp_path: Path) -> None:
+def test_unfinished_files_of_a_killed_run_are_removed_inside_the_sequence_only(
+    tmp_path: Path,
+) -> None:
     root = write_dataset(tmp_path / "data")
     script = "import sys; from carlasc.storage import files; from pathlib import Path; import os; "
     script += "files.write_atomic(Path(sys.argv[1]), lambda file: os._exit(0))"
@@ -184,13 +198,16 @@ def test_a_pipe_and_a_device_are_no_scans(tmp_path):
     (sequence,) = FolderSource(tmp_path).sequences().values()
     for frame in (0, 1):
         with pytest.raises(
-            FormatError, match=rf"00000{frame}\.bin: expected a file, found a folder, a pipe or a device"
+            FormatError,
+            match=rf"00000{frame}\.bin: expected a file, found a folder, a pipe or a device",
         ):
             sequence.read("points", frame)
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "1.7e18"])
-def test_a_frame_whose_time_or_pose_is_no_number_is_refused_alone(tmp_path: Path, value: str) -> None:
+def test_a_frame_whose_time_or_pose_is_no_number_is_refused_alone(
+    tmp_path: Path, value: str
+) -> None:
     root = write_dataset(tmp_path)
     folder = next(root.rglob(WHOLE))
     for name in ("times.txt", "poses.txt"):
@@ -200,8 +217,13 @@ def test_a_frame_whose_time_or_pose_is_no_number_is_refused_alone(tmp_path: Path
     (sequence,) = FolderSource(folder).sequences().values()
     assert np.isfinite(sequence.read_pose(0)).all()
     assert np.isfinite(sequence.read_time(0))
-    with pytest.raises(FormatError, match=f"times.txt: line 2: expected times in seconds, below .*, found {value[:3]}"):
+    with pytest.raises(
+        FormatError,
+        match=f"times.txt: line 2: expected times in seconds, below .*, found {value[:3]}",
+    ):
         sequence.read_time(1)
     if value != "1.7e18":
-        with pytest.raises(FormatError, match="poses.txt: line 2: expected finite numbers, found NaN or infinity"):
+        with pytest.raises(
+            FormatError, match="poses.txt: line 2: expected finite numbers, found NaN or infinity"
+        ):
             sequence.read_pose(1)

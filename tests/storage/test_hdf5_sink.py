@@ -41,9 +41,15 @@ def test_h5py_with_hdf5plugin_reads_the_same_numbers_as_the_page_says(
     published: Path, store: Path, tmp_path: Path
 ) -> None:
     page = (Path(__file__).parents[2] / "docs/packed-format.md").read_text()
-    code = next(block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "import h5py" in block)
+    code = next(
+        block
+        for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+        if "import h5py" in block
+    )
     reference = FolderSource(published).sequences()[WHOLE]
-    frames = {*reference.frames("points").tolist()} & {*reference.frames("evaluation/labels").tolist()}
+    frames = {*reference.frames("points").tolist()} & {
+        *reference.frames("evaluation/labels").tolist()
+    }
     assert 5 in frames
     for frame in sorted(frames):
         found = run_page(code, store, frame, tmp_path)
@@ -120,7 +126,8 @@ def test_a_scan_larger_than_the_first_takes_several_chunks(tmp_path: Path) -> No
 
 def test_a_corrupted_chunk_names_field_and_frame(store: Path) -> None:
     with h5py.File(store) as file:
-        info = file[WHOLE]["scans/points/xyz"].id.get_chunk_info(2)  # frame 0 is empty, the others take one each
+        # frame 0 is empty, the others take one each
+        info = file[WHOLE]["scans/points/xyz"].id.get_chunk_info(2)
     data = bytearray(store.read_bytes())
     data[info.byte_offset + info.size // 2] ^= 1
     store.write_bytes(data)
@@ -142,7 +149,8 @@ def test_a_truncated_file_is_one_clear_error(store: Path) -> None:
         (7, "found version 7: upgrade carlasc"),
         (
             1,
-            "expected a store of version 3, found version 1: it was packed by an earlier, unreleased version of carlasc",
+            "expected a store of version 3, found version 1: it was packed by an earlier, "
+            "unreleased version of carlasc",
         ),
     ],
 )

@@ -1,4 +1,6 @@
-"""A labelled data set: the source as it was, its files linked, the labels of a network, and a word of who predicted them."""
+"""A labelled data set: the source as it was, its files linked, the labels of a network, and a word
+of who predicted them.
+"""
 
 import json
 import os
@@ -29,7 +31,11 @@ OTHER = carlasc.ClassTable("mine", {0: "free", 1: "wall"}, {0: (0, 0, 0), 1: (9,
 
 def files_of(folder):
     """Return the bytes of all files of a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def predict(data, folder, classes=23, seed=0):
@@ -39,7 +45,9 @@ def predict(data, folder, classes=23, seed=0):
         sequence = open_store(data).sequences()[path]
         (folder / path).mkdir(parents=True)
         for frame in sequence.frames("points").tolist():
-            shares = rng.dirichlet(np.full(classes, 0.3), len(sequence.read("points", frame))).astype(np.float32)
+            shares = rng.dirichlet(
+                np.full(classes, 0.3), len(sequence.read("points", frame))
+            ).astype(np.float32)
             np.save(folder / path / f"{frame:06d}.npy", shares)
             found[path, frame] = shares
     return found
@@ -55,14 +63,19 @@ def predictions(data, tmp_path):
     return predict(data, tmp_path / "net")
 
 
-def test_labels_are_those_of_the_network_and_everything_else_is_the_same_file(data, predictions, tmp_path):
+def test_labels_are_those_of_the_network_and_everything_else_is_the_same_file(
+    data, predictions, tmp_path
+):
     before = files_of(data)
     result = carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
     assert files_of(data) == before
     source, made = open_store(data).sequences(), open_store(tmp_path / "out").sequences()
     assert list(made) == result.sequences == sorted(SEQUENCES)
     for path in SEQUENCES:
-        kept = {name for name in source[path].fields() if "/" not in name} - {"labels", "probabilities"}
+        kept = {name for name in source[path].fields() if "/" not in name} - {
+            "labels",
+            "probabilities",
+        }
         assert made[path].fields() == kept | {"labels", "probabilities"}
         assert not made[path].grids
         for name in kept:
@@ -84,19 +97,29 @@ def test_carlasc_json_keeps_what_it_said_and_names_who_predicted(data, predictio
     carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
     carlasc.label(data, tmp_path / "named", tmp_path / "net", by="SPVCNN, 2 epochs", run=ALONE)
     found = json.loads((tmp_path / "out" / WHOLE / "carlasc.json").read_text())
-    assert found == {"format": 2, "axes": "right", "classes": "carla", "sensor": "a", "labels": "predicted by net"}
+    assert found == {
+        "format": 2,
+        "axes": "right",
+        "classes": "carla",
+        "sensor": "a",
+        "labels": "predicted by net",
+    }
     made = open_store(tmp_path / "named").sequences()
     assert {one.metadata.predicted for one in made.values()} == {"predicted by SPVCNN, 2 epochs"}
 
 
 @pytest.mark.parametrize("ending", [".zarr", ".h5", ".parquet"])
-def test_probabilities_go_through_every_store_and_packed_sources_are_unpacked(data, predictions, tmp_path, ending):
+def test_probabilities_go_through_every_store_and_packed_sources_are_unpacked(
+    data, predictions, tmp_path, ending
+):
     carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
     carlasc.pack(tmp_path / "out", tmp_path / f"out{ending}", run=ALONE)
     carlasc.unpack(tmp_path / f"out{ending}", tmp_path / "again", run=ALONE)
     assert files_of(tmp_path / "again") == files_of(tmp_path / "out")
     carlasc.pack(data, tmp_path / f"data{ending}", run=ALONE)
-    result = carlasc.label(tmp_path / f"data{ending}", tmp_path / "unpacked", tmp_path / "net", run=ALONE)
+    result = carlasc.label(
+        tmp_path / f"data{ending}", tmp_path / "unpacked", tmp_path / "net", run=ALONE
+    )
     assert result.linked == 0
     assert files_of(tmp_path / "unpacked") == files_of(tmp_path / "out")
 
@@ -114,7 +137,10 @@ def test_labels_without_probabilities_have_no_such_field(data, predictions, tmp_
 
 def test_files_some_of_which_have_probabilities_are_refused(data, predictions, tmp_path):
     np.save(tmp_path / "net" / WHOLE / "000002.npy", np.zeros(777, np.uint8))
-    with pytest.raises(FormatError, match=r"000002\.npy: expected probabilities, as in the first file, found labels"):
+    with pytest.raises(
+        FormatError,
+        match=r"000002\.npy: expected probabilities, as in the first file, found labels",
+    ):
         carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
     assert not (tmp_path / "out").exists()
 
@@ -127,7 +153,9 @@ def test_labels_of_another_table_are_converted_where_that_is_known(data, tmp_pat
         for frame in sequence.frames("points").tolist():
             given = np.resize(ids, len(sequence.read("points", frame)))
             given.tofile(tmp_path / "net" / path / f"{frame:06d}.label")
-    result = carlasc.label(data, tmp_path / "out", tmp_path / "net", classes="semantickitti", run=ALONE)
+    result = carlasc.label(
+        data, tmp_path / "out", tmp_path / "net", classes="semantickitti", run=ALONE
+    )
     made = open_store(tmp_path / "out").sequences()[WHOLE]
     assert result.classes == made.metadata.classes.name == "carla" and "boxes" in made.fields()
     wanted = remap_named("semantickitti_to_carla")(np.resize(ids, 1001))
@@ -142,8 +170,11 @@ def test_a_table_that_cannot_be_converted_becomes_that_of_the_result(data, tmp_p
     result = carlasc.label(data, tmp_path / "out", tmp_path / "net", classes=given, run=ALONE)
     made = open_store(tmp_path / "out").sequences()[WHOLE]
     assert made.metadata.classes == OTHER and result.classes == "mine"
-    assert "boxes" not in made.fields() and "boxes" in result.left_out  # their classes are those of the other table
-    findings = [one for one in validate(tmp_path / "out", run=ALONE).findings if one.check == "class-ids"]
+    # their classes are those of the other table
+    assert "boxes" not in made.fields() and "boxes" in result.left_out
+    findings = [
+        one for one in validate(tmp_path / "out", run=ALONE).findings if one.check == "class-ids"
+    ]
     assert not findings
 
 
@@ -157,13 +188,21 @@ def test_frames_that_a_range_leaves_out_are_copied_without_labels(data, predicti
     assert made.frames("points").tolist() == [0, 1, 2, 5]
 
 
-def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_for(data, predictions, tmp_path):
+def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_for(
+    data, predictions, tmp_path
+):
     carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
     with pytest.raises(ConflictError, match="expected a new path"):
         carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
-    carlasc.label(data, tmp_path / "out", tmp_path / "net", by="x", overwrite=True, frames=(0, 3), run=ALONE)
+    carlasc.label(
+        data, tmp_path / "out", tmp_path / "net", by="x", overwrite=True, frames=(0, 3), run=ALONE
+    )
     made = open_store(tmp_path / "out").sequences()[WHOLE]
-    assert made.metadata.predicted == "predicted by x" and made.frames("labels").tolist() == [0, 1, 2]
+    assert made.metadata.predicted == "predicted by x" and made.frames("labels").tolist() == [
+        0,
+        1,
+        2,
+    ]
     assert not (tmp_path / "out.replaced").exists()
     before = shutil.copytree(data, tmp_path / "other")
     with pytest.raises(ConflictError, match="a data set with predicted labels to overwrite"):
@@ -184,12 +223,15 @@ label(sys.argv[1], sys.argv[2], sys.argv[3], run=Run(workers=1, progress=progres
 """
 
 
-def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(data, predictions, tmp_path):
+def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(
+    data, predictions, tmp_path
+):
     out = tmp_path / "out"
     ran = subprocess.run([sys.executable, "-c", KILLED, data, out, tmp_path / "net"], check=False)
     assert ran.returncode == 9 and not out.exists() and (tmp_path / "out.part").is_dir()
     with pytest.raises(
-        ConflictError, match=r"out\.part: expected the files of an interrupted run .*: remove the folder"
+        ConflictError,
+        match=r"out\.part: expected the files of an interrupted run .*: remove the folder",
     ):
         carlasc.label(data, out, tmp_path / "net", by="another", run=ALONE)
     changed = tmp_path / "net" / WHOLE / "000000.npy"
@@ -209,8 +251,15 @@ def test_several_processes_and_parts_make_the_same_files(data, predictions, tmp_
     carlasc.label(data, tmp_path / "alone", tmp_path / "net", run=ALONE)
     carlasc.label(data, tmp_path / "two", tmp_path / "net", run=Run(workers=2))
     for number in (1, 2):
-        carlasc.label(data, tmp_path / "parts", tmp_path / "net", run=Run(1, part=carlasc.running.Part(number, 2)))
-    assert files_of(tmp_path / "two") == files_of(tmp_path / "alone") == files_of(tmp_path / "parts")
+        carlasc.label(
+            data,
+            tmp_path / "parts",
+            tmp_path / "net",
+            run=Run(1, part=carlasc.running.Part(number, 2)),
+        )
+    assert (
+        files_of(tmp_path / "two") == files_of(tmp_path / "alone") == files_of(tmp_path / "parts")
+    )
 
 
 def test_files_are_copied_where_the_file_system_has_no_hard_links(data, predictions, tmp_path):
@@ -230,7 +279,9 @@ def test_files_are_copied_where_the_file_system_has_no_hard_links(data, predicti
 def test_a_record_a_report_and_a_card_say_who_predicted(data, predictions, tmp_path):
     carlasc.label(data, tmp_path / "out", tmp_path / "net", by="SPVCNN", run=ALONE)
     sequence = tmp_path / "out" / WHOLE
-    spec = carlasc.GridSpec(lower=(-4, -4, -2), upper=(4, 4, 2), size=(8, 8, 4), coordinates="cartesian")
+    spec = carlasc.GridSpec(
+        lower=(-4, -4, -2), upper=(4, 4, 2), size=(8, 8, 4), coordinates="cartesian"
+    )
     carlasc.regrid(sequence, spec, observe=carlasc.FromScans(), name="mine", run=ALONE)
     record = open_store(sequence).sequences()[""].params("mine")["carlasc"]
     assert record["labels"] == "predicted by SPVCNN"
@@ -238,9 +289,17 @@ def test_a_record_a_report_and_a_card_say_who_predicted(data, predictions, tmp_p
     assert made.settings["carlasc"]["labels"] == "predicted by SPVCNN"
     shown = CliRunner().invoke(app, ["report", str(sequence)])
     assert "labels predicted by SPVCNN" in " ".join(shown.output.split())
-    card(tmp_path / "out", tmp_path / "card", about=carlasc.CardDetails(license="cc-by-4.0"), pictures=False, run=ALONE)
+    card(
+        tmp_path / "out",
+        tmp_path / "card",
+        about=carlasc.CardDetails(license="cc-by-4.0"),
+        pictures=False,
+        run=ALONE,
+    )
     text = (tmp_path / "card/README.md").read_text()
-    assert "Labels of points are predicted by SPVCNN" in text and "labels predicted by SPVCNN" in text
+    assert (
+        "Labels of points are predicted by SPVCNN" in text and "labels predicted by SPVCNN" in text
+    )
     assert "Labels of points are those of the simulator" not in text
 
 
@@ -251,17 +310,33 @@ def test_a_name_is_one_line(data, predictions, tmp_path, by):
 
 
 def test_the_command_prints_what_was_made_and_one_line_where_it_fails(data, predictions, tmp_path):
-    arguments = ["label", str(data), "-o", str(tmp_path / "out"), "--from", str(tmp_path / "net"), "--workers", "1"]
+    arguments = [
+        "label",
+        str(data),
+        "-o",
+        str(tmp_path / "out"),
+        "--from",
+        str(tmp_path / "net"),
+        "--workers",
+        "1",
+    ]
     done = CliRunner().invoke(app, [*arguments, "--by", "SPVCNN"])
     assert done.exit_code == 0
     assert "out: labels of 7 frames predicted by SPVCNN (carla); " in done.output
-    assert "note: evaluation/, evaluation_8x4x3/ left out, because of other labels or classes" in done.output
+    assert (
+        "note: evaluation/, evaluation_8x4x3/ left out, because of other labels or classes"
+        in done.output
+    )
     again = CliRunner().invoke(app, arguments)
     assert again.exit_code == 1 and "`--overwrite`" in again.output
     printed = CliRunner().invoke(app, [*arguments, "--overwrite", "--json"])
     assert json.loads(printed.output)["frames"] == 7
     np.save(tmp_path / "net" / WHOLE / "000005.npy", np.ones((1001, 23), np.float32))
     failed = CliRunner().invoke(app, [*arguments, "--overwrite"])
-    assert failed.exit_code == 1 and "000005.npy" in failed.output and "give `--logits`" in failed.output
+    assert (
+        failed.exit_code == 1
+        and "000005.npy" in failed.output
+        and "give `--logits`" in failed.output
+    )
     wrong = CliRunner().invoke(app, [*arguments, "--overwrite", "--classes", "kitti"])
     assert wrong.exit_code == 2 and "--classes: expected one of carla" in wrong.output

@@ -36,7 +36,9 @@ def test_the_golden_text_files_are_written_as_they_stand(golden_capture):
         assert encode(decode(data, name)) == data
 
 
-@pytest.mark.parametrize("field", [f for f in layout.SCAN_FIELDS.values() if f.dtype], ids=lambda field: field.name)
+@pytest.mark.parametrize(
+    "field", [f for f in layout.SCAN_FIELDS.values() if f.dtype], ids=lambda field: field.name
+)
 @given(rows=st.integers(0, 7), seed=st.integers(0, 99))
 def test_scan_fields_come_back(field, rows, seed):
     shape = (rows,) if field.columns is None else (rows, field.columns)
@@ -49,11 +51,17 @@ def test_scan_fields_come_back(field, rows, seed):
 @pytest.mark.parametrize("part, nbytes", [("occupied", 2), ("flags", 1), ("views", 2)])
 def test_fields_per_voxel_come_back_as_they_are_on_disk(part, nbytes):
     field = layout.field_named(f"evaluation/{part}")
-    array = np.random.default_rng(0).integers(0, 2 ** (8 * nbytes), (2, 3, 4)).astype(f"<u{nbytes}").view(field.dtype)
+    array = (
+        np.random.default_rng(0)
+        .integers(0, 2 ** (8 * nbytes), (2, 3, 4))
+        .astype(f"<u{nbytes}")
+        .view(field.dtype)
+    )
     data = bytes(field.encode(array, "x"))
     assert data == array.tobytes()
     assert field.decode(data, "x", (2, 3, 4)).tobytes() == data
-    assert layout.frame_of(field.file(3).partition("/")[2], ".bin") is None  # it is not a file of counts
+    # it is not a file of counts
+    assert layout.frame_of(field.file(3).partition("/")[2], ".bin") is None
 
 
 def test_probabilities_are_rounded_to_float16_when_they_are_written():
@@ -92,7 +100,9 @@ def test_velocities_come_back_bit_for_bit():
             assert file.files == ["voxel", "velocity"] and file["velocity"].shape == (count, 3)
     with pytest.raises(FormatError, match="v.npz: voxel: expected at most 2 values, found 3"):
         field.decode(data, "v.npz", (1, 1, 2))
-    with pytest.raises(FormatError, match="v.npz: expected a table of voxel and velocity, found float32"):
+    with pytest.raises(
+        FormatError, match="v.npz: expected a table of voxel and velocity, found float32"
+    ):
         field.encode(np.zeros((2, 4), np.float32), "v.npz")
 
 
@@ -107,7 +117,9 @@ def test_boxes_come_back_bit_for_bit():
 
 def test_boxes_of_another_size_or_type_are_refused():
     field = layout.field_named("boxes")
-    with pytest.raises(FormatError, match=r"boxes/0.bin: expected a multiple of 89 bytes \(one box\), found 90"):
+    with pytest.raises(
+        FormatError, match=r"boxes/0.bin: expected a multiple of 89 bytes \(one box\), found 90"
+    ):
         field.decode(bytes(90), "boxes/0.bin")
     with pytest.raises(FormatError, match="expected a table of boxes, found float64"):
         field.encode(np.zeros((2, 13)), "boxes/0.bin")
@@ -118,7 +130,9 @@ def test_boxes_of_another_size_or_type_are_refused():
 def test_file_names_are_those_of_the_format():
     assert layout.field_named("points").file(7) == "velodyne/000007.bin"
     assert layout.field_named("flow").file(7) == "predictions/000007.bin"
-    assert layout.field_named("evaluation_64x64x8/counts").file(12) == "evaluation_64x64x8/000012.bin"
+    assert (
+        layout.field_named("evaluation_64x64x8/counts").file(12) == "evaluation_64x64x8/000012.bin"
+    )
     assert layout.field_named("evaluation/votes").file(1234567) == "evaluation/1234567.votes.npz"
     assert layout.grid_folder(GridSpec.published()) == "evaluation"
     assert layout.grid_folder(GridSpec.published("cylindrical")) == "evaluation"
@@ -127,14 +141,17 @@ def test_file_names_are_those_of_the_format():
     assert layout.grid_folder(GridSpec.published().with_resolution(0.4)) == "evaluation_128x128x8"
     assert layout.frame_of("000012.label", ".label") == 12
     assert [
-        layout.frame_of(name, ".label") for name in ("12.label", "000012.bin", "x00012.label", ".000012.label.part")
+        layout.frame_of(name, ".label")
+        for name in ("12.label", "000012.bin", "x00012.label", ".000012.label.part")
     ] == [None] * 4
     with pytest.raises(FormatError, match="'colour': expected one of points"):
         layout.field_named("colour")
 
 
 def test_a_file_cut_short_is_refused_with_both_sizes():
-    with pytest.raises(FormatError, match=r"a.bin: expected a multiple of 16 bytes \(4 float32 per row\), found 17"):
+    with pytest.raises(
+        FormatError, match=r"a.bin: expected a multiple of 16 bytes \(4 float32 per row\), found 17"
+    ):
         layout.field_named("points").decode(bytes(17), "a.bin")
     with pytest.raises(FormatError, match=r"expected 96 bytes \(2 x 3 x 4 uint32\), found 92"):
         layout.field_named("evaluation/labels").decode(bytes(92), "a.label", (2, 3, 4))
@@ -150,7 +167,9 @@ def test_arrays_that_do_not_fit_are_refused():
 
 
 def test_broken_lines_are_named():
-    with pytest.raises(FormatError, match="poses.txt: expected 12 numbers per line, found 11 in line 2"):
+    with pytest.raises(
+        FormatError, match="poses.txt: expected 12 numbers per line, found 11 in line 2"
+    ):
         layout.decode_poses(b"1 " * 12 + b"\n" + b"1 " * 11, "poses.txt")
     with pytest.raises(FormatError, match="times.txt: expected 1 numbers per line"):
         layout.decode_times(b"zero\n", "times.txt")
@@ -166,7 +185,17 @@ def test_the_data_set_of_the_contract_tests_has_every_field(tmp_path):
 
 def test_a_field_of_images_is_a_folder_per_camera():
     field = layout.field_named("image_labels.front_left.png")
-    assert (field.file(7), field.per, field.kind) == ("image_labels/front_left/000007.png", "scan", "picture")
-    for name in ("images.front.gif", "images.jpg", "images..jpg", "pictures.front.jpg", "images.a/b.jpg"):
+    assert (field.file(7), field.per, field.kind) == (
+        "image_labels/front_left/000007.png",
+        "scan",
+        "picture",
+    )
+    for name in (
+        "images.front.gif",
+        "images.jpg",
+        "images..jpg",
+        "pictures.front.jpg",
+        "images.a/b.jpg",
+    ):
         with pytest.raises(FormatError, match="expected one of"):
             layout.field_named(name)

@@ -53,13 +53,17 @@ class CarlascMachine(StoreMachine):
         assert contents(packed) == contents(folder / "unpacked") == contents(self.out)
 
     def _regrid(self, folder: Path) -> None:
-        """Make coarser grids from the store, and compare them with those from plain files of the same arrays."""
+        """Make coarser grids from the store, and compare them with those from plain files of the
+        same arrays.
+        """
         whole = {
             path
             for path, field, frame in self.model
             if field == f"{GRID}/labels" and (path, f"{GRID}/counts", frame) in self.model
         }
-        if not whole or whole != {path for path, name in self.documents if name == f"{GRID}/params.json"}:
+        if not whole or whole != {
+            path for path, name in self.documents if name == f"{GRID}/params.json"
+        }:
             return  # regrid refuses a sequence with a grid of no whole frame
         sink = FolderSink(folder / "plain")
         for (path, name), data in self.documents.items():
@@ -67,11 +71,14 @@ class CarlascMachine(StoreMachine):
         for (path, field, frame), array in self.model.items():
             sink.sequence(path).write(field, frame, array)
         for source, out in ((folder / "plain", folder / "wanted"), (self.out, folder / "made")):
-            carlasc.regrid(source, COARSE, out, observe=FromGrid(GRID), name="coarse", run=Run(workers=1))
+            carlasc.regrid(
+                source, COARSE, out, observe=FromGrid(GRID), name="coarse", run=Run(workers=1)
+            )
         assert contents(folder / "made") == contents(folder / "wanted")
 
 
-PHASES = (Phase.generate,)  # add Phase.shrink to see the shortest sequence that fails, which takes minutes
+# add Phase.shrink to see the shortest sequence that fails, which takes minutes
+PHASES = (Phase.generate,)
 MACHINES: dict[str, dict[str, Any]] = {
     "": {"reopens": True, "immediate": True},
     ".zarr": {"reopens": True},
@@ -82,7 +89,13 @@ MACHINES: dict[str, dict[str, Any]] = {
 
 def run(ending: str, examples: int) -> None:
     machine = type("Machine", (CarlascMachine,), {"ending": ending, **MACHINES[ending]})
-    chosen = settings(max_examples=examples, stateful_step_count=15, derandomize=True, database=None, phases=PHASES)
+    chosen = settings(
+        max_examples=examples,
+        stateful_step_count=15,
+        derandomize=True,
+        database=None,
+        phases=PHASES,
+    )
     run_state_machine_as_test(machine, settings=chosen)
 
 
@@ -93,7 +106,9 @@ def test_a_store_has_what_a_model_in_memory_has_after_kills_and_resumed_runs(end
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ending", MACHINES)
-def test_a_store_has_what_a_model_in_memory_has_after_many_kills_and_resumed_runs(ending: str) -> None:
+def test_a_store_has_what_a_model_in_memory_has_after_many_kills_and_resumed_runs(
+    ending: str,
+) -> None:
     run(ending, 150)
 
 

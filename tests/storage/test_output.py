@@ -8,7 +8,9 @@ from carlasc.errors import StorageError
 from carlasc.storage.packed.output import PatientFile
 
 
-def test_a_file_that_cannot_be_created_can_be_closed_as_python_does_when_it_forgets_it(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_created_can_be_closed_as_python_does_when_it_forgets_it(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "folder").write_bytes(b"a file")
     file = PatientFile.__new__(PatientFile)
     with pytest.raises(StorageError, match="cannot be written"):

@@ -45,15 +45,21 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("part", ["cartesian", "cylindrical", "cartesian_fine", "cartesian_step0.5"])
-def test_the_golden_files_come_back_byte_for_byte(golden_capture: Path, tmp_path: Path, kind: str, part: str) -> None:
+@pytest.mark.parametrize(
+    "part", ["cartesian", "cylindrical", "cartesian_fine", "cartesian_step0.5"]
+)
+def test_the_golden_files_come_back_byte_for_byte(
+    golden_capture: Path, tmp_path: Path, kind: str, part: str
+) -> None:
     wanted = files_of(golden_capture / part)
     assert wanted
     assert round_trip(golden_capture / part, tmp_path / f"x.{kind}") == wanted
 
 
 @pytest.mark.parametrize(("kind", "small"), [*((kind, False) for kind in KINDS), ("zarr", True)])
-def test_several_sequences_come_back_byte_for_byte(data: Path, tmp_path: Path, kind: str, small: bool) -> None:
+def test_several_sequences_come_back_byte_for_byte(
+    data: Path, tmp_path: Path, kind: str, small: bool
+) -> None:
     assert round_trip(data, tmp_path / f"x.{kind}", small=small) == files_of(data)
 
 
@@ -74,38 +80,66 @@ def test_one_sequence_keeps_its_name_though_its_path_is_empty(data: Path, tmp_pa
     assert (sequence.path, sequence.split, sequence.name) == ("", "Train", "Town01_Light")
 
 
-any_float32 = st.floats(width=32, allow_nan=True, allow_infinity=True) | st.sampled_from([0.0, -0.0])
-counts = st.sampled_from([0, 1, 2, 3, 255, 256, 65536, 2**24, 0.5, -0.0, -1.0, float("nan"), float("inf")])
+any_float32 = st.floats(width=32, allow_nan=True, allow_infinity=True) | st.sampled_from(
+    [0.0, -0.0]
+)
+counts = st.sampled_from(
+    [0, 1, 2, 3, 255, 256, 65536, 2**24, 0.5, -0.0, -1.0, float("nan"), float("inf")]
+)
 labels = st.sampled_from([0, 1, 22, 255, 256, 65535, 65536, 2**32 - 1]) | st.integers(0, 30)
 
 
 @st.composite
 def frames(draw: st.DrawFn) -> list[dict[str, np.ndarray]]:
-    """A few frames of a sequence: each field in some frames, every bit pattern that the published types can hold."""
-    have = draw(st.sets(st.sampled_from(["labels", "flow", "instances", "bev", "evaluation", "fine", "fourth"])))
+    """A few frames of a sequence: each field in some frames, every bit pattern that the published
+    types can hold.
+    """
+    have = draw(
+        st.sets(
+            st.sampled_from(["labels", "flow", "instances", "bev", "evaluation", "fine", "fourth"])
+        )
+    )
     found = []
     for _ in range(draw(st.integers(1, 4))):
         count = draw(st.sampled_from([0, 1, 2, 7, 31, 257]))
         frame: dict[str, np.ndarray] = {"points": np.zeros((count, 4), np.float32)}
-        frame["points"][:, :3] = draw(arrays.arrays(np.float32, (count, 3), elements=any_float32, fill=st.just(1.5)))
+        frame["points"][:, :3] = draw(
+            arrays.arrays(np.float32, (count, 3), elements=any_float32, fill=st.just(1.5))
+        )
         if "fourth" in have:
-            frame["points"][:, 3] = draw(arrays.arrays(np.float32, count, elements=any_float32, fill=st.just(0.0)))
+            frame["points"][:, 3] = draw(
+                arrays.arrays(np.float32, count, elements=any_float32, fill=st.just(0.0))
+            )
         if count and draw(st.booleans()):
+            # NaN payloads
             frame["points"].view(np.uint32)[0, draw(st.integers(0, 2))] = draw(
                 st.integers(0, 2**32 - 1)
-            )  # NaN payloads
+            )
         if "labels" in have and draw(st.booleans()):
-            frame["labels"] = draw(arrays.arrays(np.uint32, count, elements=labels, fill=st.just(7)))
+            frame["labels"] = draw(
+                arrays.arrays(np.uint32, count, elements=labels, fill=st.just(7))
+            )
         if "flow" in have:
-            frame["flow"] = draw(arrays.arrays(np.float32, (count, 3), elements=any_float32, fill=st.just(0.0)))
+            frame["flow"] = draw(
+                arrays.arrays(np.float32, (count, 3), elements=any_float32, fill=st.just(0.0))
+            )
         if "instances" in have:
-            frame["instances"] = draw(arrays.arrays(np.uint32, count, elements=labels, fill=st.just(0)))
+            frame["instances"] = draw(
+                arrays.arrays(np.uint32, count, elements=labels, fill=st.just(0))
+            )
         if "bev" in have:
             frame["bev"] = np.frombuffer(draw(st.binary(max_size=60)), np.uint8)
-        for name, folder, size in (("evaluation", "evaluation", SIZE), ("fine", "evaluation_6x10x4", (6, 10, 4))):
+        for name, folder, size in (
+            ("evaluation", "evaluation", SIZE),
+            ("fine", "evaluation_6x10x4", (6, 10, 4)),
+        ):
             if name in have and draw(st.booleans()):
-                frame[f"{folder}/labels"] = draw(arrays.arrays(np.uint32, size, elements=labels, fill=st.just(0)))
-                frame[f"{folder}/counts"] = draw(arrays.arrays(np.float32, size, elements=counts, fill=st.just(0)))
+                frame[f"{folder}/labels"] = draw(
+                    arrays.arrays(np.uint32, size, elements=labels, fill=st.just(0))
+                )
+                frame[f"{folder}/counts"] = draw(
+                    arrays.arrays(np.float32, size, elements=counts, fill=st.just(0))
+                )
         found.append(frame)
     return found
 
@@ -114,18 +148,26 @@ def frames(draw: st.DrawFn) -> list[dict[str, np.ndarray]]:
 @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 @given(sequence=frames(), poses=st.binary(max_size=30), first=st.sampled_from([0, 7, 999_998]))
 def test_odd_shapes_and_every_bit_pattern_come_back(
-    tmp_path_factory: pytest.TempPathFactory, kind: str, small: bool, sequence: list[dict], poses: bytes, first: int
+    tmp_path_factory: pytest.TempPathFactory,
+    kind: str,
+    small: bool,
+    sequence: list[dict],
+    poses: bytes,
+    first: int,
 ) -> None:
     folder = tmp_path_factory.mktemp("odd")
     writer = FolderSink(folder / "data").sequence(PATH)
-    writer.write_document("poses.txt", poses)  # any bytes come back, even if no program can read them
+    # any bytes come back, even if no program can read them
+    writer.write_document("poses.txt", poses)
     for name, size in (("evaluation", SIZE), ("evaluation_6x10x4", (6, 10, 4))):
         if any(f"{name}/labels" in frame for frame in sequence):
             writer.write_document(f"{name}/params.json", params(size) + b"\n ")
     for number, frame in enumerate(sequence, first):
         for name, array in frame.items():
             writer.write(name, number, array)
-    assert round_trip(folder / "data", folder / f"x.{kind}", small=small) == files_of(folder / "data")
+    assert round_trip(folder / "data", folder / f"x.{kind}", small=small) == files_of(
+        folder / "data"
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -155,7 +197,9 @@ def test_labels_of_any_size_come_back(tmp_path: Path, kind: str, largest: int) -
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_quantised_points_are_within_half_a_step_and_say_so(data: Path, tmp_path: Path, kind: str) -> None:
+def test_quantised_points_are_within_half_a_step_and_say_so(
+    data: Path, tmp_path: Path, kind: str
+) -> None:
     pack(data, tmp_path / f"x.{kind}", lossy_mm=1)
     unpack(tmp_path / f"x.{kind}", tmp_path / "files")
     before, after = FolderSource(data).sequences(), FolderSource(tmp_path / "files").sequences()
@@ -181,31 +225,49 @@ def test_points_that_cannot_be_quantised_are_refused_by_name(tmp_path: Path, kin
         pack(tmp_path / "data", tmp_path / f"x.{kind}", lossy_mm=1)
 
 
-def test_the_result_counts_bytes_per_field_and_lists_what_is_left_out(data: Path, tmp_path: Path) -> None:
+def test_the_result_counts_bytes_per_field_and_lists_what_is_left_out(
+    data: Path, tmp_path: Path
+) -> None:
     root = write_dataset(tmp_path / "data")
     (root / PATH / "notes.txt").write_text("mine")
     steps: list[tuple[int, int]] = []
-    result = pack(root, tmp_path / "x.zarr", run=Run(progress=lambda done, total: steps.append((done, total))))
+    result = pack(
+        root, tmp_path / "x.zarr", run=Run(progress=lambda done, total: steps.append((done, total)))
+    )
     files = files_of(root)
     assert result.left_out == [f"{PATH}: notes.txt"]
     assert result.sequences == sorted(carlasc.open(root).sequences())
     assert result.frames == 4 + 3 + 2
-    assert result.published_bytes["points"] == sum(len(d) for n, d in files.items() if "velodyne" in n)
-    assert result.published_bytes["flow"] == sum(len(d) for n, d in files.items() if "predictions" in n)
+    assert result.published_bytes["points"] == sum(
+        len(d) for n, d in files.items() if "velodyne" in n
+    )
+    assert result.published_bytes["flow"] == sum(
+        len(d) for n, d in files.items() if "predictions" in n
+    )
     assert (
         result.published_bytes["documents"]
         == sum(len(d) for n, d in files.items() if n.endswith((".txt", ".json"))) - 4
     )
-    assert sum(result.stored_bytes.values()) == sum(map(len, files_of(tmp_path / "x.zarr").values()))
+    assert sum(result.stored_bytes.values()) == sum(
+        map(len, files_of(tmp_path / "x.zarr").values())
+    )
     assert (
         steps[-1][0]
         == steps[-1][1]
-        == len([n for n in files if n.endswith((".bin", ".label", ".jpg", ".npz", ".instance", ".png", ".seen"))])
+        == len(
+            [
+                n
+                for n in files
+                if n.endswith((".bin", ".label", ".jpg", ".npz", ".instance", ".png", ".seen"))
+            ]
+        )
     )
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_existing_store_is_replaced_only_with_overwrite(data: Path, tmp_path: Path, kind: str) -> None:
+def test_an_existing_store_is_replaced_only_with_overwrite(
+    data: Path, tmp_path: Path, kind: str
+) -> None:
     out = tmp_path / f"x.{kind}"
     pack(data / "Val", out)
     with pytest.raises(ConflictError, match=r"give `overwrite=True`"):
@@ -216,7 +278,9 @@ def test_an_existing_store_is_replaced_only_with_overwrite(data: Path, tmp_path:
     assert [entry.name for entry in tmp_path.iterdir()] == [out.name]
 
 
-def test_an_existing_folder_is_unpacked_into_only_with_overwrite(data: Path, tmp_path: Path) -> None:
+def test_an_existing_folder_is_unpacked_into_only_with_overwrite(
+    data: Path, tmp_path: Path
+) -> None:
     pack(data / "Val", tmp_path / "x.zarr")
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "mine.txt").write_text("mine")
@@ -256,16 +320,21 @@ def test_a_grid_whose_size_changes_is_an_error(tmp_path: Path, kind: str) -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_output_that_cannot_be_written_is_one_clear_error(data: Path, tmp_path: Path, kind: str) -> None:
+def test_an_output_that_cannot_be_written_is_one_clear_error(
+    data: Path, tmp_path: Path, kind: str
+) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(
-        CarlascError, match=rf"x\.{kind}(/zarr\.json)?: cannot be written: (Not a directory|File exists)"
+        CarlascError,
+        match=rf"x\.{kind}(/zarr\.json)?: cannot be written: (Not a directory|File exists)",
     ):
         pack(data / "Val", tmp_path / "file" / f"x.{kind}")
 
 
 @pytest.mark.parametrize("path", ["../evil", "/tmp/evil", "Train/../../evil"])
-def test_a_store_whose_names_lead_elsewhere_is_not_unpacked(data: Path, tmp_path: Path, path: str) -> None:
+def test_a_store_whose_names_lead_elsewhere_is_not_unpacked(
+    data: Path, tmp_path: Path, path: str
+) -> None:
     root = pack(data / "Val", tmp_path / "x.zarr").out / "zarr.json"
     node = json.loads(root.read_bytes())
     node["attributes"]["sequences"] = {path: next(iter(node["attributes"]["sequences"].values()))}
@@ -293,7 +362,9 @@ def test_a_killed_pack_leaves_no_store_and_a_second_run_finishes_it(
     data: Path, tmp_path: Path, kind: str, files: int
 ) -> None:
     out = tmp_path / f"x.{kind}"
-    killed = subprocess.run([sys.executable, "-c", KILLED, "pack", data, out, str(files)], check=False)
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, "pack", data, out, str(files)], check=False
+    )
     assert killed.returncode == -signal.SIGKILL
     assert out.exists() is (kind == "zarr")
     with pytest.raises(CarlascError, match="run the same command again"):
@@ -312,18 +383,24 @@ def test_a_second_run_does_not_pack_blocks_again(data: Path, tmp_path: Path) -> 
 
 
 def test_what_another_source_left_is_not_mixed_with_this_one(data: Path, tmp_path: Path) -> None:
-    subprocess.run([sys.executable, "-c", KILLED, "pack", data, tmp_path / "x.zarr", "1"], check=False)
+    subprocess.run(
+        [sys.executable, "-c", KILLED, "pack", data, tmp_path / "x.zarr", "1"], check=False
+    )
     other = write_dataset(tmp_path / "other", seed=1)
     (other / PATH / "carlasc.json").write_bytes(b"{}")
     with pytest.raises(
-        ConflictError, match=r"carlasc\.json: expected the text file of this source, found a different file"
+        ConflictError,
+        match=r"carlasc\.json: expected the text file of this source, found a different file",
     ):
         pack(other, tmp_path / "x.zarr")
 
 
 def test_a_killed_unpack_continues_file_by_file(data: Path, tmp_path: Path) -> None:
     pack(data, tmp_path / "x.zarr")
-    subprocess.run([sys.executable, "-c", KILLED, "unpack", tmp_path / "x.zarr", tmp_path / "files", "20"], check=False)
+    subprocess.run(
+        [sys.executable, "-c", KILLED, "unpack", tmp_path / "x.zarr", tmp_path / "files", "20"],
+        check=False,
+    )
     assert not (tmp_path / "files").exists()
     result = unpack(tmp_path / "x.zarr", tmp_path / "files")
     assert result.kept >= 20
@@ -340,8 +417,16 @@ def test_the_memory_does_not_grow_with_the_sequence(tmp_path: Path) -> None:
         writer = FolderSink(tmp_path / f"data{count}").sequence(PATH)
         for frame in range(count):
             writer.write("points", frame, points)
-        command = [sys.executable, "-c", script, tmp_path / f"data{count}", tmp_path / f"x{count}.h5"]
-        peaks.append(int(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+        command = [
+            sys.executable,
+            "-c",
+            script,
+            tmp_path / f"data{count}",
+            tmp_path / f"x{count}.h5",
+        ]
+        peaks.append(
+            int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        )
     unit = 1 if sys.platform == "darwin" else 1024
     assert (peaks[1] - peaks[0]) * unit < 40 << 20  # bytes, where the files have 128 MB more
 
@@ -353,17 +438,28 @@ def test_the_command_line_packs_and_unpacks(data: Path, tmp_path: Path) -> None:
     packed = runner.invoke(app, ["pack", str(data), str(tmp_path / "x.zarr")])
     assert packed.exit_code == 0, packed.output
     assert "3 sequences, 9 frames" in packed.output
-    unpacked = runner.invoke(app, ["unpack", str(tmp_path / "x.zarr"), str(tmp_path / "files"), "--json"])
+    unpacked = runner.invoke(
+        app, ["unpack", str(tmp_path / "x.zarr"), str(tmp_path / "files"), "--json"]
+    )
     assert unpacked.exit_code == 0, unpacked.output
     assert json.loads(unpacked.output)["files"] == len(
-        [n for n in files_of(data) if n.endswith((".bin", ".label", ".jpg", ".npz", ".instance", ".png", ".seen"))]
+        [
+            n
+            for n in files_of(data)
+            if n.endswith((".bin", ".label", ".jpg", ".npz", ".instance", ".png", ".seen"))
+        ]
     )
     assert files_of(tmp_path / "files") == files_of(data)
 
 
 @pytest.mark.parametrize(
     ("arguments", "code"),
-    [(["x.npz"], 2), (["x.h5", "--small"], 2), (["x.zarr", "--lossy-mm", "-1"], 2), (["taken.zarr"], 1)],
+    [
+        (["x.npz"], 2),
+        (["x.h5", "--small"], 2),
+        (["x.zarr", "--lossy-mm", "-1"], 2),
+        (["taken.zarr"], 1),
+    ],
 )
 def test_the_command_line_tells_wrong_usage_from_failure(
     data: Path, tmp_path: Path, arguments: list[str], code: int
@@ -378,7 +474,9 @@ def test_the_command_line_tells_wrong_usage_from_failure(
 
 
 @pytest.mark.parametrize("kind", ["h5", "parquet"])
-def test_only_zarr_has_a_small_kind_and_the_command_names_the_option(data: Path, tmp_path: Path, kind: str) -> None:
+def test_only_zarr_has_a_small_kind_and_the_command_names_the_option(
+    data: Path, tmp_path: Path, kind: str
+) -> None:
     result = runner.invoke(app, ["pack", str(data), str(tmp_path / f"x.{kind}"), "--small"])
     assert result.exit_code == 2
     assert result.stderr.startswith("carlasc: --small: expected a .zarr store")
@@ -389,7 +487,10 @@ def test_only_zarr_has_a_small_kind_and_the_command_names_the_option(data: Path,
 def test_stores_of_one_writer_take_no_executor(data: Path, tmp_path: Path, kind: str) -> None:
     with (
         ThreadPoolExecutor(1) as executor,
-        pytest.raises(ArgumentError, match=r"executor: expected a \.zarr store, which several processes can write"),
+        pytest.raises(
+            ArgumentError,
+            match=r"executor: expected a \.zarr store, which several processes can write",
+        ),
     ):
         pack(data, tmp_path / f"x.{kind}", run=Run(executor=executor))
     assert not list(tmp_path.iterdir())
@@ -403,7 +504,9 @@ def test_results_say_how_long_it_took(data: Path, tmp_path: Path) -> None:
     assert packed.elapsed_s + unpacked.elapsed_s <= time.perf_counter() - began
 
 
-def test_unpacking_over_a_folder_replaces_its_files_and_counts_them(data: Path, tmp_path: Path) -> None:
+def test_unpacking_over_a_folder_replaces_its_files_and_counts_them(
+    data: Path, tmp_path: Path
+) -> None:
     pack(data / "Val", tmp_path / "x.h5")
     first = unpack(tmp_path / "x.h5", tmp_path / "files")
     assert (first.files, first.kept) == (15, 0)
@@ -427,7 +530,9 @@ def test_a_continued_unpacking_counts_the_files_that_it_kept(data: Path, tmp_pat
     next((tmp_path / "files.part").rglob("000001.label")).unlink()
     steps: list[tuple[int, int]] = []
     result = unpack(
-        tmp_path / "x.h5", tmp_path / "files", run=Run(progress=lambda done, total: steps.append((done, total)))
+        tmp_path / "x.h5",
+        tmp_path / "files",
+        run=Run(progress=lambda done, total: steps.append((done, total))),
     )
     assert (result.files, result.kept) == (1, 14)
     assert steps[-1] == (15, 15)
@@ -438,7 +543,9 @@ def test_the_limits_of_quantisation(millimetres: float) -> None:
     assert PackOptions(lossy_mm=millimetres).scale_m == millimetres / 1000
 
 
-def test_leftovers_of_an_older_replacement_are_removed_and_a_copy_of_the_user_stays(data: Path, tmp_path: Path) -> None:
+def test_leftovers_of_an_older_replacement_are_removed_and_a_copy_of_the_user_stays(
+    data: Path, tmp_path: Path
+) -> None:
     pack(data / "Val", tmp_path / "x.h5")
     for name in ("x.h5.replaced", "x.h5.old"):
         (tmp_path / name).mkdir()

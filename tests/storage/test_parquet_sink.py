@@ -47,10 +47,18 @@ def test_frames_are_rows_with_pose_time_and_statistics(published: Path, packed: 
         assert row["points"] == len(points)
         assert row["moving_points"] == (flow != 0).any(axis=1).sum()
         if len(points):
-            assert row["farthest_m"] == pytest.approx(np.linalg.norm(points[:, :3], axis=1).max(), rel=1e-6)
+            assert row["farthest_m"] == pytest.approx(
+                np.linalg.norm(points[:, :3], axis=1).max(), rel=1e-6
+            )
         if frame in reference.frames("evaluation/labels"):
-            assert row["evaluation_known_voxels"] == (reference.read("evaluation/counts", frame) > 0).sum()
-            assert row["evaluation_occupied_voxels"] == (reference.read("evaluation/labels", frame) > 0).sum()
+            assert (
+                row["evaluation_known_voxels"]
+                == (reference.read("evaluation/counts", frame) > 0).sum()
+            )
+            assert (
+                row["evaluation_occupied_voxels"]
+                == (reference.read("evaluation/labels", frame) > 0).sum()
+            )
         else:
             assert row["evaluation_known_voxels"] is None
 
@@ -60,7 +68,8 @@ def test_any_parquet_reader_gets_points_as_columns(published: Path, packed: Path
     table = parquet.read_table(packed / WHOLE / "points.parquet", filters=[("frame", "=", 5)])
     assert table.column_names == ["sequence", "frame", "x", "y", "z", "fourth"]
     assert np.array_equal(
-        np.stack([table[axis].to_numpy() for axis in "xyz"], axis=1), reference.read("points", 5)[:, :3]
+        np.stack([table[axis].to_numpy() for axis in "xyz"], axis=1),
+        reference.read("points", 5)[:, :3],
     )
 
 
@@ -80,7 +89,8 @@ def test_a_second_run_goes_on_with_the_numbers_of_the_first(tmp_path: Path) -> N
     with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(WHOLE) as writer:
         writer.write("labels", 0, labels)
     numbers = [
-        parquet.read_table(tmp_path / "x.parquet" / path / "labels.parquet")["sequence"] for path in (SCANS, WHOLE)
+        parquet.read_table(tmp_path / "x.parquet" / path / "labels.parquet")["sequence"]
+        for path in (SCANS, WHOLE)
     ]
     assert [number.to_pylist() for number in numbers] == [[0] * 3, [1] * 3]
 
@@ -90,7 +100,10 @@ def test_a_sequence_that_is_written_again_keeps_its_number(tmp_path: Path) -> No
         with ParquetSink(tmp_path / "x.parquet").sequence(path) as writer:
             writer.write("labels", 0, np.arange(3, dtype=np.uint32))
     ParquetSink(tmp_path / "x.parquet").finish()
-    tables = [parquet.read_table(tmp_path / "x.parquet" / path / "labels.parquet") for path in (SCANS, WHOLE)]
+    tables = [
+        parquet.read_table(tmp_path / "x.parquet" / path / "labels.parquet")
+        for path in (SCANS, WHOLE)
+    ]
     assert [table["sequence"].to_pylist() for table in tables] == [[0] * 3, [1] * 3]
 
 
@@ -107,7 +120,8 @@ def test_negative_zeros_and_nan_payloads_survive(tmp_path: Path) -> None:
 
 def test_a_corrupted_page_names_field_and_frame(store: Path) -> None:
     file = store / WHOLE / "points.parquet"
-    column = parquet.ParquetFile(file).metadata.row_group(2).column(3)  # the third scan that is not empty: frame 5
+    # the third scan that is not empty: frame 5
+    column = parquet.ParquetFile(file).metadata.row_group(2).column(3)
     data = bytearray(file.read_bytes())
     data[column.data_page_offset + column.total_compressed_size // 2] ^= 1
     file.write_bytes(data)
@@ -167,7 +181,9 @@ def frames_table(store: Path) -> list[dict[str, object]]:
     [(3, [0.0, 1.0, 2.0]), (4, [1.0, 2.0, 3.0]), (2, None), (0, None)],
     ids=["a line for each frame", "a line for each number", "too few lines", "none"],
 )
-def test_lines_of_text_files_are_those_of_the_frames(tmp_path: Path, lines: int, times: list[float] | None) -> None:
+def test_lines_of_text_files_are_those_of_the_frames(
+    tmp_path: Path, lines: int, times: list[float] | None
+) -> None:
     with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(SCANS) as writer:
         writer.write_document("times.txt", "".join(f"{line}\n" for line in range(lines)).encode())
         for frame in (1, 2, 3):
@@ -200,7 +216,9 @@ def test_a_table_of_another_size_than_the_grid_is_one_clear_error(store: Path) -
     data = [row["data"].replace(b"[4.0, 6.0, 2.0]", b"[4.0, 6.0, 3.0]") for row in rows.to_pylist()]
     changed = rows.set_column(1, "data", [data])
     parquet.write_table(changed.cast(rows.schema), file)
-    with pytest.raises(FormatError, match="documents.parquet: the checksum of the footer does not match"):
+    with pytest.raises(
+        FormatError, match="documents.parquet: the checksum of the footer does not match"
+    ):
         carlasc.open(store).sequences()[WHOLE].read("evaluation/labels", 5)
     seal_tables(store / WHOLE)
     with pytest.raises(FormatError, match="frame 5: expected 72 voxels, found 48"):

@@ -1,4 +1,6 @@
-"""Files of predictions: labels and probabilities are read as they are, and what does not fit is one line that names the file."""
+"""Files of predictions: labels and probabilities are read as they are, and what does not fit is one
+line that names the file.
+"""
 
 import json
 from dataclasses import replace
@@ -53,7 +55,9 @@ def test_the_three_likeliest_classes_are_kept_the_likeliest_is_the_label(tmp_pat
 def test_scores_before_the_softmax_are_refused_unless_they_are_said_to_be_such(tmp_path):
     scores = np.random.default_rng(0).normal(scale=4, size=(200, 23)).astype(np.float32)
     np.save(tmp_path / "000000.npy", scores)
-    with pytest.raises(FormatError, match=r"000000\.npy: .*sum to 1.*at point 0: give `logits=True`"):
+    with pytest.raises(
+        FormatError, match=r"000000\.npy: .*sum to 1.*at point 0: give `logits=True`"
+    ):
         CARLA_ONLY.read(tmp_path / "000000.npy", 200)
     labels, pairs = replace(CARLA_ONLY, logits=True).read(tmp_path / "000000.npy", 200)
     exact = np.exp(scores.astype(np.float64))
@@ -96,7 +100,9 @@ def test_classes_are_converted_and_the_probabilities_of_those_that_become_one_ar
     given = shares(300, 23)
     np.save(tmp_path / "000000.npy", given)
     labels, pairs = PredictionReader(CARLA, CARLASC11).read(tmp_path / "000000.npy", 300)
-    assert_array_equal(labels, to_table(given.argmax(axis=1).astype(np.uint32), CARLA, CARLASC11, "x"))
+    assert_array_equal(
+        labels, to_table(given.argmax(axis=1).astype(np.uint32), CARLA, CARLASC11, "x")
+    )
     target = to_table(np.arange(23, dtype=np.uint32), CARLA, CARLASC11, "x")
     summed = np.stack([given[:, target == k].sum(axis=1) for k in range(11)], axis=1)
     assert np.abs(pairs[:, 1::2] / CERTAIN - -np.sort(-summed, axis=1)[:, :3]).max() < 2e-5
@@ -117,7 +123,10 @@ def test_a_scan_without_points_has_predictions_without_rows(tmp_path):
         (np.array([1, -1, 2]), "class table carla, up to 22, found -1"),
         (np.array([1, 23, 2]), "class table carla, up to 22, found 23"),
         (np.eye(3, 30, 25, dtype=np.float32), "class table carla, up to 22, found 25"),
-        (np.zeros(3, np.float32), r"\(N,\) integers, or \(N, C\) floats.*found float32 of shape \(3,\)"),
+        (
+            np.zeros(3, np.float32),
+            r"\(N,\) integers, or \(N, C\) floats.*found float32 of shape \(3,\)",
+        ),
         (np.zeros((3, 23), np.uint8), r"found uint8 of shape \(3, 23\)"),
         (np.array(["a", "b", "c"]), "expected numeric values"),
     ],
@@ -171,14 +180,19 @@ ALL = FrameRange()
 def test_the_files_of_a_sequence_are_found_where_networks_write_them(sequences, tmp_path, folder):
     write(tmp_path / folder)
     found = find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)[SCANS]
-    assert found.folder == tmp_path / folder and found.frames == (0, 1, 2) and found.suffix == ".label"
+    assert (
+        found.folder == tmp_path / folder and found.frames == (0, 1, 2) and found.suffix == ".label"
+    )
 
 
 def test_predictions_of_several_sequences_are_in_folders_of_their_names(sequences, tmp_path):
     write(tmp_path / "Town07_Heavy")
     write(tmp_path / "Town01_Light", (0, 1, 2, 5), ".npz")
     found = find_predictions(tmp_path, sequences, ALL)
-    assert {path: files.folder.name for path, files in found.items()} == {SCANS: "Town07_Heavy", WHOLE: "Town01_Light"}
+    assert {path: files.folder.name for path, files in found.items()} == {
+        SCANS: "Town07_Heavy",
+        WHOLE: "Town01_Light",
+    }
 
 
 def test_a_data_set_in_the_layout_is_a_folder_of_predictions(sequences, tmp_path):
@@ -192,9 +206,7 @@ def test_a_data_set_in_the_layout_is_a_folder_of_predictions(sequences, tmp_path
 def test_frames_without_a_file_are_named_unless_they_are_left_out(sequences, tmp_path):
     write(tmp_path / "Town07_Heavy")
     write(tmp_path / "Town01_Light", (0, 1, 7))
-    message = (
-        r"expected a file for each frame, found none for 2 of 4 frames of .*cartesian \(000002, 000005\): .*`frames`"
-    )
+    message = r"expected a file for each frame, found none for 2 of 4 frames of .*cartesian \(000002, 000005\): .*`frames`"
     with pytest.raises(MissingDataError, match=message):
         find_predictions(tmp_path, sequences, ALL)
     assert find_predictions(tmp_path, sequences, FrameRange(None, 2))[WHOLE].frames == (0, 1)
@@ -204,7 +216,8 @@ def test_files_of_another_split_or_of_another_sequence_are_not_taken(sequences, 
     write(tmp_path / "Test/Town07_Heavy")
     write(tmp_path / "Val/Town03_Light")
     with pytest.raises(
-        MissingDataError, match=r"one folder of files such as Town07_Heavy/.*found Test/Town07_Heavy, Val"
+        MissingDataError,
+        match=r"one folder of files such as Town07_Heavy/.*found Test/Town07_Heavy, Val",
     ):
         find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)
 
@@ -226,7 +239,9 @@ def test_names_of_frames_have_six_digits_as_those_of_the_layout(sequences, tmp_p
         find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)
 
 
-@pytest.mark.parametrize("make", [lambda path: None, lambda path: path.write_text("x"), lambda path: path.mkdir()])
+@pytest.mark.parametrize(
+    "make", [lambda path: None, lambda path: path.write_text("x"), lambda path: path.mkdir()]
+)
 def test_a_folder_without_predictions_is_one_line(sequences, tmp_path, make):
     make(tmp_path / "x")
     with pytest.raises(MissingDataError, match="found none"):
@@ -244,5 +259,7 @@ def test_a_class_table_is_a_name_a_table_or_a_file(tmp_path):
     (tmp_path / "bad.json").write_text('{"names": {"0": "a"}}')
     with pytest.raises(FormatError, match=r"bad\.json"):
         read_table(tmp_path / "bad.json")
-    with pytest.raises(ArgumentError, match="expected one of carla, .*or a JSON file, found 'kitti'"):
+    with pytest.raises(
+        ArgumentError, match="expected one of carla, .*or a JSON file, found 'kitti'"
+    ):
         read_table("kitti")

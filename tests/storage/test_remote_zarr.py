@@ -65,7 +65,9 @@ def write(target: Target) -> None:
 
 def files_in(target: Target) -> dict[str, bytes]:
     paths = sorted(target.paths())
-    return {path: bytes(data) for path, data in zip(paths, target.tree.read_many(paths), strict=True)}
+    return {
+        path: bytes(data) for path, data in zip(paths, target.tree.read_many(paths), strict=True)
+    }
 
 
 @pytest.mark.parametrize("fault", [None, "503", "drop"])
@@ -85,7 +87,9 @@ def test_a_store_in_a_bucket_has_the_files_of_one_on_disk(
     assert files_in(target) == files_of(reference)
 
 
-def test_a_bucket_store_is_read_with_few_requests(server: FaultyServer, reference: Path, tmp_path: Path) -> None:
+def test_a_bucket_store_is_read_with_few_requests(
+    server: FaultyServer, reference: Path, tmp_path: Path
+) -> None:
     target = RemoteTarget(f"s3://{BUCKET}/{tmp_path.name}.zarr")
     target.put_many(files_of(reference))
     server.reset(lambda number, method, path: None)
@@ -94,7 +98,9 @@ def test_a_bucket_store_is_read_with_few_requests(server: FaultyServer, referenc
     assert server.requests.total() <= 8, server.requests
     server.reset(lambda number, method, path: None)
     found = sequence.read_many("points", range(32))
-    assert all(np.array_equal(array, arrays_of(frame)["points"]) for frame, array in enumerate(found))
+    assert all(
+        np.array_equal(array, arrays_of(frame)["points"]) for frame, array in enumerate(found)
+    )
     columns, shards, chunks = 2, 2, 32 + 7
     assert server.requests.total() <= columns * shards + chunks, server.requests
     server.reset(lambda number, method, path: None)
@@ -103,9 +109,14 @@ def test_a_bucket_store_is_read_with_few_requests(server: FaultyServer, referenc
 
 
 @pytest.mark.slow
-def test_packing_to_a_bucket_and_back(server: FaultyServer, reference: Path, tmp_path: Path) -> None:
+def test_packing_to_a_bucket_and_back(
+    server: FaultyServer, reference: Path, tmp_path: Path
+) -> None:
     out = f"s3://{BUCKET}/{tmp_path.name}.zarr"
-    there, here = pack(reference, out, run=Run(workers=1)), pack(reference, tmp_path / "x.zarr", run=Run(workers=1))
+    there, here = (
+        pack(reference, out, run=Run(workers=1)),
+        pack(reference, tmp_path / "x.zarr", run=Run(workers=1)),
+    )
     assert there.out == out
     assert (there.stored_bytes, there.published_bytes) == (here.stored_bytes, here.published_bytes)
     assert files_in(RemoteTarget(out)) == files_of(tmp_path / "x.zarr")
@@ -124,7 +135,9 @@ def test_nothing_but_a_store_is_written_to(server: FaultyServer, tmp_path: Path)
     target = RemoteTarget(f"s3://{BUCKET}/{tmp_path.name}.zarr")
     target.put("photo.jpg", b"1")
     for overwrite in (False, True):
-        with pytest.raises(ConflictError, match=r"expected a new path, or a packed store, found photo\.jpg"):
+        with pytest.raises(
+            ConflictError, match=r"expected a new path, or a packed store, found photo\.jpg"
+        ):
             ZarrSink(target, overwrite=overwrite)
     assert files_in(target) == {"photo.jpg": b"1"}
 

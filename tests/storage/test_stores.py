@@ -25,10 +25,19 @@ from carlasc.testing.data import SCANS, WHOLE
 
 PACKAGES = {"zarr": "zarr", "h5": "hdf5plugin", "parquet": "pyarrow"}
 KINDS = [
-    pytest.param(kind, marks=pytest.mark.skipif(find_spec(name) is None, reason=f"{name} is not installed"))
+    pytest.param(
+        kind, marks=pytest.mark.skipif(find_spec(name) is None, reason=f"{name} is not installed")
+    )
     for kind, name in PACKAGES.items()
 ]
-OUTSIDE = ["../victim", "Train/../../victim", "/victim", "C:victim", "Train\\..\\..\\victim", "Train/a\0b"]
+OUTSIDE = [
+    "../victim",
+    "Train/../../victim",
+    "/victim",
+    "C:victim",
+    "Train\\..\\..\\victim",
+    "Train/a\0b",
+]
 
 
 class Renamed(Source):
@@ -49,7 +58,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", OUTSIDE)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_sequence_whose_path_leads_elsewhere_is_not_packed(data: Path, tmp_path: Path, kind: str, name: str) -> None:
+def test_a_sequence_whose_path_leads_elsewhere_is_not_packed(
+    data: Path, tmp_path: Path, kind: str, name: str
+) -> None:
     (tmp_path / "victim").mkdir()
     (tmp_path / "victim" / "diary.txt").write_text("mine")
     with pytest.raises(FormatError, match="leads out of the store"):
@@ -59,14 +70,18 @@ def test_a_sequence_whose_path_leads_elsewhere_is_not_packed(data: Path, tmp_pat
 
 
 @pytest.mark.parametrize("name", OUTSIDE)
-def test_a_sequence_whose_path_leads_elsewhere_is_not_unpacked(data: Path, tmp_path: Path, name: str) -> None:
+def test_a_sequence_whose_path_leads_elsewhere_is_not_unpacked(
+    data: Path, tmp_path: Path, name: str
+) -> None:
     with pytest.raises(FormatError, match="leads out of it"):
         unpack(Renamed(data, name), tmp_path / "files")
     assert not files_of(tmp_path)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_fields_and_text_files_whose_names_lead_elsewhere_are_not_written(tmp_path: Path, kind: str) -> None:
+def test_fields_and_text_files_whose_names_lead_elsewhere_are_not_written(
+    tmp_path: Path, kind: str
+) -> None:
     writer = open_sink(tmp_path / f"x.{kind}", PackOptions(), False).sequence(SCANS)
     with pytest.raises(FormatError, match="leads out of the store"):
         writer.write("../../../../victim/labels", 0, np.zeros((2, 2, 2), np.uint32))
@@ -88,7 +103,9 @@ def node(root: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("entry", ["group", "field", "document"])
-def test_a_store_with_names_that_lead_elsewhere_is_not_read(data: Path, tmp_path: Path, entry: str) -> None:
+def test_a_store_with_names_that_lead_elsewhere_is_not_read(
+    data: Path, tmp_path: Path, entry: str
+) -> None:
     pytest.importorskip("zarr")
 
     def change(root: dict[str, Any]) -> None:
@@ -174,19 +191,27 @@ def make_larger(root: dict[str, Any]) -> None:
     ("change", "message"),
     [
         (remove_chunk, "expected a chunk size above 0, found None: the store is damaged"),
-        (forget_columns, r"expected \(4, 0\) numbers of elements, with ascending frame numbers, found other values"),
+        (
+            forget_columns,
+            r"expected \(4, 0\) numbers of elements, with ascending frame numbers, found other "
+            r"values",
+        ),
         (shorten, r"xyz: expected <f4 with room for frame 5, found <f4 of shape \(5, 3, 262144\)"),
         (flatten, r"expected <f4 with room for frame 5, found <f4 of shape \(16, 2, "),
         (widen, r"expected <f4 with room for frame 5, found <f8"),
         (make_larger, "the checksum does not match|found none: the store is damaged"),
         (
             take_completeness,
-            "expected a finished store, found an unfinished one: a run is writing it, or was interrupted",
+            "expected a finished store, found an unfinished one: a run is writing it, or was "
+            "interrupted",
         ),
         (change_type, "expected the sequence that the store lists"),
         (remove_split, "expected the attribute split, found none: the store is damaged"),
         (change_kind, "expected a field of kind points, found 'values'"),
-        (make_big_endian, r"expected the codecs and chunks that carlasc writes, found something else \(codecs"),
+        (
+            make_big_endian,
+            r"expected the codecs and chunks that carlasc writes, found something else \(codecs",
+        ),
         (change_codec, r"found something else \(codecs bytes, gzip, crc32c\)"),
         (remove_array, "expected an array, found none"),
         (remove_field, "expected the field that the sequence lists, found none"),
@@ -236,11 +261,20 @@ SEQUENCE = "Town01_Light/cartesian"
         (
             "frames",
             [0, 1, 2],
-            r"expected \(3, [0-9]+\) numbers of elements, with ascending frame numbers, found other values",
+            r"expected \(3, [0-9]+\) numbers of elements, with ascending frame numbers, found "
+            r"other values",
         ),
         ("counts", [0, 1, 777, 2**40], "expected u1 with room for frame 5"),
-        ("counts", [1, 1, 777, 1001], r"frame 0.*expected chunk 0 of .*values, found none: the store is damaged"),
-        ("counts", [0, 1, 777, 16385], r"frame 5.*expected chunk 81 of .*values, found none: the store is damaged"),
+        (
+            "counts",
+            [1, 1, 777, 1001],
+            r"frame 0.*expected chunk 0 of .*values, found none: the store is damaged",
+        ),
+        (
+            "counts",
+            [0, 1, 777, 16385],
+            r"frame 5.*expected chunk 81 of .*values, found none: the store is damaged",
+        ),
     ],
 )
 def test_wrong_frames_and_counts_are_one_clear_error(
@@ -274,7 +308,9 @@ def test_an_index_beyond_the_palette_is_one_clear_error(hdf5_store: Path) -> Non
     counts[3, place] -= 1
     edit_hdf5(hdf5_store, f"{SEQUENCE}/counts", counts)
     sequence = carlasc.open(hdf5_store).sequences()[SEQUENCE]
-    with pytest.raises(FormatError, match="field flow, frame 5: .*expected indices below 3, found 3"):
+    with pytest.raises(
+        FormatError, match="field flow, frame 5: .*expected indices below 3, found 3"
+    ):
         sequence.read("flow", 5)
     assert len(sequence.read("flow", 2)) == 777
 
@@ -299,7 +335,9 @@ def test_bytes_that_cannot_be_decoded_name_field_and_frame(hdf5_store: Path) -> 
         checksums = file[f"{LABELS}_crc32c"][:]
     content = bytearray(hdf5_store.read_bytes())
     content[info.byte_offset : info.byte_offset + 16] = b"\xff" * 16
-    checksums[1] = google_crc32c.value(bytes(content[info.byte_offset : info.byte_offset + info.size]))
+    checksums[1] = google_crc32c.value(
+        bytes(content[info.byte_offset : info.byte_offset + info.size])
+    )
     hdf5_store.write_bytes(content)
     edit_hdf5(hdf5_store, f"{LABELS}_crc32c", checksums)
     sequence = carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"]
@@ -307,15 +345,21 @@ def test_bytes_that_cannot_be_decoded_name_field_and_frame(hdf5_store: Path) -> 
         sequence.read("labels", 2)
 
 
-@pytest.mark.parametrize("options", [{}, {"chunks": (10,)}, {"chunks": (10,), "compression": "gzip"}], ids=str)
-def test_a_data_set_without_the_filter_is_one_clear_error(hdf5_store: Path, options: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "options", [{}, {"chunks": (10,)}, {"chunks": (10,), "compression": "gzip"}], ids=str
+)
+def test_a_data_set_without_the_filter_is_one_clear_error(
+    hdf5_store: Path, options: dict[str, Any]
+) -> None:
     edit_hdf5(hdf5_store, LABELS, np.zeros(30, np.uint8), **options)
     with pytest.raises(FormatError, match="expected a chunked data set with the Blosc filter"):
         carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read("labels", 2)
 
 
 @pytest.mark.parametrize("rows", [[0, 1, 776, 1002], [1, 1, 776, 1001]])
-def test_a_table_whose_footer_counts_other_rows_is_one_clear_error(data: Path, tmp_path: Path, rows: list[int]) -> None:
+def test_a_table_whose_footer_counts_other_rows_is_one_clear_error(
+    data: Path, tmp_path: Path, rows: list[int]
+) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     pack(data, tmp_path / "x.parquet")
     path = tmp_path / "x.parquet" / WHOLE / "labels.parquet"
@@ -352,7 +396,8 @@ def refuse_chunk(data: bytes) -> None:
     [("decoded", 99), ("decoded", 101), ("encoded", 2**32 - 1), ("block", 0), ("block", 2**31)],
 )
 def test_what_the_header_of_a_chunk_says_is_not_believed(name: str, value: int) -> None:
-    refuse_chunk(blosc_header(**{name: value}))  # of 99 bytes, Blosc would leave the last one as it is
+    # of 99 bytes, Blosc would leave the last one as it is
+    refuse_chunk(blosc_header(**{name: value}))
 
 
 def test_a_chunk_that_is_cut_short_is_refused() -> None:
@@ -369,7 +414,9 @@ def test_fewer_numbers_than_a_chunk_has_are_not_taken_for_all() -> None:
     encoding = Encoding("pcodec", 8)
     data = encoding.encode(np.arange(50, dtype="<i4"), "zarr")
     for count in (49, 51):
-        with pytest.raises(FormatError, match=r"its bytes: cannot be decoded: \d+ elements instead of"):
+        with pytest.raises(
+            FormatError, match=r"its bytes: cannot be decoded: \d+ elements instead of"
+        ):
             encoding.decode(data, np.empty(count, "<i4"), "zarr")
 
 
@@ -397,10 +444,14 @@ def test_an_hdf5_store_shows_no_other_file(hdf5_store: Path, tmp_path: Path) -> 
             del file[name]
             make(file)
         with pytest.raises(FormatError, match=message):
-            carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read_document("poses.txt")
+            carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].read_document(
+                "poses.txt"
+            )
 
 
-def test_a_chunk_of_an_hdf5_store_that_unpacks_to_more_than_its_array_is_refused(hdf5_store: Path) -> None:
+def test_a_chunk_of_an_hdf5_store_that_unpacks_to_more_than_its_array_is_refused(
+    hdf5_store: Path,
+) -> None:
     import h5py
 
     name = f"{SEQUENCE}/frames"
@@ -411,5 +462,8 @@ def test_a_chunk_of_an_hdf5_store_that_unpacks_to_more_than_its_array_is_refused
         frames.attrs.update(attributes)
         # Level 9 gives 16 kB: HDF5 1.14 takes at most 64 kB for a chunk as small as this one.
         frames.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 24), 9))
-    with pytest.raises(FormatError, match=f"{name}: expected 32 bytes, found another size: carlasc did not write this"):
+    with pytest.raises(
+        FormatError,
+        match=f"{name}: expected 32 bytes, found another size: carlasc did not write this",
+    ):
         carlasc.open(hdf5_store).sequences()["Town01_Light/cartesian"].frames("labels")

@@ -22,13 +22,19 @@ def by_numpy(votes):
 
 
 def votes_of_a_street(seed=0):
-    """Return votes as common as at 0.1 m: columns of free voxels above a road, of one vote to eight, a class in every seventh."""
+    """Return votes as common as at 0.1 m: columns of free voxels above a road, of one vote to
+    eight, a class in every seventh.
+    """
     rng = np.random.default_rng(seed)
-    free = np.flatnonzero(np.repeat(rng.random(20_000) < 0.6, 30) & (np.arange(600_000) % 30 > rng.integers(3, 12)))
+    free = np.flatnonzero(
+        np.repeat(rng.random(20_000) < 0.6, 30) & (np.arange(600_000) % 30 > rng.integers(3, 12))
+    )
     hit = rng.choice(600_000, len(free) // 7, replace=False)
     votes = np.empty(len(free) + len(hit), field_files.VOTES_DTYPE)
     votes["voxel"] = np.concatenate([free, hit])
-    votes["label"] = np.concatenate([np.zeros(len(free)), rng.choice([1, 6, 7, 9], len(hit), p=(0.3, 0.1, 0.5, 0.1))])
+    votes["label"] = np.concatenate(
+        [np.zeros(len(free)), rng.choice([1, 6, 7, 9], len(hit), p=(0.3, 0.1, 0.5, 0.1))]
+    )
     votes["votes"] = np.minimum(rng.geometric(0.5, len(votes)), 20)
     return votes[np.lexsort((votes["label"], votes["voxel"]))]
 
@@ -46,14 +52,22 @@ def test_numpy_reads_the_columns_and_their_types(dtype, count):
 
 def test_the_file_is_that_of_numpy_but_for_the_level():
     votes = votes_of_a_street()
-    assert npz_bytes({name: (votes[name], 6) for name in ("voxel", "label", "votes")}) == by_numpy(votes)
+    assert npz_bytes({name: (votes[name], 6) for name in ("voxel", "label", "votes")}) == by_numpy(
+        votes
+    )
     with (
         zipfile.ZipFile(io.BytesIO(FIELD.encode(votes, "x"))) as ours,
         zipfile.ZipFile(io.BytesIO(by_numpy(votes))) as theirs,
     ):
-        assert [ours.read(name) for name in ours.namelist()] == [theirs.read(name) for name in theirs.namelist()]
+        assert [ours.read(name) for name in ours.namelist()] == [
+            theirs.read(name) for name in theirs.namelist()
+        ]
         for mine, other in zip(ours.infolist(), theirs.infolist(), strict=True):
-            assert (mine.filename, mine.date_time, mine.CRC) == (other.filename, other.date_time, other.CRC)
+            assert (mine.filename, mine.date_time, mine.CRC) == (
+                other.filename,
+                other.date_time,
+                other.CRC,
+            )
             assert mine.compress_size != other.compress_size
 
 
@@ -68,10 +82,16 @@ def test_fast_levels_cost_few_bytes():
     assert len(FIELD.encode(votes, "x")) < 1.06 * len(by_numpy(votes))
 
 
-@given(arrays(st.sampled_from(["<f4", "u1", "<i4"]), array_shapes(min_dims=0, max_dims=3)), st.integers(1, 9))
+@given(
+    arrays(st.sampled_from(["<f4", "u1", "<i4"]), array_shapes(min_dims=0, max_dims=3)),
+    st.integers(1, 9),
+)
 @settings(deadline=None)
 def test_any_array_comes_back_at_any_level(array, level):
     data = npz_bytes({"a": (array, level)})
     with open_npz(data, "a.npz") as archive:
-        assert archive.read("a", ArrayFormat((array.dtype.str,), array.shape)).tobytes() == array.tobytes()
+        assert (
+            archive.read("a", ArrayFormat((array.dtype.str,), array.shape)).tobytes()
+            == array.tobytes()
+        )
     assert np.load(io.BytesIO(data))["a"].tobytes() == array.tobytes()

@@ -105,7 +105,13 @@ def test_types_are_fixed_and_columns_that_no_frame_needs_are_absent(store: Path)
 
 
 def test_frames_that_do_not_fit_the_type_go_to_a_second_column(tmp_path: Path) -> None:
-    values = [np.array([1, 255]), np.array([256, 3]), np.array([2]), np.array([70000, 0]), np.array([4, 5])]
+    values = [
+        np.array([1, 255]),
+        np.array([256, 3]),
+        np.array([2]),
+        np.array([70000, 0]),
+        np.array([4, 5]),
+    ]
     with ZarrSink(tmp_path / "x.zarr") as sink, sink.sequence(SCANS) as writer:
         for frame, labels in enumerate(values):
             writer.write("labels", frame, labels.astype(np.uint32))
@@ -129,11 +135,15 @@ def test_a_scan_larger_than_the_first_takes_several_chunks(tmp_path: Path) -> No
 
 
 def shard_of(store: Path, field: str) -> Path:
-    return max((store / WHOLE / field / "c").rglob("*"), key=lambda file: file.stat().st_size if file.is_file() else -1)
+    return max(
+        (store / WHOLE / field / "c").rglob("*"),
+        key=lambda file: file.stat().st_size if file.is_file() else -1,
+    )
 
 
 @pytest.mark.parametrize(
-    ("node", "field"), [("scans/points/xyz", "points"), ("grids/evaluation/labels/values", "evaluation/labels")]
+    ("node", "field"),
+    [("scans/points/xyz", "points"), ("grids/evaluation/labels/values", "evaluation/labels")],
 )
 def test_a_corrupted_chunk_names_field_and_frame(store: Path, node: str, field: str) -> None:
     file = shard_of(store, node)
@@ -170,12 +180,20 @@ def test_a_chunk_that_the_index_does_not_have_is_damage_and_no_zeros(store: Path
     import google_crc32c
 
     file = store / WHOLE / "scans/points/xyz/c/0/0/0"
-    data, size, slot = bytearray(file.read_bytes()), 16 * 16 * 16, 16 * 16 * 5  # 16 bytes per slot, 16 slots per frame
+    # 16 bytes per slot, 16 slots per frame
+    data, size, slot = (
+        bytearray(file.read_bytes()),
+        16 * 16 * 16,
+        16 * 16 * 5,
+    )
     data[slot : slot + 16] = b"\xff" * 16  # the first chunk of frame 5
     data[size : size + 4] = google_crc32c.value(bytes(data[:size])).to_bytes(4, "little")
     file.write_bytes(data)
     sequence = carlasc.open(store).sequences()[WHOLE]
-    with pytest.raises(FormatError, match="field points, frame 5.*expected chunk 80, found none: the store is damaged"):
+    with pytest.raises(
+        FormatError,
+        match="field points, frame 5.*expected chunk 80, found none: the store is damaged",
+    ):
         sequence.read("points", 5)
     assert len(sequence.read("points", 2)) == 777
 
@@ -186,7 +204,8 @@ def test_a_chunk_that_the_index_does_not_have_is_damage_and_no_zeros(store: Path
         (7, "found version 7: upgrade carlasc"),
         (
             2,
-            "expected a store of version 3, found version 2: it was packed by an earlier, unreleased version of carlasc",
+            "expected a store of version 3, found version 2: it was packed by an earlier, "
+            "unreleased version of carlasc",
         ),
     ],
 )
@@ -207,7 +226,8 @@ def test_another_zarr_store_is_refused(tmp_path: Path) -> None:
 def test_an_unfinished_store_is_refused(tmp_path: Path) -> None:
     ZarrSink(tmp_path / "x.zarr").sequence(SCANS).close()
     with pytest.raises(
-        FormatError, match="a run is writing it, or was interrupted: run the same command again.*carlasc finish"
+        FormatError,
+        match="a run is writing it, or was interrupted: run the same command again.*carlasc finish",
     ):
         carlasc.open(tmp_path / "x.zarr")
 
@@ -219,9 +239,15 @@ def test_a_second_run_finds_what_exists_and_other_options_are_a_conflict(tmp_pat
     again = ZarrSink(tmp_path / "x.zarr").sequence(SCANS)
     assert again.has("points", 0) and not again.has("points", 1) and not again.has("labels", 0)
     assert np.array_equal(again.read("points", 0), points)
-    with pytest.raises(ConflictError, match=r"same options, found one with lossy_mm None.*overwrite=True"):
+    with pytest.raises(
+        ConflictError, match=r"same options, found one with lossy_mm None.*overwrite=True"
+    ):
         ZarrSink(tmp_path / "x.zarr", PackOptions(lossy_mm=1))
-    assert not ZarrSink(tmp_path / "x.zarr", PackOptions(lossy_mm=1), overwrite=True).sequence(SCANS).has("points", 0)
+    assert (
+        not ZarrSink(tmp_path / "x.zarr", PackOptions(lossy_mm=1), overwrite=True)
+        .sequence(SCANS)
+        .has("points", 0)
+    )
 
 
 def test_more_is_added_to_a_finished_store_and_seen_when_it_is_finished_again(store: Path) -> None:
@@ -244,7 +270,9 @@ def test_more_is_added_to_a_finished_store_and_seen_when_it_is_finished_again(st
     assert np.array_equal(after.read("instances", 5), before.read("instances", 5))
 
 
-def test_overwrite_keeps_the_old_store_until_the_new_one_is_finished(store: Path, tmp_path: Path) -> None:
+def test_overwrite_keeps_the_old_store_until_the_new_one_is_finished(
+    store: Path, tmp_path: Path
+) -> None:
     before = files_of(store)
     sink = ZarrSink(store, overwrite=True)
     sink.sequence(SCANS).close()

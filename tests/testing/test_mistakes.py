@@ -14,7 +14,9 @@ LABELS = RNG.integers(0, 8, len(POINTS)).astype(np.uint8)
 
 @pytest.mark.parametrize("clump_m", [None, 1.0])
 @pytest.mark.parametrize("share", [0, 0.2, 0.5, 1])
-def test_the_share_of_wrong_labels_is_that_asked_for_and_points_without_a_class_keep_it(share, clump_m):
+def test_the_share_of_wrong_labels_is_that_asked_for_and_points_without_a_class_keep_it(
+    share, clump_m
+):
     made = wrong_labels(LABELS, POINTS, share, clump_m=clump_m)
     labelled = LABELS > 0
     assert made.dtype == LABELS.dtype and not made[~labelled].any()

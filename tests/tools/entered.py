@@ -1,8 +1,11 @@
-"""`python -m entered [CASE ...]`: how many files and functions of `carlasc` make one frame, and how deeply they call each other.
+"""`python -m entered [CASE ...]`: how many files and functions of `carlasc` make one frame, and how
+deeply they call each other.
 
-What is loaded or compiled once is left out: each case runs once before it is counted. A call counts if its code is in a file of the package,
-that of a compiled loop too where Numba tells of it. Comprehensions, generator expressions and lambdas count like functions; from Python 3.12
-on, most comprehensions are no calls, so a version before it counts more. A generator is as deep as the call that resumes it.
+What is loaded or compiled once is left out: each case runs once before it is counted. A call counts
+if its code is in a file of the package, that of a compiled loop too where Numba tells of it.
+Comprehensions, generator expressions and lambdas count like functions; from Python 3.12 on, most
+comprehensions are no calls, so a version before it counts more. A generator is as deep as the call
+that resumes it.
 """
 
 from __future__ import annotations
@@ -77,9 +80,12 @@ def entered(function: Callable[[], object]) -> Entered:
 
 
 def cases(folder: Path) -> dict[str, Callable[[], object]]:
-    """Write small simulated data into a folder, and return what is counted, by name. Each call does the work anew.
+    """Write small simulated data into a folder, and return what is counted, by name.
 
-    One frame of a capture and of scans is made, each with its tracks, its report and all other files of a run.
+    Each call does the work anew.
+
+    One frame of a capture and of scans is made, each with its tracks, its report and all other
+    files of a run.
     """
     carlasc.simulate(folder / "capture", count=FRAMES, sensors=3, lidar=LIDAR, bev=False, run=ONE)
     regrid(folder / "capture", SPEC, folder / "grids", run=ONE)
@@ -90,11 +96,20 @@ def cases(folder: Path) -> dict[str, Callable[[], object]]:
 
     def scans() -> object:
         with tempfile.TemporaryDirectory(dir=folder) as out:
-            return regrid(folder / "grids", SPEC, out, observe=observe, frames=(middle, middle + 1), run=ONE)
+            return regrid(
+                folder / "grids", SPEC, out, observe=observe, frames=(middle, middle + 1), run=ONE
+            )
 
     def capture() -> object:
         with tempfile.TemporaryDirectory(dir=folder) as out:
-            return regrid(folder / "capture", SPEC, out, observe=FromCapture(), frames=(middle, middle + 1), run=ONE)
+            return regrid(
+                folder / "capture",
+                SPEC,
+                out,
+                observe=FromCapture(),
+                frames=(middle, middle + 1),
+                run=ONE,
+            )
 
     return {
         "regrid from scans": scans,
@@ -111,14 +126,19 @@ def count_case(case: Callable[[], object]) -> Entered:
 
 
 def main() -> None:
-    """Print what each case enters; of the cases that are named, the functions and the deepest chain too."""
+    """Print what each case enters; of the cases that are named, the functions and the deepest chain
+    too.
+    """
     with tempfile.TemporaryDirectory() as folder:
         found = {name: count_case(case) for name, case in cases(Path(folder)).items()}
     for name, own in found.items():
         print(f"{name}: {own}")
         if name in sys.argv[1:]:
             print(*sorted(own.functions), sep="\n")
-            print(*(f"{'  ' * level}{function}" for level, function in enumerate(own.deepest)), sep="\n")
+            print(
+                *(f"{'  ' * level}{function}" for level, function in enumerate(own.deepest)),
+                sep="\n",
+            )
 
 
 if __name__ == "__main__":

@@ -26,7 +26,9 @@ def test_it_draws_without_a_network(page):
     canvas = page.canvas("page")
     assert len(np.unique(canvas.reshape(-1, 3), axis=0)) > 200
     assert page.text("#title") == "Train / Town01_Light"
-    assert page.run("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
+    assert (
+        page.run("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
+    )
 
 
 @pytest.mark.slow
@@ -34,7 +36,8 @@ def test_left_ahead_and_up_are_where_they_should_be(page):
     canvas = page.canvas()
     vehicle = canvas.shape[1] / 2
     red, blue = middle_of(red_pixels(canvas)), middle_of(blue_pixels(canvas))
-    assert red[0] > vehicle + 30 and red[1] < canvas.shape[0] / 2  # x = +10, y = +5: ahead and to the right
+    # x = +10, y = +5: ahead and to the right
+    assert red[0] > vehicle + 30 and red[1] < canvas.shape[0] / 2
     assert blue[0] < vehicle - 30 and blue[1] > red[1]  # x = -8, y = -6: behind and to the left
     page.click("#view-top")
     above = page.canvas("page_above")
@@ -43,13 +46,16 @@ def test_left_ahead_and_up_are_where_they_should_be(page):
     assert blue[0] < vehicle - 30 and blue[1] > above.shape[0] / 2 + 30
     page.run("carlasc.panels.camera.position.set(0, -1, 60); carlasc.panels.controls.update()")
     level = page.canvas()
-    assert middle_of(red_pixels(level))[1] < level.shape[0] / 2 + 10  # seen from the ground it stands upwards
+    # seen from the ground it stands upwards
+    assert middle_of(red_pixels(level))[1] < level.shape[0] / 2 + 10
     assert middle_of(red_pixels(level))[0] > vehicle
 
 
 @pytest.mark.slow
 def test_data_with_y_on_the_left_is_drawn_so(browser, tmp_path):
-    folder = write_blocks(tmp_path / "kitti" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False)
+    folder = write_blocks(
+        tmp_path / "kitti" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False
+    )
     page = Page(browser, view(folder, tmp_path / "scene.html").out)
     canvas = page.canvas()
     assert middle_of(red_pixels(canvas))[0] < canvas.shape[1] / 2 - 30
@@ -61,7 +67,8 @@ def test_data_with_y_on_the_left_is_drawn_so(browser, tmp_path):
 def test_the_slider_moves_the_frame(page):
     before = middle_of(red_pixels(page.canvas()))
     page.run(
-        "const s = document.getElementById('slider'); s.value = 2; s.dispatchEvent(new Event('input'));"
+        "const s = document.getElementById('slider'); s.value = 2; s.dispatchEvent(new "
+        "Event('input'));"
         " while (carlasc.position !== 2) await new Promise((done) => setTimeout(done, 10))"
     )
     after = middle_of(red_pixels(page.canvas("page_last_frame")))
@@ -77,21 +84,27 @@ def test_play_goes_through_the_frames_until_it_is_stopped(page):
     page.click("#play")
     seen = page.run(
         "const seen = new Set(); const until = performance.now() + 20000;"
-        " while (seen.size < 3 && performance.now() < until) { seen.add(carlasc.position); await new Promise((done) => setTimeout(done, 10)); }"
+        " while (seen.size < 3 && performance.now() < until) { seen.add(carlasc.position); await "
+        "new Promise((done) => setTimeout(done, 10)); }"
         " return [...seen].sort()"
     )
     assert seen == [0, 1, 2]
     assert page.text("#play") == "Stop"
     page.click("#play")
     assert (
-        page.run("while (carlasc.runs) await new Promise((done) => setTimeout(done, 10)); return carlasc.playing")
+        page.run(
+            "while (carlasc.runs) await new Promise((done) => setTimeout(done, 10)); return "
+            "carlasc.playing"
+        )
         is False
     )
 
 
 @pytest.mark.slow
 def test_a_class_is_toggled_and_counted(page):
-    voxels = page.run("return carlasc.contents.grids[0].label.filter((label) => label === 4).length")
+    voxels = page.run(
+        "return carlasc.contents.grids[0].label.filter((label) => label === 4).length"
+    )
     assert page.text("tr:has([data-class='4']) td:nth-child(2)") == str(voxels)
     assert red_pixels(page.canvas()).sum() > 100
     page.click("[data-class='4']")
@@ -134,7 +147,9 @@ def test_a_picked_voxel_shows_its_class_votes_and_position(page):
     x, y, z = page.run("return carlasc.picked.center")
     assert abs(x - 10) < 1.3 and abs(y - 5) < 1.3 and abs(z) < 1.3
     cell = page.run("return carlasc.picked.cell")
-    assert np.allclose(GridSpec.published().with_size((64, 64, 4)).centers()[tuple(cell)], (x, y, z), atol=1e-4)
+    assert np.allclose(
+        GridSpec.published().with_size((64, 64, 4)).centers()[tuple(cell)], (x, y, z), atol=1e-4
+    )
     assert page.run("return carlasc.pick(3, 3)") is None
     assert page.text("#card") == ""
 
@@ -144,7 +159,9 @@ def test_a_picked_voxel_shows_its_class_votes_and_position(page):
 def test_colours_can_show_height_or_votes(page, mode):
     before = page.canvas()
     page.run(
-        "const s = document.getElementById('color-by'); s.value = args[0]; s.dispatchEvent(new Event('change'))", mode
+        "const s = document.getElementById('color-by'); s.value = args[0]; s.dispatchEvent(new "
+        "Event('change'))",
+        mode,
     )
     after = page.canvas(f"page_{mode}")
     assert (before != after).any(-1).mean() > 0.1
@@ -152,8 +169,12 @@ def test_colours_can_show_height_or_votes(page, mode):
 
 
 @pytest.mark.slow
-def test_prediction_truth_and_errors_are_side_by_side_and_rotate_together(browser, blocks, tmp_path):
-    prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False)
+def test_prediction_truth_and_errors_are_side_by_side_and_rotate_together(
+    browser, blocks, tmp_path
+):
+    prediction = write_blocks(
+        tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False
+    )
     result = view(Scene(prediction, truth=blocks), tmp_path / "scene.html")
     assert result.panels == ("prediction", "truth", "errors")
     page = Page(browser, result.out, (1200, 640))
@@ -164,11 +185,16 @@ def test_prediction_truth_and_errors_are_side_by_side_and_rotate_together(browse
     page.click("#view-top")
     turned = page.canvas()
     for i in range(3):
-        assert (turned[:, i * third : (i + 1) * third] != canvas[:, i * third : (i + 1) * third]).any(-1).mean() > 0.1
+        assert (
+            turned[:, i * third : (i + 1) * third] != canvas[:, i * third : (i + 1) * third]
+        ).any(-1).mean() > 0.1
 
     column, row = middle_of(red_pixels(turned[:, third : 2 * third]))
     page.run("carlasc.pick(...args)", float(column + third), float(row))
-    assert page.run("return carlasc.picked.lines.errors") in ("right class", "missed: predicted free")
+    assert page.run("return carlasc.picked.lines.errors") in (
+        "right class",
+        "missed: predicted free",
+    )
     assert page.run("return carlasc.picked.class") == "Pedestrian"
     page.click("[data-panel='errors']")
     page.click("[data-panel='prediction']")
@@ -209,16 +235,22 @@ def test_points_alone_are_drawn(browser, tmp_path):
 @pytest.mark.parametrize("size", [(1280, 800), (500, 900)])
 @pytest.mark.parametrize("compared", [False, True])
 def test_nothing_overlaps_and_nothing_is_cut_off(browser, blocks, tmp_path, size, compared):
-    result = view(Scene(blocks, truth=blocks if compared else None, frames=(0, 1)), tmp_path / "scene.html")
+    result = view(
+        Scene(blocks, truth=blocks if compared else None, frames=(0, 1)), tmp_path / "scene.html"
+    )
     page = Page(browser, result.out, size)
     page.picture(f"page_{size[0]}x{size[1]}{'_compared' if compared else ''}")
     found = page.run(
-        "const boxes = [...document.querySelectorAll('header button, h1, #subtitle, footer button, #slider, #frame-label, .chips button, th, tbody .name, tbody .count, #titles span')]"
+        "const boxes = [...document.querySelectorAll('header button, h1, #subtitle, footer "
+        "button, #slider, #frame-label, .chips button, th, tbody .name, tbody .count, #titles "
+        "span')]"
         "  .filter((e) => e.offsetParent).map((e) => [e, e.getBoundingClientRect()]);"
         "const wrong = [];"
-        "for (const [e, b] of boxes) if (b.left < -0.5 || b.right > window.innerWidth + 0.5) wrong.push(`${e.id || e.textContent} is cut off`);"
+        "for (const [e, b] of boxes) if (b.left < -0.5 || b.right > window.innerWidth + 0.5) "
+        "wrong.push(`${e.id || e.textContent} is cut off`);"
         "boxes.forEach(([e, a], i) => { for (const [f, b] of boxes.slice(i + 1))"
-        "  if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1 && !e.contains(f) && !f.contains(e))"
+        "  if (a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < "
+        "a.bottom - 1 && !e.contains(f) && !f.contains(e))"
         "    wrong.push(`${e.id || e.textContent} overlaps ${f.id || f.textContent}`); });"
         "return wrong"
     )

@@ -19,14 +19,26 @@ from carlasc.viewing.colors import (
 SIGHT = {
     "normal": np.eye(3),
     "deuteranopia": np.array(
-        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]]
+        [
+            [0.367322, 0.860646, -0.227968],
+            [0.280085, 0.672501, 0.047413],
+            [-0.01182, 0.04294, 0.968881],
+        ]
     ),
     "protanopia": np.array(
-        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+        [
+            [0.152286, 1.052583, -0.204868],
+            [0.114503, 0.786281, 0.099216],
+            [-0.003882, -0.048116, 1.051998],
+        ]
     ),
 }
 TO_XYZ = np.array(
-    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.072175], [0.0193339, 0.119192, 0.9503041]]
+    [
+        [0.4124564, 0.3575761, 0.1804375],
+        [0.2126729, 0.7151522, 0.072175],
+        [0.0193339, 0.119192, 0.9503041],
+    ]
 )
 
 
@@ -52,7 +64,12 @@ def test_the_papers_own_colours_are_hard_to_distinguish():
 
 def test_a_class_alone_in_its_group_or_named_like_it_has_the_groups_colour():
     eleven, carla = colorblind_palette(CARLASC11), colorblind_palette(CARLA)
-    for name, group in (("Road", "Road"), ("Vehicle", "Vehicles"), ("Pole", "Pole"), ("Vegetation", "Vegetation")):
+    for name, group in (
+        ("Road", "Road"),
+        ("Vehicle", "Vehicles"),
+        ("Pole", "Pole"),
+        ("Vegetation", "Vegetation"),
+    ):
         np.testing.assert_array_equal(carla[CARLA.id_of(name)], eleven[CARLASC11.id_of(group)])
     kitti = colorblind_palette(SEMANTICKITTI)
     np.testing.assert_array_equal(kitti[40], eleven[CARLASC11.id_of("Road")])
@@ -68,7 +85,9 @@ def test_every_table_has_a_palette_without_two_classes_alike(table):
 
 
 def test_an_unknown_table_gets_a_palette_too():
-    table = ClassTable("mine", {i: f"thing {i}" for i in range(15)}, dict.fromkeys(range(15), (1, 2, 3)))
+    table = ClassTable(
+        "mine", {i: f"thing {i}" for i in range(15)}, dict.fromkeys(range(15), (1, 2, 3))
+    )
     palette = colorblind_palette(table)
     assert len(np.unique(palette[1:], axis=0)) == 14
 
@@ -107,13 +126,19 @@ def test_errors_have_their_names_and_colours():
 def test_the_legend_of_heights_goes_from_the_lowest_to_the_highest_before_all_classes():
     entries = height_entries(-2.0, 2.0)
     assert [entry.name for entry in entries] == ["-2.0 m", "-1.0 m", "+0.0 m", "+1.0 m", "+2.0 m"]
-    assert [entry.color for entry in entries] == [tuple(c) for c in height_colors(np.arange(-2, 3), -2.0, 2.0).tolist()]
+    assert [entry.color for entry in entries] == [
+        tuple(c) for c in height_colors(np.arange(-2, 3), -2.0, 2.0).tolist()
+    ]
     assert merge_legends([ClassColors(CARLA).entries([1]), entries])[:5] == entries
 
 
 def test_shades_of_a_dark_group_are_lighter_and_of_a_light_group_darker():
     palette = colorblind_palette(CARLA).astype(int)
-    fence, wall, guard_rail = (palette[CARLA.id_of(name)] for name in ("Fence", "Wall", "GuardRail"))
+    fence, wall, guard_rail = (
+        palette[CARLA.id_of(name)] for name in ("Fence", "Wall", "GuardRail")
+    )
     assert (fence <= wall).all() and (wall <= guard_rail).all() and fence.sum() < wall.sum()
-    pole, sign, light = (palette[CARLA.id_of(name)] for name in ("Pole", "TrafficSign", "TrafficLight"))
+    pole, sign, light = (
+        palette[CARLA.id_of(name)] for name in ("Pole", "TrafficSign", "TrafficLight")
+    )
     assert (pole >= sign).all() and (sign >= light).all() and pole.sum() > sign.sum()

@@ -51,20 +51,29 @@ def test_a_page_describes_classes_panels_and_axes(blocks, tmp_path):
     assert [panel["title"] for panel in scene["panels"]] == ["prediction", "truth", "errors"]
     assert [panel["table"] for panel in scene["panels"]] == ["carla", "carla", "errors"]
     assert scene["panels"][0]["upper"] == pytest.approx([25.6, 25.6, 1.0], abs=1e-3)
-    assert (scene["pointTable"], scene["hasPoints"], scene["hasFlow"], scene["pointCell"]) == ("carla", True, True, 0.2)
+    assert (scene["pointTable"], scene["hasPoints"], scene["hasFlow"], scene["pointCell"]) == (
+        "carla",
+        True,
+        True,
+        0.2,
+    )
     own, truth, errors = (frames[1][f"panel{number}/label"] for number in range(3))
     assert (own == 4).sum() == (truth == 4).sum() > 0 and set(np.unique(errors)) == {1, 3, 4}
     assert {"actors/arrows", "scan/label"} <= set(frames[1])
 
 
 def test_data_with_y_on_the_left_say_so_in_the_page(tmp_path):
-    folder = write_blocks(tmp_path / "a" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False)
+    folder = write_blocks(
+        tmp_path / "a" / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False
+    )
     _, scene, _ = read_page(view(folder, tmp_path / "scene.html").out)
     assert (scene["leftHanded"], scene["hasPoints"], scene["hasFlow"]) == (False, False, False)
 
 
 def test_a_page_loads_nothing_from_a_network(golden_capture, tmp_path):
-    text, _, _ = read_page(view(Scene(golden_capture / "cartesian", frames=(0, 1)), tmp_path / "scene.html").out)
+    text, _, _ = read_page(
+        view(Scene(golden_capture / "cartesian", frames=(0, 1)), tmp_path / "scene.html").out
+    )
     assert not re.search(r"<(script|link|img)[^>]+(src|href)=[\"'](?!data:)", text)
     assert "default-src 'none'" in text
     assert "Permission is hereby granted" in text  # three.js's licence goes with it
@@ -82,9 +91,13 @@ def test_a_page_shows_the_first_sixty_frames_unless_a_range_is_given(tmp_path):
     folder = write_blocks(tmp_path / "a" / "cartesian", frames=1, points=False)
     for frame in range(1, 65):
         for kind in ("label", "bin"):
-            (folder / "evaluation" / f"{frame:06d}.{kind}").symlink_to(folder / "evaluation" / f"000000.{kind}")
+            (folder / "evaluation" / f"{frame:06d}.{kind}").symlink_to(
+                folder / "evaluation" / f"000000.{kind}"
+            )
     result = view(folder, tmp_path / "a.html")
-    assert result.frames == tuple(range(60)) and result.notes == ("65 frames found, showing the first 60",)
+    assert result.frames == tuple(range(60)) and result.notes == (
+        "65 frames found, showing the first 60",
+    )
     ranged = view(Scene(folder, frames=(1, 65)), tmp_path / "b.html")
     assert ranged.frames == tuple(range(1, 65)) and ranged.notes == ()
 
@@ -108,7 +121,9 @@ def test_what_cannot_be_written_is_refused(blocks, tmp_path):
 
 
 def test_sixty_dense_frames_stay_under_fifteen_megabytes(tmp_path):
-    """A frame as full as a real one: 130,000 points, a coarse grid of 20,000 voxels; its bytes times 60."""
+    """A frame as full as a real one: 130,000 points, a coarse grid of 20,000 voxels; its bytes
+    times 60.
+    """
     from helpers.scenes.box_street import Street
 
     from carlasc.core.geometry import translation

@@ -1,4 +1,6 @@
-"""What a page holds besides grids and points: poses, evidence, scores, a second run; and the folder of a page."""
+"""What a page holds besides grids and points: poses, evidence, scores, a second run; and the folder
+of a page.
+"""
 
 import json
 import re
@@ -22,7 +24,9 @@ def described(path):
 
 
 def test_a_page_holds_the_poses_of_its_frames(golden_capture, tmp_path):
-    scene = described(view(Scene(golden_capture / "cartesian", frames=(1, 3)), tmp_path / "a.html").out)
+    scene = described(
+        view(Scene(golden_capture / "cartesian", frames=(1, 3)), tmp_path / "a.html").out
+    )
     (sequence,) = open_source(golden_capture / "cartesian").sequences().values()
     for frame, pose in zip(scene["frames"], scene["poses"], strict=True):
         assert np.allclose(np.reshape(pose, (3, 4)), sequence.read_pose(frame)[:3], atol=1e-5)
@@ -55,9 +59,13 @@ def test_evidence_of_the_occupied_voxels_is_in_the_page(tmp_path):
 
 
 def test_scores_are_those_of_each_frame(blocks, tmp_path):
-    prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False)
+    prediction = write_blocks(
+        tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False
+    )
     scene = described(view(Scene(prediction, truth=blocks), tmp_path / "a.html").out)
-    predicted, true = (open_source(folder).sequences().popitem()[1] for folder in (prediction, blocks))
+    predicted, true = (
+        open_source(folder).sequences().popitem()[1] for folder in (prediction, blocks)
+    )
     for at, frame in enumerate(scene["frames"]):
         grid, truth = predicted.grid("evaluation", frame), true.grid("evaluation", frame)
         a, b = grid.labels[truth.known], truth.labels[truth.known]
@@ -91,7 +99,8 @@ def test_another_grid_of_the_same_sequence_is_a_second_run(tmp_path):
     result = view(folder, tmp_path / "a.html", beside_grid="fine")
     assert result.panels == ("evaluation", "fine") and result.frames == (0, 1)
     assert [panel["size"][0] for panel in described(result.out)["panels"]] == [32, 64]
-    result = view(folder, tmp_path / "b.html", beside=folder / "fine")  # a grid's folder says the same
+    # a grid's folder says the same
+    result = view(folder, tmp_path / "b.html", beside=folder / "fine")
     assert result.panels == ("evaluation", "fine")
 
 
@@ -99,12 +108,16 @@ def test_runs_that_cannot_be_compared_are_refused(blocks, tmp_path):
     right = write_blocks(tmp_path / "r" / "cartesian", metadata={"axes": "right"}, points=False)
     with pytest.raises(ArgumentError, match="the same axes"):
         view(blocks, tmp_path / "a.html", beside=right)
-    with pytest.raises(MissingDataError, match="expected one of the frames 2 to 2, found frames 0 to 1"):
+    with pytest.raises(
+        MissingDataError, match="expected one of the frames 2 to 2, found frames 0 to 1"
+    ):
         other = write_blocks(tmp_path / "o" / "cartesian", frames=2, points=False)
         view(Scene(blocks, frames=(2, 3)), tmp_path / "a.html", beside=other)
     with pytest.raises(MissingDataError, match="the grid fine"):
         view(blocks, tmp_path / "a.html", beside_grid="fine")
-    coarse = write_blocks(tmp_path / "c" / "cartesian", spec=GridSpec.published().with_size((32, 32, 4)), points=False)
+    coarse = write_blocks(
+        tmp_path / "c" / "cartesian", spec=GridSpec.published().with_size((32, 32, 4)), points=False
+    )
     with pytest.raises(ArgumentError, match="the geometry"):
         view(Scene(blocks, truth=blocks), tmp_path / "a.html", beside=coarse)
     assert not (tmp_path / "a.html").exists()
@@ -114,10 +127,14 @@ def test_a_folder_holds_the_whole_sequence_one_file_per_frame(tmp_path):
     folder = write_blocks(tmp_path / "a" / "cartesian", frames=1, points=False)
     for frame in range(1, 65):
         for kind in ("label", "bin"):
-            (folder / "evaluation" / f"{frame:06d}.{kind}").symlink_to(folder / "evaluation" / f"000000.{kind}")
+            (folder / "evaluation" / f"{frame:06d}.{kind}").symlink_to(
+                folder / "evaluation" / f"000000.{kind}"
+            )
     result = view(folder, tmp_path / "page")
     assert result.frames == tuple(range(65)) and result.notes == ()
-    files = sorted(path.relative_to(result.out).as_posix() for path in result.out.rglob("*") if path.is_file())
+    files = sorted(
+        path.relative_to(result.out).as_posix() for path in result.out.rglob("*") if path.is_file()
+    )
     assert files == [*(f"frames/{n:06d}.bin" for n in range(65)), "index.html"]
     assert result.size_bytes == sum((result.out / name).stat().st_size for name in files)
     text = (result.out / "index.html").read_text()
@@ -167,7 +184,9 @@ def test_a_run_that_fails_leaves_nothing_and_keeps_the_old_page(tmp_path, name):
     (folder / "evaluation" / "000002.label").write_bytes(b"cut short")
     with pytest.raises(FormatError, match="000002"):
         view(folder, out, overwrite=True)
-    assert {path: path.read_bytes() for path in (tmp_path / "pages").rglob("*") if path.is_file()} == before
+    assert {
+        path: path.read_bytes() for path in (tmp_path / "pages").rglob("*") if path.is_file()
+    } == before
 
 
 @pytest.mark.parametrize("name", ["page", "page.html"])

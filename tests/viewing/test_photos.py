@@ -30,9 +30,13 @@ def camera(name="front"):
 @pytest.fixture(scope="module")
 def photographed(tmp_path_factory):
     """Two frames, of which the second has no image of its second camera."""
-    folder = write_blocks(tmp_path_factory.mktemp("photographed") / "Town01_Light" / "cartesian", frames=2)
+    folder = write_blocks(
+        tmp_path_factory.mktemp("photographed") / "Town01_Light" / "cartesian", frames=2
+    )
     writer = FolderSink(folder.parent).sequence(folder.name)
-    writer.write_document(layout.CAMERAS, cameras_to_json([camera(), camera("second"), camera("never")]))
+    writer.write_document(
+        layout.CAMERAS, cameras_to_json([camera(), camera("second"), camera("never")])
+    )
     for name, frame, gray in (("front", 0, 60), ("front", 1, 90), ("second", 0, 200)):
         image = encode_image(np.full((HEIGHT, WIDTH, 3), gray, np.uint8), "PNG")
         writer.write(f"images.{name}.png", frame, image)
@@ -55,7 +59,9 @@ def test_without_images_nothing_is_added(tmp_path):
     folder = write_blocks(tmp_path / "Town01_Light" / "cartesian", frames=1)
     content = open_content(Scene(folder), 0.2)
     assert content.describe()["cameras"] == []
-    assert not [name for name in content.read(0)[0] if name.startswith("photos") or name == "actors/cameras"]
+    assert not [
+        name for name in content.read(0)[0] if name.startswith("photos") or name == "actors/cameras"
+    ]
 
 
 def test_a_frustum_goes_from_the_camera_to_the_corners_of_its_image():
@@ -84,7 +90,9 @@ def test_the_page_shows_them_until_the_layer_is_off(browser, photographed, tmp_p
     assert page.run(shown) == [400, 400]
     page.run("return carlasc.show(1)")
     assert page.run(shown)[1] is False
-    assert page.run("return carlasc.panels.frustums.lines[0].geometry.attributes.position.count") == 16
+    assert (
+        page.run("return carlasc.panels.frustums.lines[0].geometry.attributes.position.count") == 16
+    )
     page.click('[data-layer="cameras"]')
     assert page.run("return document.getElementById('photos').hidden")
     assert not page.run("return carlasc.panels.frustums.lines[0].visible")

@@ -1,4 +1,6 @@
-"""Recordings for Rerun and Foxglove, read back with the readers of their makers: what is where, and in which colours."""
+"""Recordings for Rerun and Foxglove, read back with the readers of their makers: what is where, and
+in which colours.
+"""
 
 import re
 import shutil
@@ -10,7 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.readers.pixels import BLUE, RED
-from helpers.readers.recorded import POINT, read_mcap, read_metadata, read_rrd, verify_rrd, voxels_of
+from helpers.readers.recorded import (
+    POINT,
+    read_mcap,
+    read_metadata,
+    read_rrd,
+    verify_rrd,
+    voxels_of,
+)
 from helpers.scenes.road_blocks import ROAD, add_actors, add_poses, write_blocks
 
 from carlasc.core.boxes import Boxes
@@ -32,19 +41,27 @@ from carlasc.viewing.viewer import RECORDINGS
 pytestmark = pytest.mark.needs("rerun", "foxglove")
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
-YAW, BOX_YAW = 0.1, 0.3  # the vehicle's turn to the right in each frame, and that of the box in the frame of the sensor
+# the vehicle's turn to the right in each frame, and that of the box in the frame of the sensor
+YAW, BOX_YAW = (
+    0.1,
+    0.3,
+)
 
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """Left-handed: a red block ahead on the right, a box around it, a vehicle that turns to the right, pictures."""
+    """Left-handed: a red block ahead on the right, a box around it, a vehicle that turns to the
+    right, pictures.
+    """
     folder = write_blocks(tmp_path_factory.mktemp("drive") / "Train" / "Town01_Light" / "cartesian")
     writer = FolderSink(folder.parent).sequence(folder.name)
     poses = np.stack([translation((2.0 * i, 1.0 * i, 0.0)) @ rotation_z(YAW * i) for i in range(3)])
     writer.write_document(layout.POSES, layout.encode_poses(poses))
     for frame in range(3):
         box = translation((10.0 + frame, 5.0, 0.0)) @ rotation_z(BOX_YAW)
-        boxes = Boxes.from_poses(np.array([7]), np.array([RED]), box[None], np.array([[4.0, 2.0, 1.5]]))
+        boxes = Boxes.from_poses(
+            np.array([7]), np.array([RED]), box[None], np.array([[4.0, 2.0, 1.5]])
+        )
         writer.write("boxes", frame, boxes.to_table())
         writer.write("bev", frame, np.frombuffer(JPEG, np.uint8))
     return folder
@@ -65,11 +82,15 @@ def test_a_rerun_recording_holds_every_voxel_by_class_where_it_is(drive, tmp_pat
         counts = np.bincount(reader.read(frame).grids[0].labels.reshape(-1))
         for label in (ROAD, RED, BLUE):
             seen = entities[f"/world/ego/grid/{CARLA.names[label]}"][frame]
-            cells, size = np.array(seen["VoxelGridMap:voxel_indices"]), np.array(seen["VoxelGridMap:voxel_size"][0])
+            cells, size = (
+                np.array(seen["VoxelGridMap:voxel_indices"]),
+                np.array(seen["VoxelGridMap:voxel_size"][0]),
+            )
             assert len(cells) == counts[label] and len(np.unique(cells, axis=0)) == len(cells)
             assert seen["VoxelGridMap:colors"] == [color_of(label)]
             middle = (cells + 0.5).mean(0) * size + seen["VoxelGridMap:translation"][0]
-            if label == RED:  # y = +5 is on the right of left-handed data; right-handed, y points to the left
+            # y = +5 is on the right of left-handed data; right-handed, y points to the left
+            if label == RED:
                 np.testing.assert_allclose(middle, (10 + frame, -5, 0), atol=0.5)
             if label == BLUE:
                 np.testing.assert_allclose(middle, (-8, 6, 0), atol=0.5)
@@ -91,17 +112,23 @@ def test_a_rerun_recording_holds_points_flow_boxes_tracks_poses_and_pictures(dri
     np.testing.assert_allclose(boxes["Boxes3D:centers"], [(11, -5, 0)], atol=1e-6)
     np.testing.assert_allclose(boxes["Boxes3D:half_sizes"], [(2, 1, 0.75)])
     x, y, z, w = boxes["Boxes3D:quaternions"][0]
-    np.testing.assert_allclose(rotations_of(np.array([[w, x, y, z]]))[0], rotation_z(-BOX_YAW)[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(
+        rotations_of(np.array([[w, x, y, z]]))[0], rotation_z(-BOX_YAW)[:3, :3], atol=1e-6
+    )
     assert (boxes["Boxes3D:class_ids"], boxes["Boxes3D:labels"]) == ([RED], ["Pedestrian 7"])
     pose = entities["/world/ego"][2]
     np.testing.assert_allclose(pose["Transform3D:translation"], [(4, -2, 0)])
     x, y, z, w = pose["Transform3D:quaternion"][0]
-    np.testing.assert_allclose(rotations_of(np.array([[w, x, y, z]]))[0], rotation_z(-2 * YAW)[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(
+        rotations_of(np.array([[w, x, y, z]]))[0], rotation_z(-2 * YAW)[:3, :3], atol=1e-6
+    )
     np.testing.assert_allclose(
         entities["/world/path"][None]["LineStrips3D:strips"], [[(0, 0, 0), (2, -1, 0), (4, -2, 0)]]
     )
     (way,) = entities["/world/tracks"][2]["LineStrips3D:strips"]
-    expected = [translation((2 * i, -i, 0)) @ rotation_z(-YAW * i) @ (10 + i, -5, 0, 1) for i in range(3)]
+    expected = [
+        translation((2 * i, -i, 0)) @ rotation_z(-YAW * i) @ (10 + i, -5, 0, 1) for i in range(3)
+    ]
     np.testing.assert_allclose(way, np.array(expected)[:, :3], atol=1e-5)
     assert entities["/world/tracks"][2]["LineStrips3D:class_ids"] == [RED]
     assert entities["/world/tracks"][0]["LineStrips3D:strips"] == []
@@ -116,7 +143,8 @@ def test_a_rerun_recording_names_and_colours_the_classes_and_has_a_blueprint(dri
     assert {i: info["label"] for i, info in classes.items()} == {**CARLA.names, 0: "unlabelled"}
     assert all(classes[i]["color"] == color_of(i) for i in CARLA.names if i)
     assert classes[0]["color"] >> 8 == int.from_bytes(bytes(UNLABELLED))
-    assert entities["/world"][None]["ViewCoordinates:xyz"] == [[3, 5, 1]]  # right, forward, up: right-handed
+    # right, forward, up: right-handed
+    assert entities["/world"][None]["ViewCoordinates:xyz"] == [[3, 5, 1]]
     (blueprint,) = pytest.importorskip("rerun.chunk").RrdReader(tmp_path / "scene.rrd").blueprints()
     assert blueprint.application_id == "carlasc"
 
@@ -130,7 +158,11 @@ def test_a_class_that_is_gone_is_removed(tmp_path):
     entities, _ = read_rrd(tmp_path / "scene.rrd")
     vehicle = entities["/world/ego/grid/Vehicle"]
     assert "VoxelGridMap:voxel_indices" in vehicle[0] and set(vehicle[1]) == {"Clear:is_recursive"}
-    (grid,) = [m.message for m in read_mcap(view(folder, tmp_path / "scene.mcap").out)["/grid"] if m.time_s > 0]
+    (grid,) = [
+        m.message
+        for m in read_mcap(view(folder, tmp_path / "scene.mcap").out)["/grid"]
+        if m.time_s > 0
+    ]
     assert BLUE not in voxels_of(grid)[0]["label"]
 
 
@@ -151,13 +183,20 @@ def test_a_foxglove_recording_holds_every_voxel_and_point_where_it_is(drive, tmp
     for frame, (grid, cloud) in enumerate(zip(topics["/grid"], topics["/points"], strict=True)):
         content = reader.read(frame)
         assert grid.time_s == cloud.time_s == pytest.approx(0.1 * frame)
-        assert (grid.message.timestamp.seconds, grid.message.timestamp.nanos) == (0, round(1e8 * frame))
+        assert (grid.message.timestamp.seconds, grid.message.timestamp.nanos) == (
+            0,
+            round(1e8 * frame),
+        )
         assert grid.message.frame_id == cloud.message.frame_id == "ego"
         cells, corner, size = voxels_of(grid.message)
         np.testing.assert_array_equal(cells["label"], content.grids[0].labels)
-        np.testing.assert_array_equal(cells["rgba"][..., 3], np.where(content.grids[0].labels, 255, 0))
+        np.testing.assert_array_equal(
+            cells["rgba"][..., 3], np.where(content.grids[0].labels, 255, 0)
+        )
         red = np.argwhere(cells["label"] == RED)
-        np.testing.assert_allclose(corner + (red + 0.5).mean(0) * size, (10 + frame, -5, 0), atol=0.5)
+        np.testing.assert_allclose(
+            corner + (red + 0.5).mean(0) * size, (10 + frame, -5, 0), atol=0.5
+        )
         assert (cells["rgba"][tuple(red.T)] == (*CARLA.colors[RED], 255)).all()
         points = np.frombuffer(cloud.message.data, POINT)
         assert cloud.message.point_stride == POINT.itemsize
@@ -189,15 +228,23 @@ def test_a_foxglove_recording_holds_flow_boxes_tracks_poses_and_pictures(drive, 
     )  # fmt: skip
     assert (cube.size.x, cube.size.y, cube.size.z) == (4, 2, 1.5)
     assert (cube.pose.position.x, cube.pose.position.y) == pytest.approx((11, -5))
-    np.testing.assert_allclose(turned(cube.pose.orientation), rotation_z(-BOX_YAW)[:3, :3], atol=1e-6)
-    np.testing.assert_allclose((cube.color.r, cube.color.g, cube.color.b), np.array(CARLA.colors[RED]) / 255)
+    np.testing.assert_allclose(
+        turned(cube.pose.orientation), rotation_z(-BOX_YAW)[:3, :3], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        (cube.color.r, cube.color.g, cube.color.b), np.array(CARLA.colors[RED]) / 255
+    )
     (entity,) = topics["/tracks"][2].message.entities
     assert entity.frame_id == "world" and [len(line.points) for line in entity.lines] == [3]
-    assert all(m.message.deletions[0].type == 1 for m in topics["/boxes"] + topics["/tracks"])  # the ones before go
+    # the ones before go
+    assert all(m.message.deletions[0].type == 1 for m in topics["/boxes"] + topics["/tracks"])
     (line,) = topics["/path"][0].message.entities[0].lines
     assert [(p.x, p.y) for p in line.points] == [(0, 0), (2, -1), (4, -2)]
     np.testing.assert_allclose((line.color.r, line.color.g, line.color.b), np.array(PATH) / 255)
-    assert topics["/picture"][0].message.data == JPEG and topics["/picture"][0].message.format == "jpeg"
+    assert (
+        topics["/picture"][0].message.data == JPEG
+        and topics["/picture"][0].message.format == "jpeg"
+    )
     metadata = read_metadata(tmp_path / "scene.mcap")
     assert metadata["classes"] == {str(i): name for i, name in CARLA.names.items() if i}
 
@@ -220,7 +267,9 @@ def test_another_program_reads_the_voxels_and_points_of_a_foxglove_recording_ali
     corner, size = voxels["VoxelGridMap:translation"][0], voxels["VoxelGridMap:voxel_size"][0]
     middle = np.array(corner) + (cells[colors == color_of(RED)] + 0.5).mean(0) * size
     np.testing.assert_allclose(middle, (10, -5, 0), atol=0.5)
-    np.testing.assert_array_equal(np.array(points["Points3D:positions"], np.float32), content.scan.points)
+    np.testing.assert_array_equal(
+        np.array(points["Points3D:positions"], np.float32), content.scan.points
+    )
     np.testing.assert_array_equal(
         points["Points3D:colors"], [color_of(label) for label in content.scan.labels.tolist()]
     )
@@ -234,17 +283,26 @@ def turned(quaternion):
 
 def test_right_handed_data_are_recorded_as_they_are(tmp_path):
     folder = write_blocks(tmp_path / "cartesian", frames=1, metadata={"axes": "right"})
-    cells, corner, size = voxels_of(read_mcap(view(folder, tmp_path / "a.mcap").out)["/grid"][0].message)
+    cells, corner, size = voxels_of(
+        read_mcap(view(folder, tmp_path / "a.mcap").out)["/grid"][0].message
+    )
     red = np.argwhere(cells["label"] == RED)
     np.testing.assert_allclose(corner + (red + 0.5).mean(0) * size, (10, 5, 0), atol=0.5)
     entities, _ = read_rrd(view(folder, tmp_path / "a.rrd").out)
-    np.testing.assert_allclose(entities["/world/ego/flow"][0]["Arrows3D:origins"][0][:2], (10, 5), atol=0.1)
+    np.testing.assert_allclose(
+        entities["/world/ego/flow"][0]["Arrows3D:origins"][0][:2], (10, 5), atol=0.1
+    )
 
 
 def test_a_prediction_is_beside_its_truth_and_its_errors(blocks, tmp_path):
-    prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False)
+    prediction = write_blocks(
+        tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False
+    )
     scene = Scene(prediction, truth=blocks)
-    (content, *_), panels = record_frames(scene.open().right_handed(), None), ("prediction", "truth", "errors")
+    (content, *_), panels = (
+        record_frames(scene.open().right_handed(), None),
+        ("prediction", "truth", "errors"),
+    )
     entities, _ = read_rrd(view(scene, tmp_path / "a.rrd").out)
     topics = read_mcap(view(scene, tmp_path / "a.mcap").out)
     for panel, grid, table in zip(panels, content.grids, (CARLA, CARLA, ERRORS), strict=True):
@@ -257,7 +315,9 @@ def test_a_prediction_is_beside_its_truth_and_its_errors(blocks, tmp_path):
         cells, _, _ = voxels_of(topics[f"/{panel}"][0].message)
         np.testing.assert_array_equal(cells["label"], grid.labels)
         shown = grid.labels > 0
-        np.testing.assert_array_equal(cells["rgba"][shown][:, :3], table.palette[grid.labels[shown]])
+        np.testing.assert_array_equal(
+            cells["rgba"][shown][:, :3], table.palette[grid.labels[shown]]
+        )
     assert {VoxelOutcome.MISSED, VoxelOutcome.INVENTED} <= set(np.unique(content.grids[2].labels))
 
 
@@ -265,7 +325,9 @@ def test_a_prediction_is_beside_its_truth_and_its_errors(blocks, tmp_path):
 def ring(tmp_path_factory):
     """The blocks in a cylindrical grid."""
     spec = GridSpec.published("cylindrical").with_size((32, 48, 4))
-    return write_blocks(tmp_path_factory.mktemp("ring") / "Town01_Light" / "cylindrical", frames=1, spec=spec)
+    return write_blocks(
+        tmp_path_factory.mktemp("ring") / "Town01_Light" / "cylindrical", frames=1, spec=spec
+    )
 
 
 def area(corners, indices):
@@ -289,7 +351,8 @@ def test_a_cylindrical_grid_is_a_surface_of_few_faces_that_look_outward(ring):
         assert len(surface.indices) <= 2 * chosen.sum()
         one, two, three = (surface.corners[surface.indices[:, i]] for i in range(3))
         turn = np.cross(two - one, three - one)
-        assert ((turn * surface.normals[surface.indices[:, 0]]).sum(1) > 0).all()  # counter-clockwise from outside
+        # counter-clockwise from outside
+        assert ((turn * surface.normals[surface.indices[:, 0]]).sum(1) > 0).all()
     road = surfaces[ROAD]
     assert len(road.indices) < 0.5 * 2 * ((whole.colors[:, 0] == ROAD) & ~low).sum()
     red = surfaces[RED]
@@ -308,14 +371,21 @@ def test_cylindrical_grids_are_meshes_in_the_colours_of_their_classes(ring, tmp_
     assert set(scene) == {CARLA.names[label] for label in surfaces}
     for label, surface in surfaces.items():
         mesh = entities[f"/world/ego/grid/{CARLA.names[label]}"][0]
-        np.testing.assert_array_equal(np.array(mesh["Mesh3D:vertex_positions"], np.float32), surface.corners)
+        np.testing.assert_array_equal(
+            np.array(mesh["Mesh3D:vertex_positions"], np.float32), surface.corners
+        )
         np.testing.assert_array_equal(mesh["Mesh3D:triangle_indices"], surface.indices)
         assert mesh["Mesh3D:albedo_factor"] == [color_of(label)]
         (triangles,) = scene[CARLA.names[label]].triangles
-        assert len(triangles.points) == len(surface.corners) and len(triangles.indices) == surface.indices.size
+        assert (
+            len(triangles.points) == len(surface.corners)
+            and len(triangles.indices) == surface.indices.size
+        )
         last = triangles.points[-1]
         np.testing.assert_allclose((last.x, last.y, last.z), surface.corners[-1])
-        np.testing.assert_allclose((triangles.color.r, triangles.color.b), np.array(CARLA.colors[label])[[0, 2]] / 255)
+        np.testing.assert_allclose(
+            (triangles.color.r, triangles.color.b), np.array(CARLA.colors[label])[[0, 2]] / 255
+        )
 
 
 @pytest.mark.parametrize("count", [1, 29_999, 30_000, 30_001, 130_000])
@@ -326,15 +396,16 @@ def test_thinning_keeps_an_even_share_and_always_the_same_points(count):
     assert len(kept) == min(count, 30_000)
     np.testing.assert_array_equal(kept, thin_scan(Scan(points), 30_000).points[:, 0])
     assert (np.diff(kept) > 0).all() and np.diff(kept).max(initial=0) <= 2 * np.ceil(count / 30_000)
-    shares = np.bincount(
-        (kept % 64).astype(int), minlength=64
-    )  # of the lasers of a sensor that fires one after the other
+    # of the lasers of a sensor that fires one after the other
+    shares = np.bincount((kept % 64).astype(int), minlength=64)
     if count > 10_000:
         assert shares.min() > 0.95 * shares.mean()
 
 
 @pytest.mark.parametrize("ending", RECORDINGS)
-def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_first(ending, tmp_path, monkeypatch):
+def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_first(
+    ending, tmp_path, monkeypatch
+):
     folder = write_blocks(tmp_path / "cartesian", frames=6)
     monkeypatch.setattr("carlasc.viewing.viewer.MAX_POINTS", 1000)
     said = []
@@ -350,13 +421,23 @@ def test_points_are_thinned_unless_all_are_asked_for_and_then_the_size_comes_fir
     )
     ((text, before),) = said
     assert before == 0 and done == [(i, 6) for i in range(1, 7)]
-    assert re.fullmatch(rf"{re.escape(str(full.out))}: about \d+ MB: 6 frames with all of their points", text)
+    assert re.fullmatch(
+        rf"{re.escape(str(full.out))}: about \d+ MB: 6 frames with all of their points", text
+    )
     if ending == ".rrd":
-        lengths = [len(read_rrd(r.out)[0]["/world/ego/points"][5]["Points3D:positions"]) for r in (thin, full)]
+        lengths = [
+            len(read_rrd(r.out)[0]["/world/ego/points"][5]["Points3D:positions"])
+            for r in (thin, full)
+        ]
     else:
-        lengths = [len(read_mcap(r.out)["/points"][5].message.data) // POINT.itemsize for r in (thin, full)]
+        lengths = [
+            len(read_mcap(r.out)["/points"][5].message.data) // POINT.itemsize for r in (thin, full)
+        ]
     assert lengths == [1000, 3401]
-    assert isinstance(full, ViewResult) and full.size_bytes == full.out.stat().st_size > thin.size_bytes
+    assert (
+        isinstance(full, ViewResult)
+        and full.size_bytes == full.out.stat().st_size > thin.size_bytes
+    )
 
 
 @pytest.mark.parametrize("ending", RECORDINGS)
@@ -370,7 +451,9 @@ def test_the_size_is_estimated_within_a_few_percent(ending, tmp_path):
 
 
 @pytest.mark.parametrize("ending", RECORDINGS)
-def test_a_scene_without_a_range_shows_its_first_frames_and_says_so(ending, blocks, tmp_path, monkeypatch):
+def test_a_scene_without_a_range_shows_its_first_frames_and_says_so(
+    ending, blocks, tmp_path, monkeypatch
+):
     monkeypatch.setattr("carlasc.viewing.targets.MAX_FRAMES", 2)
     result = view(blocks, tmp_path / f"a{ending}")
     assert result.frames == (0, 1) and result.notes == ("3 frames found, showing the first 2",)
@@ -378,7 +461,9 @@ def test_a_scene_without_a_range_shows_its_first_frames_and_says_so(ending, bloc
 
 
 @pytest.mark.parametrize("ending", RECORDINGS)
-def test_what_exists_is_replaced_only_on_demand_and_a_failure_leaves_nothing(ending, blocks, tmp_path):
+def test_what_exists_is_replaced_only_on_demand_and_a_failure_leaves_nothing(
+    ending, blocks, tmp_path
+):
     out = tmp_path / f"a{ending}"
     out.write_text("mine")
     with pytest.raises(ConflictError):
@@ -410,7 +495,9 @@ def test_a_file_that_cannot_be_written_is_an_error_and_leaves_nothing(ending, bl
         [sys.executable, "-c", FULL_DISK, blocks, tmp_path / f"a{ending}"],
         capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
-    assert StorageError.__name__ in run.stderr.splitlines()[-1] and "cannot be written" in run.stderr, run.stderr
+    assert (
+        StorageError.__name__ in run.stderr.splitlines()[-1] and "cannot be written" in run.stderr
+    ), run.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -444,7 +531,9 @@ def test_actors_without_boxes_are_followed_by_their_instances(tmp_path):
 
 @pytest.fixture(scope="module")
 def actors(tmp_path_factory):
-    """A grid whose red block is actor 70,003, drives ahead at 3 m/s, and has no points; the blue one is actor 6 and stands."""
+    """A grid whose red block is actor 70,003, drives ahead at 3 m/s, and has no points; the blue
+    one is actor 6 and stands.
+    """
     folder = write_blocks(tmp_path_factory.mktemp("actors") / "cartesian", points=False)
     add_actors(folder)
     add_poses(folder, [0.0] * 3, step_m=0.0)
@@ -459,7 +548,9 @@ def test_velocities_of_voxels_are_arrows_and_tracks(actors, tmp_path):
         np.testing.assert_allclose(flow["Arrows3D:vectors"], [(3, 0, 0)], atol=1e-3)
         np.testing.assert_allclose(flow["Arrows3D:origins"][0][:2], (10 + frame, -5), atol=0.3)
         ((arrow,),) = [entity.arrows for entity in topics["/flow"][frame].message.entities]
-        assert (arrow.pose.position.x, arrow.pose.position.y) == pytest.approx((10 + frame, -5), abs=0.3)
+        assert (arrow.pose.position.x, arrow.pose.position.y) == pytest.approx(
+            (10 + frame, -5), abs=0.3
+        )
         assert arrow.shaft_length + arrow.head_length == pytest.approx(3, abs=1e-3)
     (way,) = entities["/world/tracks"][2]["LineStrips3D:strips"]
     np.testing.assert_allclose(np.array(way)[:, :2], [(10, -5), (11, -5), (12, -5)], atol=0.3)
@@ -479,7 +570,9 @@ def test_voxels_are_shown_by_actor_too(actors, tmp_path):
         assert (cells["rgba"][labels == label][:, :3] == color).all()
         parts = [entities[path][1] for path in entities if path.startswith("/world/ego/actors/")]
         (part,) = [
-            part for part in parts if part["VoxelGridMap:colors"] == [color_of(actor_ids(np.array(actor)), ACTORS)]
+            part
+            for part in parts
+            if part["VoxelGridMap:colors"] == [color_of(actor_ids(np.array(actor)), ACTORS)]
         ]
         assert len(part["VoxelGridMap:voxel_indices"]) == np.count_nonzero(labels == label)
     assert read_metadata(tmp_path / "a.mcap")["actors"]["1"] == "no actor"
@@ -540,16 +633,21 @@ def test_sixty_frames_take_less_than_40_megabytes_and_20_seconds(ending, tmp_pat
     rng = np.random.default_rng(0)
     for frame in range(4):
         name = f"{frame:06d}"
-        cloud = np.column_stack([rng.normal(0, 15, (130_000, 2)), rng.uniform(-2, 3, 130_000), np.zeros(130_000)])
+        cloud = np.column_stack(
+            [rng.normal(0, 15, (130_000, 2)), rng.uniform(-2, 3, 130_000), np.zeros(130_000)]
+        )
         cloud.astype(np.float32).tofile(folder / "velodyne" / f"{name}.bin")
         rng.integers(1, 23, 130_000, np.uint32).tofile(folder / "labels" / f"{name}.label")
         moving = rng.random(130_000) < 0.01
-        (moving[:, None] * np.array([8.0, 0, 0])).astype(np.float32).tofile(folder / "predictions" / f"{name}.bin")
+        (moving[:, None] * np.array([8.0, 0, 0])).astype(np.float32).tofile(
+            folder / "predictions" / f"{name}.bin"
+        )
         labels = np.fromfile(folder / "evaluation" / f"{name}.label", np.uint32)
         above = rng.permutation(labels.size)[:8_000]  # beside the 16,384 voxels of the road
         labels[above] = rng.integers(1, 23, 8_000)
         labels.tofile(folder / "evaluation" / f"{name}.label")
-    for frame in range(4, 60):  # four different frames, so that none repeats where a compressor would notice
+    # four different frames, so that none repeats where a compressor would notice
+    for frame in range(4, 60):
         for first in folder.rglob(f"{frame % 4:06d}.*"):
             (first.parent / f"{frame:06d}{first.suffix}").symlink_to(first)
     (folder / layout.TIMES).write_bytes(layout.encode_times(np.arange(60) * 0.1))
@@ -563,9 +661,13 @@ def test_only_the_scene_reads_sequences():
     """Whatever shows data reads it through a `SceneReader`."""
     viewing = Path(sys.modules["carlasc.viewing"].__file__).parent
     allowed = {"scene.py", "finding.py"}
-    reading = re.compile(r"\.sequence\.(read|scan|grid|boxes|frames|fields|metadata|poses|times|params)")
+    reading = re.compile(
+        r"\.sequence\.(read|scan|grid|boxes|frames|fields|metadata|poses|times|params)"
+    )
     found = [
-        path.name for path in viewing.rglob("*.py") if path.name not in allowed and reading.search(path.read_text())
+        path.name
+        for path in viewing.rglob("*.py")
+        if path.name not in allowed and reading.search(path.read_text())
     ]
     assert found == []
 
@@ -593,10 +695,11 @@ def test_recordings_hold_the_images_of_cameras_where_they_were_taken(photographe
     entities, _ = read_rrd(tmp_path / "scene.rrd")
     shown = entities["/world/ego/cameras/right"]
     assert sorted(shown) == [0, 1] and bytes(shown[1]["EncodedImage:blob"][0]) == image
+    # y points to the left
+    np.testing.assert_allclose(shown[1]["Transform3D:translation"], [(1, -0.5, -0.2)], atol=1e-6)
     np.testing.assert_allclose(
-        shown[1]["Transform3D:translation"], [(1, -0.5, -0.2)], atol=1e-6
-    )  # y points to the left
-    np.testing.assert_allclose(np.reshape(shown[1]["Pinhole:image_from_camera"], (3, 3)).T[0], (100, 0, 39.5))
+        np.reshape(shown[1]["Pinhole:image_from_camera"], (3, 3)).T[0], (100, 0, 39.5)
+    )
 
     view(folder, tmp_path / "scene.mcap")
     topics = read_mcap(tmp_path / "scene.mcap")
@@ -608,4 +711,5 @@ def test_recordings_hold_the_images_of_cameras_where_they_were_taken(photographe
     assert (placed.parent_frame_id, placed.child_frame_id) == ("ego", "right")
     turn, q = placed.rotation, np.zeros((1, 4))
     q[0] = turn.w, turn.x, turn.y, turn.z
-    np.testing.assert_allclose(rotations_of(q)[0][:, 2], (0, -1, 0), atol=1e-6)  # it looks to the right
+    # it looks to the right
+    np.testing.assert_allclose(rotations_of(q)[0][:, 2], (0, -1, 0), atol=1e-6)

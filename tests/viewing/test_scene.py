@@ -25,15 +25,23 @@ def predicted(tmp_path):
     folder = write_blocks(tmp_path / "Train" / "Town01_Light" / "cartesian")
     shutil.copytree(folder / "evaluation", folder / "completion")
     params = json.loads((folder / "evaluation" / "params.json").read_text())
-    (folder / "completion" / "params.json").write_text(json.dumps(params | {"carlasc": {"classes": "carlasc11"}}))
+    (folder / "completion" / "params.json").write_text(
+        json.dumps(params | {"carlasc": {"classes": "carlasc11"}})
+    )
     for path in (folder / "completion").glob("*.label"):
-        path.write_bytes(REMAPS["carlasc11"](np.fromfile(path, np.uint32)).astype(np.uint32).tobytes())
+        path.write_bytes(
+            REMAPS["carlasc11"](np.fromfile(path, np.uint32)).astype(np.uint32).tobytes()
+        )
     return folder
 
 
 def test_a_scene_reads_grids_scan_flow_and_time_of_each_frame(blocks):
     reader = Scene(blocks, frames=(1, 3)).open()
-    assert (reader.frames, reader.contents, reader.name) == ((1, 2), ("grid",), "Train / Town01_Light")
+    assert (reader.frames, reader.contents, reader.name) == (
+        (1, 2),
+        ("grid",),
+        "Train / Town01_Light",
+    )
     assert reader.left_handed and reader.table == CARLA and reader.truth is None
     (sequence,) = carlasc.open(blocks).sequences().values()
     for frame in reader.frames:
@@ -99,12 +107,15 @@ def test_the_grid_is_the_one_named_or_evaluation_or_the_first(predicted):
 
 
 def test_a_prediction_in_eleven_classes_is_shown_with_its_truth_in_the_same(blocks, tmp_path):
-    prediction = write_blocks(tmp_path / "Town01_Light" / "cartesian", metadata={"classes": "carlasc11"}, points=False)
+    prediction = write_blocks(
+        tmp_path / "Town01_Light" / "cartesian", metadata={"classes": "carlasc11"}, points=False
+    )
     reader = Scene(prediction, truth=blocks).open()
     assert [panel.title for panel in reader.panels] == ["prediction", "truth", "errors"]
     assert [panel.colors.table for panel in reader.panels] == [CARLASC11, CARLASC11, ERRORS]
     assert reader.read(0).grids[1].labels.max() <= 10
-    swapped = Scene(blocks, truth=prediction).open()  # there is no way from eleven classes to CARLA's
+    # there is no way from eleven classes to CARLA's
+    swapped = Scene(blocks, truth=prediction).open()
     assert swapped.table == CARLASC11 and swapped.read(0).scan.labels.max() <= 10
 
 
@@ -112,8 +123,15 @@ def test_a_prediction_beside_the_data_brings_points_and_truth_to_its_classes(pre
     reader = Scene(predicted, grid="completion", truth=predicted).open()
     content = reader.read(0)
     assert reader.table == CARLASC11
-    assert set(np.unique(content.grids[2].labels)) == {VoxelOutcome.NOT_COMPARED, VoxelOutcome.RIGHT}
-    assert set(np.unique(content.scan.labels)) == {4, CARLASC11.id_of("Road")}  # stored as CARLA's 4 and 7
+    assert set(np.unique(content.grids[2].labels)) == {
+        VoxelOutcome.NOT_COMPARED,
+        VoxelOutcome.RIGHT,
+    }
+    # stored as CARLA's 4 and 7
+    assert set(np.unique(content.scan.labels)) == {
+        4,
+        CARLASC11.id_of("Road"),
+    }
     assert Scene(predicted).open().table == CARLA
 
 
@@ -121,7 +139,10 @@ def test_errors_have_the_counts_of_the_truth(blocks, tmp_path):
     prediction = write_blocks(tmp_path / "Town01_Light" / "cartesian", shift=3.0, points=False)
     own, truth, errors = Scene(prediction, truth=blocks).open().read(0).grids
     assert errors.counts is truth.counts
-    assert (errors.labels[(own.labels == 4) & (truth.labels == 0) & truth.known] == VoxelOutcome.INVENTED).all()
+    assert (
+        errors.labels[(own.labels == 4) & (truth.labels == 0) & truth.known]
+        == VoxelOutcome.INVENTED
+    ).all()
     assert (errors.labels[(own.labels == 0) & (truth.labels == 4)] == VoxelOutcome.MISSED).all()
 
 
@@ -169,7 +190,9 @@ def test_a_sequence_without_grids_and_points_is_refused(tmp_path):
     writer.write("labels", 0, np.zeros(3, np.uint32))
     with pytest.raises(MissingDataError, match="expected a grid or points, found labels"):
         Scene(tmp_path / "s").open()
-    with pytest.raises(MissingDataError, match="expected the field points, found evaluation/counts"):
+    with pytest.raises(
+        MissingDataError, match="expected the field points, found evaluation/counts"
+    ):
         Scene(write_blocks(tmp_path / "b", points=False)).open("flow")
 
 
@@ -185,5 +208,7 @@ def test_a_reader_can_be_sent_to_another_process(blocks):
 
 
 def test_data_with_y_on_the_left_say_so(tmp_path):
-    folder = write_blocks(tmp_path / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False)
+    folder = write_blocks(
+        tmp_path / "cartesian", frames=1, metadata={"frame": "kitti"}, points=False
+    )
     assert not Scene(folder).open().left_handed

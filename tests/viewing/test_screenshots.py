@@ -1,4 +1,7 @@
-"""The pictures of the documentation: a simulated street in the page and in the window. They stay in test-output/."""
+"""The pictures of the documentation: a simulated street in the page and in the window.
+
+They stay in test-output/.
+"""
 
 import subprocess
 import sys
@@ -24,7 +27,15 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     folder = tmp_path_factory.mktemp("town") / "Train" / "Demo_Heavy"
-    simulate(folder, count=2, sensors=6, traffic="heavy", lidar=Lidar(points=60_000), bev=False, run=Run(workers=1))
+    simulate(
+        folder,
+        count=2,
+        sensors=6,
+        traffic="heavy",
+        lidar=Lidar(points=60_000),
+        bev=False,
+        run=Run(workers=1),
+    )
     regrid(folder, GridSpec.published(), run=Run(workers=1))
     return folder / "cartesian"
 
@@ -34,9 +45,16 @@ def test_the_page_of_a_street(browser, street, tmp_path):
     page = Page(browser, view(street, tmp_path / "scene.html").out, (1280, 860))
     page.run("carlasc.panels.setShadows(true)")
     canvas = page.canvas("docs_page")
-    for name in ("Road", "Sidewalk", "Vehicle"):  # open, level faces in the sun have the legend's colours
+    # open, level faces in the sun have the legend's colours
+    for name in (
+        "Road",
+        "Sidewalk",
+        "Vehicle",
+    ):
         assert has_color(canvas, CARLA.colors[CARLA.id_of(name)])
-    page.run("carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.setView('top')")
+    page.run(
+        "carlasc.setTheme('dark'); carlasc.layerButtons.points.click(); carlasc.setView('top')"
+    )
     above = page.canvas("docs_page_dark")
     assert np.median(above.reshape(-1, 3)[:, 0]) < 140
     assert page.complaints() == []
@@ -46,7 +64,15 @@ def test_the_page_of_a_street(browser, street, tmp_path):
 def drive(tmp_path_factory):
     """A street with two grids that were merged from scans in two ways, and the truth."""
     folder = tmp_path_factory.mktemp("drive") / "Train" / "Demo_Heavy"
-    simulate(folder, count=16, sensors=4, traffic="heavy", lidar=Lidar(points=40_000), bev=False, run=Run(workers=1))
+    simulate(
+        folder,
+        count=16,
+        sensors=4,
+        traffic="heavy",
+        lidar=Lidar(points=40_000),
+        bev=False,
+        run=Run(workers=1),
+    )
     regrid(folder, GridSpec.published(), run=Run(workers=1))
     for name in ("tube", "align"):
         scans = FromScans(window=(-6, 6), dynamic=name)
@@ -64,7 +90,9 @@ def drive(tmp_path_factory):
 @pytest.mark.slow
 def test_the_page_of_two_runs(browser, drive, tmp_path):
     truth = drive / "evaluation"
-    result = view(Scene(drive, grid="tube", truth=truth), tmp_path / "scene.html", beside_grid="align")
+    result = view(
+        Scene(drive, grid="tube", truth=truth), tmp_path / "scene.html", beside_grid="align"
+    )
     page = Page(browser, result.out, (1280, 860))
     page.run("carlasc.panels.setShadows(true)")
     page.click("[data-panel='truth']")
@@ -87,12 +115,15 @@ def test_the_window_of_a_street(street):
     OUTPUT.mkdir(exist_ok=True)
     script = (
         "import sys; from PIL import Image; from carlasc.viewing import Scene, Window;"
-        "window = Window(Scene(sys.argv[1]).open(), size=(1280, 720)); Image.fromarray(window.picture()).save(sys.argv[2]); window.close()"
+        "window = Window(Scene(sys.argv[1]).open(), size=(1280, 720)); "
+        "Image.fromarray(window.picture()).save(sys.argv[2]); window.close()"
     )
     target = OUTPUT / "docs_window.png"
     target.unlink(missing_ok=True)
     with virtual_screen() as environment:
-        subprocess.run([sys.executable, "-c", script, street, target], env=environment, check=True, timeout=120)
+        subprocess.run(
+            [sys.executable, "-c", script, street, target], env=environment, check=True, timeout=120
+        )
     image = pytest.importorskip("PIL.Image")
     picture = np.asarray(image.open(target).convert("RGB"))
     assert picture.shape == (720, 1280, 3)

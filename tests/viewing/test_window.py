@@ -83,13 +83,17 @@ def test_keys_step_and_toggle_scan_grid_flow_and_classes(blocks, tmp_path):
     start = seen["start"]
     height, width = start.shape[:2]
     red, blue = middle_of(red_pixels(start)), middle_of(blue_pixels(start))
-    assert red[0] > width / 2 + 20 and red[1] < height / 2  # x = +10, y = +5: ahead and to the right
+    # x = +10, y = +5: ahead and to the right
+    assert red[0] > width / 2 + 20 and red[1] < height / 2
     assert blue[0] < width / 2 - 20 and blue[1] > red[1]
     assert middle_of(red_pixels(seen["last"]))[1] < red[1] - 2  # it drove on
     assert not red_pixels(seen["no_pedestrians"]).any()
     back = np.abs(seen["pedestrians"].astype(int) - seen["last"]).max(-1) > 8
-    assert back.mean() < 0.01  # edges of neighbouring voxels lie on each other: which is on top is Open3D's choice
-    assert red_pixels(seen["pedestrians"]).sum() == pytest.approx(red_pixels(seen["last"]).sum(), rel=0.1)
+    # edges of neighbouring voxels lie on each other: which is on top is Open3D's choice
+    assert back.mean() < 0.01
+    assert red_pixels(seen["pedestrians"]).sum() == pytest.approx(
+        red_pixels(seen["last"]).sum(), rel=0.1
+    )
     assert not blue_pixels(seen["no_grid"]).any()
     assert (seen["no_flow"] != seen["no_grid"]).any()
     assert red_pixels(seen["points"]).sum() > 20
@@ -98,9 +102,14 @@ def test_keys_step_and_toggle_scan_grid_flow_and_classes(blocks, tmp_path):
 
 
 def test_a_key_switches_between_prediction_truth_and_errors(blocks, tmp_path):
-    prediction = write_blocks(tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False, frames=1)
+    prediction = write_blocks(
+        tmp_path / "pred" / "Town01_Light" / "cartesian", shift=3.0, points=False, frames=1
+    )
     seen, state = drive_window(
-        tmp_path, prediction, [("truth", "next_panel", []), ("errors", "next_panel", [])], truth=blocks
+        tmp_path,
+        prediction,
+        [("truth", "next_panel", []), ("errors", "next_panel", [])],
+        truth=blocks,
     )
     keep("window_errors", seen["errors"])
     assert middle_of(red_pixels(seen["start"]))[1] < middle_of(red_pixels(seen["truth"]))[1] - 2
@@ -110,7 +119,9 @@ def test_a_key_switches_between_prediction_truth_and_errors(blocks, tmp_path):
 
 @pytest.fixture
 def open_window(monkeypatch):
-    """Opens a window whose Open3D only records what it is told; returns the window and a function that presses keys."""
+    """Opens a window whose Open3D only records what it is told; returns the window and a function
+    that presses keys.
+    """
     monkeypatch.setenv("DISPLAY", ":0")
     o3d = MagicMock()
     monkeypatch.setattr("carlasc.viewing.window.import_open3d", lambda: o3d)
@@ -119,12 +130,19 @@ def open_window(monkeypatch):
         said = []
         window = Window(Scene(*arguments, **options).open(), report=said.append)
         visualizer = o3d.visualization.VisualizerWithKeyCallback.return_value
-        simple = {call.args[0]: call.args[1] for call in visualizer.register_key_callback.call_args_list}
-        digits = {call.args[0]: call.args[1] for call in visualizer.register_key_action_callback.call_args_list}
+        simple = {
+            call.args[0]: call.args[1] for call in visualizer.register_key_callback.call_args_list
+        }
+        digits = {
+            call.args[0]: call.args[1]
+            for call in visualizer.register_key_action_callback.call_args_list
+        }
 
         def press(key, *modifiers):
             code = ord(key) if isinstance(key, str) else key
-            assert (digits[code](visualizer, *modifiers) if modifiers else simple[code](visualizer)) is True
+            assert (
+                digits[code](visualizer, *modifiers) if modifiers else simple[code](visualizer)
+            ) is True
 
         return window, press, said
 
@@ -160,7 +178,12 @@ def test_keys_do_what_the_help_says(blocks, open_window):
     press("0", 1, 0)
     press("1", 1, 2)
     assert window.state.hidden == {4, 12, 10, 21}
-    assert said[-4:] == ["Pedestrian: hidden", "TrafficSign: hidden", "Vehicle: hidden", "Water: hidden"]
+    assert said[-4:] == [
+        "Pedestrian: hidden",
+        "TrafficSign: hidden",
+        "Vehicle: hidden",
+        "Water: hidden",
+    ]
     press("4", 1, 0)
     assert said[-1] == "Pedestrian: shown"
     press("A")
@@ -184,7 +207,12 @@ def test_the_help_names_every_key_and_the_class_of_every_digit(blocks, open_wind
     *keys, classes = help_lines(window)
     assert [line.split("  ")[0] for line in keys] == list(KEYS)
     named = dict(part.split(" ", 1) for part in classes.split(", "))
-    assert (named["1"], named["0"], named["Shift+1"], named["Ctrl+1"]) == ("Building", "Vehicle", "Wall", "Water")
+    assert (named["1"], named["0"], named["Shift+1"], named["Ctrl+1"]) == (
+        "Building",
+        "Vehicle",
+        "Wall",
+        "Water",
+    )
 
 
 def test_playing_goes_to_the_next_frame_when_it_is_due_and_starts_again_after_the_last(
@@ -211,7 +239,9 @@ def test_without_a_screen_the_window_says_what_to_do(blocks, monkeypatch):
     monkeypatch.setattr("carlasc.viewing.window.import_open3d", MagicMock())
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(DependencyError, match=r"window: expected a screen, found no DISPLAY: .*`out=\"page.html\"`"):
+    with pytest.raises(
+        DependencyError, match=r"window: expected a screen, found no DISPLAY: .*`out=\"page.html\"`"
+    ):
         Window(Scene(blocks).open())
 
 
@@ -233,7 +263,8 @@ def test_hidden_classes_hide_points_too_and_colours_are_those_of_the_table(block
     pedestrian, road = (np.array(CARLA.colors[label]) / 255 for label in (4, 7))
     block = np.isclose(colors, pedestrian).all(1)
     assert np.isclose(colors[~block], road).all() and 0 < block.sum() < len(block)
-    np.testing.assert_allclose(points[block].mean(0), (10, -5, 0), atol=0.2)  # Open3D's y points to the left
+    # Open3D's y points to the left
+    np.testing.assert_allclose(points[block].mean(0), (10, -5, 0), atol=0.2)
     press("4", 1, 0)
     _, colors = drawn_arrays(window)
     assert np.isclose(colors, road).all()
@@ -247,7 +278,8 @@ def test_arrows_point_along_the_flow(blocks, open_window):
     press("P")
     press("P")
     vertices = drawn_arrays(window)[-2]
-    assert vertices[:, 0].min() > 9 and vertices[:, 0].max() == pytest.approx(20, abs=0.5)  # 10 m/s ahead, from x = 10
+    # 10 m/s ahead, from x = 10
+    assert vertices[:, 0].min() > 9 and vertices[:, 0].max() == pytest.approx(20, abs=0.5)
 
 
 def test_boxes_are_drawn_where_they_are_in_the_colours_of_their_classes(tmp_path, open_window):
@@ -261,9 +293,11 @@ def test_boxes_are_drawn_where_they_are_in_the_colours_of_their_classes(tmp_path
     drawn_arrays(window)
     press("B")
     corners, colors = drawn_arrays(window)
-    np.testing.assert_allclose(corners[:24].min(0), (9, -7, -0.75), atol=1e-6)  # right-handed: y points to the left
+    # right-handed: y points to the left
+    np.testing.assert_allclose(corners[:24].min(0), (9, -7, -0.75), atol=1e-6)
     np.testing.assert_allclose(corners[:24].max(0), (11, -3, 0.75), atol=1e-6)
-    np.testing.assert_allclose(corners[24:], [(10, -5, -0.75), (10, -7.8, -0.75)], atol=1e-6)  # a bar to its front
+    # a bar to its front
+    np.testing.assert_allclose(corners[24:], [(10, -5, -0.75), (10, -7.8, -0.75)], atol=1e-6)
     assert len(colors) == 13 and np.allclose(colors, np.array(CARLA.colors[4]) / 255)
     ends = window.o3d.utility.Vector2iVector.call_args.args[0]
     lengths = np.linalg.norm(corners[ends[:, 0]] - corners[ends[:, 1]], axis=1)
@@ -272,7 +306,9 @@ def test_boxes_are_drawn_where_they_are_in_the_colours_of_their_classes(tmp_path
 
 @pytest.fixture
 def actors(tmp_path):
-    """A vehicle that stands, and a grid whose red block is actor 70,003 and drives a metre in each of three frames. There are no boxes."""
+    """A vehicle that stands, and a grid whose red block is actor 70,003 and drives a metre in each
+    of three frames. There are no boxes.
+    """
     folder = write_blocks(tmp_path / "Town01_Light" / "cartesian")
     add_actors(folder)
     add_poses(folder, [0.0] * 3, step_m=0.0)
@@ -322,7 +358,10 @@ def test_the_panel_key_shows_the_grid_by_actor(actors, open_window):
         ("libGL.so.1: cannot open shared object file: No such file or directory", "libgl1"),
         ("libX11.so.6: cannot open shared object file: No such file or directory", "libx11-6"),
         ("libudev.so.1: cannot open shared object file: No such file or directory", "libudev1"),
-        ("libusb-1.0.so.0: cannot open shared object file: No such file or directory", "libusb-1.0-0"),
+        (
+            "libusb-1.0.so.0: cannot open shared object file: No such file or directory",
+            "libusb-1.0-0",
+        ),
         ("libidn2.so.0: cannot open shared object file: No such file or directory", "libidn2-0"),
         ("libgomp.so.1: cannot open shared object file: No such file or directory", "libgomp1"),
     ],
@@ -336,12 +375,19 @@ def test_the_package_of_a_missing_library_is_named(monkeypatch, message, package
     with pytest.raises(DependencyError) as error:
         import_open3d()
     said = str(error.value)
-    assert f"apt-get install {package} " in said and message.split(":")[0] in said and '`out="page.html"`' in said
+    assert (
+        f"apt-get install {package} " in said
+        and message.split(":")[0] in said
+        and '`out="page.html"`' in said
+    )
     assert "\n" not in said
 
 
 def test_an_unknown_library_is_named():
-    assert missing_library("libstrange.so.3: cannot open shared object file: No such file") == "libstrange.so.3"
+    assert (
+        missing_library("libstrange.so.3: cannot open shared object file: No such file")
+        == "libstrange.so.3"
+    )
     assert "page.html" in advice("libstrange.so.3")
     assert missing_library("undefined symbol: foo") is None
 

@@ -1,4 +1,6 @@
-"""`record`: a drive on a CARLA server among spawned traffic, written as a raw capture (see the format page, `docs/format.md#raw-capture`)."""
+"""`record`: a drive on a CARLA server among spawned traffic, written as a raw capture (see the
+format page, `docs/format.md#raw-capture`).
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.layout import CAMERAS
 
 SETTINGS_FILE = "recording.json"
-_REPLAY_TOLERANCE_M = 0.02  # maximum distance between the ego sensor positions of the replay and of the recorded drive
+# maximum distance between the ego sensor positions of the replay and of the recorded drive
+_REPLAY_TOLERANCE_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -77,10 +80,11 @@ def record(
 ) -> RecordResult:
     """Record a drive on a CARLA server as a raw capture.
 
-    At the end, also after an error or Ctrl-C, the spawned actors are destroyed and the settings of the server are restored.
+    At the end, also after an error or Ctrl-C, the spawned actors are destroyed and the settings of
+    the server are restored.
 
-    A second run with the same settings replays the drive from its start with the same seed, and writes the missing frames. It stops if the
-    replay deviates from the recorded drive.
+    A second run with the same settings replays the drive from its start with the same seed, and
+    writes the missing frames. It stops if the replay deviates from the recorded drive.
 
     Args:
         out: folder of the sequence, or its URL in an object store. Files go to `<out>/raw`.
@@ -92,7 +96,8 @@ def record(
         traffic: "light", "medium" or "heavy": 25, 50 or 100 vehicles, and as many pedestrians.
         lidar: model of the LiDARs; None takes the model of the data set.
         bev: whether to write bird's-eye pictures.
-        cameras: names of cameras on the vehicle, as in `carlasc.simulate`. Each has images of colour, class and depth.
+        cameras: names of cameras on the vehicle, as in `carlasc.simulate`. Each has images of
+            colour, class and depth.
         carla: module of the client; None takes the package `carla`.
         progress: called with (finished frames, number of frames).
 
@@ -116,10 +121,16 @@ def record(
         import_extra("PIL.Image", "carla")
     writer, written = CaptureWriter(out), 0
     with Server(server, carla) as connection:
-        settings = _ServerSettings(town, traffic, sensors, seed, bev, connection.version, lidar or Lidar())
-        written_settings = dataclasses.asdict(settings) | ({"cameras": list(cameras)} if cameras else {})
+        settings = _ServerSettings(
+            town, traffic, sensors, seed, bev, connection.version, lidar or Lidar()
+        )
+        written_settings = dataclasses.asdict(settings) | (
+            {"cameras": list(cameras)} if cameras else {}
+        )
         writer.check_settings(SETTINGS_FILE, written_settings, "carlasc capture")
-        complete = {frame for frame in range(count) if writer.has_frame(frame, sensors, bev, images)}
+        complete = {
+            frame for frame in range(count) if writer.has_frame(frame, sensors, bev, images)
+        }
         missing = set(range(count)) - (complete & writer.timed_frames(sensors))
         if not missing:
             return RecordResult(writer.out, count, 0, sensors, 0, 0, connection.version)
@@ -132,12 +143,15 @@ def record(
         rig = SensorRig(connection, actors.ego, offsets, settings.lidar, bev, seed, models)
         spawned = (int(actor.id) for actor in (actors.ego, *actors.vehicles, *actors.walkers))
         numbers = ActorNumbers([*connection.initial_actors, *spawned])
-        writer.write_settings(SETTINGS_FILE, written_settings)  # only now it is certain that the town exists
+        # only now it is certain that the town exists
+        writer.write_settings(SETTINGS_FILE, written_settings)
         if models:
             writer.target.put(CAMERAS, cameras_to_json(models))
         with TimesLog(writer) as log:
             for frame in range(max(missing) + 1):
-                recordings, times_s, picture, photos = rig.measure(connection.tick(), frame, numbers)
+                recordings, times_s, picture, photos = rig.measure(
+                    connection.tick(), frame, numbers
+                )
                 if frame in missing:
                     _write_frame(writer, frame, recordings, picture)
                     writer.write_images(frame, photos)
@@ -148,11 +162,19 @@ def record(
                 if progress is not None:
                     progress(frame + 1, count)
     return RecordResult(
-        writer.out, count, written, sensors, len(actors.vehicles), len(actors.walkers), connection.version
+        writer.out,
+        count,
+        written,
+        sensors,
+        len(actors.vehicles),
+        len(actors.walkers),
+        connection.version,
     )
 
 
-def _write_frame(writer: CaptureWriter, frame: int, recordings: list[SensorRecording], picture: bytes | None) -> None:
+def _write_frame(
+    writer: CaptureWriter, frame: int, recordings: list[SensorRecording], picture: bytes | None
+) -> None:
     """Write a frame without its times."""
     for sensor, recording in enumerate(recordings):
         writer.write(sensor, frame, recording)
@@ -198,7 +220,8 @@ def spawn_actors(server: Server, number: int, port: int, rng: np.random.Generato
 
     Args:
         server: the server, with its town loaded.
-        number: number of other vehicles, and of pedestrians. Fewer are spawned if the town has too little room.
+        number: number of other vehicles, and of pedestrians. Fewer are spawned if the town has too
+            little room.
         port: port of the traffic manager.
         rng: source of the random numbers.
 
@@ -213,7 +236,10 @@ def spawn_actors(server: Server, number: int, port: int, rng: np.random.Generato
     ego_blueprints = [by_name[name] for name in EGO_BLUEPRINTS if name in by_name] or blueprints
     if not ego_blueprints or not free:
         raise MissingDataError(
-            server.where, expected="vehicles and spawn points", found="none", advice="try another `town`"
+            server.where,
+            expected="vehicles and spawn points",
+            found="none",
+            advice="try another `town`",
         )
 
     ego = None
@@ -221,16 +247,23 @@ def spawn_actors(server: Server, number: int, port: int, rng: np.random.Generato
         ego = _spawn_vehicle(server, ego_blueprints[0], free.pop(), "hero", port)
     vehicles: list[Any] = []
     while free and len(vehicles) < number:
-        vehicle = _spawn_vehicle(server, blueprints[rng.integers(len(blueprints))], free.pop(), "autopilot", port)
+        vehicle = _spawn_vehicle(
+            server, blueprints[rng.integers(len(blueprints))], free.pop(), "autopilot", port
+        )
         vehicles += [] if vehicle is None else [vehicle]
     if ego is None:
         raise MissingDataError(
-            server.where, expected="a free spawn point for the ego vehicle", found="none", advice="try another `town`"
+            server.where,
+            expected="a free spawn point for the ego vehicle",
+            found="none",
+            advice="try another `town`",
         )
     return SpawnedActors(ego, tuple(vehicles), tuple(_spawn_walkers(server, number, rng)))
 
 
-def _spawn_vehicle(server: Server, blueprint: Any, transform: Any, role: str, port: int) -> Any | None:
+def _spawn_vehicle(
+    server: Server, blueprint: Any, transform: Any, role: str, port: int
+) -> Any | None:
     """Spawn a vehicle on autopilot. Return None if there is no room for it."""
     if blueprint.has_attribute("role_name"):
         blueprint.set_attribute("role_name", role)
@@ -252,11 +285,15 @@ def _spawn_walkers(server: Server, number: int, rng: np.random.Generator) -> lis
         start = server.random_sidewalk_location()
         walker = None
         if start is not None:
-            walker = server.spawn(blueprints[rng.integers(len(blueprints))], server.transform_at(start))
+            walker = server.spawn(
+                blueprints[rng.integers(len(blueprints))], server.transform_at(start)
+            )
         if walker is None:
             continue
         walkers.append(walker)
-        controller = server.spawn(controller_blueprints[0], server.transform(), parent=walker, before_destroy="stop")
+        controller = server.spawn(
+            controller_blueprints[0], server.transform(), parent=walker, before_destroy="stop"
+        )
         controllers += [] if controller is None else [controller]
     server.tick()  # a controller can be started only after its first tick
     for controller in controllers:

@@ -21,11 +21,12 @@ from carlasc.errors import MissingDataError
 from carlasc.storage.camera_files import encode_image
 from carlasc.storage.layout import FRAME_PERIOD_S
 
+# by folder of images: camera of CARLA and file suffix
 _KINDS = {
     "images": ("rgb", "jpg"),
     "image_labels": ("semantic_segmentation", "png"),
     "image_depths": ("depth", "png"),
-}  # by folder of images: camera of CARLA and file suffix
+}
 _FARTHEST_M, _DEPTH_STEP = 1000.0, 256.0
 
 RENUMBERED_FROM = (0, 9, 14)
@@ -35,7 +36,9 @@ _ROTATIONS_PER_S = round(1 / FRAME_PERIOD_S)  # one rotation per frame
 
 
 class SensorRig:
-    """The semantic LiDARs on the ego vehicle, with the orientation of the vehicle, and the camera above it."""
+    """The semantic LiDARs on the ego vehicle, with the orientation of the vehicle, and the camera
+    above it.
+    """
 
     def __init__(
         self,
@@ -56,7 +59,8 @@ class SensorRig:
             lidar: model of the LiDARs. The semantic LiDAR of CARLA has no noise, so noise is added.
             bev: whether to spawn the camera above the vehicle.
             seed: seed of the noise.
-            cameras: level cameras on the vehicle, without distortion. Their poses are relative to the first LiDAR.
+            cameras: level cameras on the vehicle, without distortion. Their poses are relative to
+                the first LiDAR.
 
         Raises:
             MissingDataError: the server has no such sensor, or no room for it.
@@ -64,7 +68,9 @@ class SensorRig:
         """
         self._server, self._lidar, self._seed = server, lidar, seed
         self._ego_id = int(ego.id)
-        self._remap = REMAPS["carla0914_to_carla"] if server.version_numbers >= RENUMBERED_FROM else None
+        self._remap = (
+            REMAPS["carla0914_to_carla"] if server.version_numbers >= RENUMBERED_FROM else None
+        )
         self._lidars: list[queue.Queue[Any]] = []
         for x, y, z in offsets.tolist():
             attributes = {
@@ -76,7 +82,9 @@ class SensorRig:
                 "lower_fov": lidar.lower_deg,
             }
             self._lidars.append(
-                self._mount(ego, "sensor.lidar.ray_cast_semantic", attributes, server.transform((x, y, z)))
+                self._mount(
+                    ego, "sensor.lidar.ray_cast_semantic", attributes, server.transform((x, y, z))
+                )
             )
         self._camera: queue.Queue[Any] | None = None
         if bev:
@@ -100,24 +108,32 @@ class SensorRig:
             numbers: numbers of the actors in the capture.
 
         Returns:
-            The recording of each LiDAR, its simulation time in seconds, the bird's-eye picture as JPEG bytes or None, and the images of
-            the cameras on the vehicle as bytes of files, by field.
+            The recording of each LiDAR, its simulation time in seconds, the bird's-eye picture as
+            JPEG bytes or None, and the images of the cameras on the vehicle as bytes of files, by
+            field.
 
         Raises:
             ServerError: a measurement does not arrive.
-            FormatError: a class id is not in the class table, or a measurement does not have the format of CARLA.
+            FormatError: a class id is not in the class table, or a measurement does not have the
+                format of CARLA.
         """
         sweeps = [
             decode_sweep(self._server.measurement(arrived, tick, f"LiDAR {number}"))
             for number, arrived in enumerate(self._lidars)
         ]
-        image = None if self._camera is None else self._server.measurement(self._camera, tick, "the camera")
+        image = (
+            None
+            if self._camera is None
+            else self._server.measurement(self._camera, tick, "the camera")
+        )
         recordings = [
             self._to_recording(sweep, numbers, np.random.default_rng((self._seed, frame, sensor)))
             for sensor, sweep in enumerate(sweeps)
         ]
         photos = {
-            field: self._to_file(field, self._server.measurement(arrived, tick, f"the camera of {field}"))
+            field: self._to_file(
+                field, self._server.measurement(arrived, tick, f"the camera of {field}")
+            )
             for field, arrived in self._photos.items()
         }
         picture = None if image is None else encode_bev(image)
@@ -126,7 +142,9 @@ class SensorRig:
     def _mount_camera(
         self, ego: Any, camera: CameraModel, ego_lidar: NDArray[np.float64], kind: tuple[str, str]
     ) -> queue.Queue[Any]:
-        """Spawn a camera of CARLA at the pose of a camera model, and return the queue of its images."""
+        """Spawn a camera of CARLA at the pose of a camera model, and return the queue of its
+        images.
+        """
         place = camera.sensor_T_camera
         x, y, z = (place[:3, 3] + ego_lidar).tolist()
         yaw_deg = math.degrees(math.atan2(place[1, 2], place[0, 2]))
@@ -136,7 +154,9 @@ class SensorRig:
         return self._mount(ego, f"sensor.camera.{kind[0]}", attributes, where)
 
     def _to_file(self, field: str, image: Any) -> NDArray[np.uint8]:
-        """Return an image as the bytes of a file: colours, class ids, or depths, which CARLA encodes in three channels."""
+        """Return an image as the bytes of a file: colours, class ids, or depths, which CARLA
+        encodes in three channels.
+        """
         pixels = _rgb(image)
         folder = field.partition(".")[0]
         if folder == "images":
@@ -148,9 +168,13 @@ class SensorRig:
                 return encode_image(pixels[..., 0], "PNG")
             return encode_image(self._remap(pixels[..., 0], where).astype(np.uint8), "PNG")
         shares = (pixels @ np.array([1.0, 256.0, 65536.0])) / (256**3 - 1)
-        return encode_image(np.rint(shares * _FARTHEST_M * _DEPTH_STEP).clip(1, 65535).astype(np.uint16), "PNG")
+        return encode_image(
+            np.rint(shares * _FARTHEST_M * _DEPTH_STEP).clip(1, 65535).astype(np.uint16), "PNG"
+        )
 
-    def _mount(self, ego: Any, name: str, attributes: dict[str, Any], transform: Any) -> queue.Queue[Any]:
+    def _mount(
+        self, ego: Any, name: str, attributes: dict[str, Any], transform: Any
+    ) -> queue.Queue[Any]:
         """Spawn a sensor on the ego vehicle, and return the queue of its measurements."""
         found = self._server.blueprints(name)
         if not found:
@@ -167,11 +191,15 @@ class SensorRig:
             raise MissingDataError(self._server.where, expected=f"room for {name}", found="none")
         return self._server.listen(sensor)
 
-    def _to_recording(self, sweep: SemanticSweep, numbers: ActorNumbers, rng: np.random.Generator) -> SensorRecording:
+    def _to_recording(
+        self, sweep: SemanticSweep, numbers: ActorNumbers, rng: np.random.Generator
+    ) -> SensorRecording:
         """Remove the points on the ego vehicle, add noise, and convert class ids and actor ids."""
         seen = sweep.detections[sweep.detections["actor"] != self._ego_id]
         points = np.stack([seen["x"], seen["y"], seen["z"]], axis=1)
-        points = (points + rng.uniform(-self._lidar.noise_m, self._lidar.noise_m, points.shape)).astype(np.float32)
+        points = (
+            points + rng.uniform(-self._lidar.noise_m, self._lidar.noise_m, points.shape)
+        ).astype(np.float32)
         tags = np.ascontiguousarray(seen["tag"])
         where = f"CARLA {self._server.version}, semantic LiDAR"
         if self._remap is not None:
@@ -182,11 +210,15 @@ class SensorRig:
         actors = np.unique(seen["actor"][seen["actor"] > 0])
         velocities = rotate_vectors(invert(sweep.world_T_sensor), self._server.velocities(actors))
         rows = np.column_stack([numbers.of(actors).astype(np.float64), velocities])
-        return SensorRecording(Scan(points, labels, instances=numbers.of(seen["actor"])), sweep.world_T_sensor, rows)
+        return SensorRecording(
+            Scan(points, labels, instances=numbers.of(seen["actor"])), sweep.world_T_sensor, rows
+        )
 
 
 class ActorNumbers:
-    """Numbers for the actors of the server, in the order of spawning, equal in every run. 0 is no actor."""
+    """Numbers for the actors of the server, in the order of spawning, equal in every run. 0 is no
+    actor.
+    """
 
     def __init__(self, actors: list[int]) -> None:
         """Number actors from 1.
@@ -200,12 +232,20 @@ class ActorNumbers:
         """Return (N,) numbers for (N,) ids of actors. A new actor gets the next number."""
         ids, position = np.unique(actors, return_inverse=True)
         numbers = [self._numbers.setdefault(int(actor), len(self._numbers)) for actor in ids]
-        return np.array(numbers, np.uint32)[position.reshape(-1)] if len(ids) else np.empty(0, np.uint32)
+        return (
+            np.array(numbers, np.uint32)[position.reshape(-1)]
+            if len(ids)
+            else np.empty(0, np.uint32)
+        )
 
 
 def photo_fields(cameras: Sequence[CameraModel]) -> tuple[str, ...]:
     """Return the fields of the layout for the images of cameras."""
-    return tuple(f"{folder}.{camera.name}.{suffix}" for camera in cameras for folder, (_, suffix) in _KINDS.items())
+    return tuple(
+        f"{folder}.{camera.name}.{suffix}"
+        for camera in cameras
+        for folder, (_, suffix) in _KINDS.items()
+    )
 
 
 def encode_bev(image: Any) -> bytes:
@@ -215,5 +255,7 @@ def encode_bev(image: Any) -> bytes:
 
 def _rgb(image: Any) -> NDArray[np.uint8]:
     """Return the (H, W, 3) pixels of a `carla.Image`, which are BGRA."""
-    pixels = np.frombuffer(bytes(image.raw_data), np.uint8).reshape(int(image.height), int(image.width), 4)
+    pixels = np.frombuffer(bytes(image.raw_data), np.uint8).reshape(
+        int(image.height), int(image.width), 4
+    )
     return np.ascontiguousarray(pixels[..., 2::-1])

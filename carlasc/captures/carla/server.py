@@ -1,7 +1,7 @@
 """The connection to a CARLA server. Only this module calls the `carla` package.
 
-At the end of the `with` block of a connection, also after an error, all changes on the server are undone: actors are destroyed in reverse
-order, and settings are restored.
+At the end of the `with` block of a connection, also after an error, all changes on the server are
+undone: actors are destroyed in reverse order, and settings are restored.
 """
 
 from __future__ import annotations
@@ -22,8 +22,12 @@ from carlasc.core.geometry import Transform
 from carlasc.errors import ArgumentError, CarlascError, FormatError, import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
 
-DETECTION = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("cos", "<f4"), ("actor", "<u4"), ("tag", "<u4")])
-"""One return of the semantic LiDAR of CARLA: position, cosine of the angle of incidence, actor id, class id."""
+DETECTION = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("cos", "<f4"), ("actor", "<u4"), ("tag", "<u4")]
+)
+"""One return of the semantic LiDAR of CARLA: position, cosine of the angle of incidence, actor id,
+class id.
+"""
 
 
 class ServerError(CarlascError):
@@ -63,7 +67,9 @@ class ServerOptions:
 
 
 class Server:
-    """A connection to a CARLA server, used in a `with` block. At its end, the previous state of the server is restored.
+    """A connection to a CARLA server, used in a `with` block.
+
+    At its end, the previous state of the server is restored.
 
     Attributes:
         carla: module of the client.
@@ -104,7 +110,9 @@ class Server:
         """
         match = re.match(r"v?(\d+)\.(\d+)(?:\.(\d+))?", self.version)
         if match is None:
-            raise ServerError(self.where, expected="a version such as 0.9.15", found=repr(self.version))
+            raise ServerError(
+                self.where, expected="a version such as 0.9.15", found=repr(self.version)
+            )
         return tuple(int(part or 0) for part in match.groups())
 
     def load_town(self, town: str) -> None:
@@ -115,12 +123,21 @@ class Server:
             ServerError: the server does not answer.
         """
         with self._waiting_for(f"the town {town}"):
-            towns = sorted({str(name).rsplit("/", 1)[-1] for name in self._client.get_available_maps()})
+            towns = sorted(
+                {str(name).rsplit("/", 1)[-1] for name in self._client.get_available_maps()}
+            )
             if town not in towns:
-                raise ArgumentError("town", expected=f"one of the server's towns: {', '.join(towns)}", found=repr(town))
+                raise ArgumentError(
+                    "town",
+                    expected=f"one of the server's towns: {', '.join(towns)}",
+                    found=repr(town),
+                )
             before = self._client.get_world().get_settings()
             self._cleanup.callback(
-                self._restore, before.synchronous_mode, before.fixed_delta_seconds, before.no_rendering_mode
+                self._restore,
+                before.synchronous_mode,
+                before.fixed_delta_seconds,
+                before.no_rendering_mode,
             )
             self._world = self._client.load_world(town)
             settings = self._world.get_settings()
@@ -130,7 +147,9 @@ class Server:
             self.initial_actors = tuple(sorted(int(actor.id) for actor in self._world.get_actors()))
 
     def set_up_traffic(self, port: int, seed: int) -> None:
-        """Set the traffic manager to synchronous mode, and set its seed and the seed of the pedestrians."""
+        """Set the traffic manager to synchronous mode, and set its seed and the seed of the
+        pedestrians.
+        """
         with self._waiting_for("its traffic manager"):
             manager = self._client.get_trafficmanager(port)
             self._cleanup.callback(self._attempt, lambda: manager.set_synchronous_mode(False))
@@ -140,7 +159,10 @@ class Server:
 
     def blueprints(self, pattern: str) -> list[Any]:
         """Return the blueprints that match a pattern such as "vehicle.*", sorted by name."""
-        return sorted(self._world.get_blueprint_library().filter(pattern), key=lambda blueprint: str(blueprint.id))
+        return sorted(
+            self._world.get_blueprint_library().filter(pattern),
+            key=lambda blueprint: str(blueprint.id),
+        )
 
     def spawn_points(self) -> list[Any]:
         """Return the transforms at which vehicles may be spawned."""
@@ -151,11 +173,16 @@ class Server:
         return self._world.get_random_location_from_navigation()
 
     def transform(
-        self, xyz: tuple[float, float, float] = (0.0, 0.0, 0.0), pitch_deg: float = 0.0, yaw_deg: float = 0.0
+        self,
+        xyz: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        pitch_deg: float = 0.0,
+        yaw_deg: float = 0.0,
     ) -> Any:
         """Return a CARLA transform from a position, metres, pitch and yaw, degrees, without roll."""
         carla = self.carla
-        return carla.Transform(carla.Location(*xyz), carla.Rotation(pitch=pitch_deg, yaw=yaw_deg, roll=0.0))
+        return carla.Transform(
+            carla.Location(*xyz), carla.Rotation(pitch=pitch_deg, yaw=yaw_deg, roll=0.0)
+        )
 
     def transform_at(self, location: Any) -> Any:
         """Return a CARLA transform from a location, without rotation."""
@@ -225,7 +252,9 @@ class Server:
                 )
 
     def velocities(self, actors: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Return (K, 3) velocities of actors after the last tick, m/s, world frame; zero for actors that no longer exist."""
+        """Return (K, 3) velocities of actors after the last tick, m/s, world frame; zero for actors
+        that no longer exist.
+        """
         snapshot = self._world.get_snapshot()
         velocities = np.zeros((len(actors), 3))
         for row, actor in enumerate(actors):
@@ -239,12 +268,17 @@ class Server:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._cleanup.close()
         if self._cleanup_errors and error is None:
             raise ServerError(
-                self.where, problem=f"could not be cleaned up: {self._cleanup_errors[0]}", advice="restart the server"
+                self.where,
+                problem=f"could not be cleaned up: {self._cleanup_errors[0]}",
+                advice="restart the server",
             )
 
     def _destroy(self, actor: Any, before: str | None) -> None:
@@ -267,9 +301,9 @@ class Server:
         """Run one step of the clean-up. An error is recorded, and the other steps follow."""
         try:
             action()
-        except (
-            RuntimeError
-        ) as error:  # the client raises no other errors: the actor no longer exists, or the server does not answer
+        # the client raises no other errors: the actor no longer exists, or the server does not
+        # answer
+        except RuntimeError as error:
             self._cleanup_errors.append(str(error))
 
     @contextmanager

@@ -1,4 +1,5 @@
-"""The actors of the town in any frame: moving and parked vehicles, and pedestrians, each with its pose, velocity and shape.
+"""The actors of the town in any frame: moving and parked vehicles, and pedestrians, each with its
+pose, velocity and shape.
 
 Pedestrians walk around blocks, or stand on the sidewalk.
 """
@@ -51,7 +52,9 @@ class Walk:
 
     def pose(self, elapsed_s: float, height_m: float) -> Transform:
         """Return (4, 4) world_T_pedestrian at a time. The feet are at `height_m`."""
-        stations = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.loop, axis=0), axis=1))])
+        stations = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(self.loop, axis=0), axis=1))]
+        )
         along = (self.start_m + self.speed_mps * elapsed_s) % stations[-1]
         point = [np.interp(along, stations, self.loop[:, axis]) for axis in (0, 1)]
         heading = self.heading_rad
@@ -65,7 +68,8 @@ class Walk:
 def draw_walks(rng: np.random.Generator, blocks: tuple[CityBlock, ...], count: int) -> list[Walk]:
     """Draw random pedestrians: a third walk around a block in each direction, and a third stand.
 
-    Pedestrians of one block and direction have the same speed and distance from the kerb, so they do not meet.
+    Pedestrians of one block and direction have the same speed and distance from the kerb, so they
+    do not meet.
     """
     speeds = rng.uniform(1.0, 1.8, (len(blocks), 2))
     walks: list[Walk] = []
@@ -101,7 +105,8 @@ class TownActor:
 
     Attributes:
         id: number of the actor, the same in every frame of a drive. The ego vehicle is 1.
-        world_T_actor: (4, 4) pose. The x axis of the actor's frame is forward, its origin is on the ground.
+        world_T_actor: (4, 4) pose. The x axis of the actor's frame is forward, its origin is on the
+            ground.
         velocity: (3,) velocity over ground, m/s, world frame.
         mesh: its shape, actor frame.
     """
@@ -152,7 +157,8 @@ class Population:
         actors = []
         for index, mesh in enumerate(self._shapes):
             pose = self._traffic.pose(index, float(along[index]), self._wheelbases[index])
-            step_m = 0.01  # the velocity of the centre of the vehicle is a finite difference along its route
+            # the velocity of the centre of the vehicle is a finite difference along its route
+            step_m = 0.01
             ahead = self._traffic.pose(index, float(along[index]) + step_m, self._wheelbases[index])
             velocity = (ahead[:3, 3] - pose[:3, 3]) / step_m * speed[index]
             actors.append(TownActor(EGO_ID + index, pose, velocity, mesh))
@@ -160,11 +166,17 @@ class Population:
 
     def _pedestrians(self, frame: int) -> list[TownActor]:
         elapsed_s, actors = frame * FRAME_PERIOD_S, []
-        for id, (walk, height) in enumerate(zip(self._walks, self._heights, strict=True), EGO_ID + len(self._shapes)):
+        for id, (walk, height) in enumerate(
+            zip(self._walks, self._heights, strict=True), EGO_ID + len(self._shapes)
+        ):
             pose, speed = walk.pose(elapsed_s, KERB_M), abs(walk.speed_mps)
             cycle = (walk.start_m + speed * elapsed_s) / STRIDE_M
             phase = int(cycle * GAIT_PHASES) % GAIT_PHASES if speed else -1
-            actors.append(TownActor(id, pose, speed * pose[:3, 0], pedestrian_mesh(round(float(height), 1), phase)))
+            actors.append(
+                TownActor(
+                    id, pose, speed * pose[:3, 0], pedestrian_mesh(round(float(height), 1), phase)
+                )
+            )
         return actors
 
 
@@ -188,7 +200,9 @@ def _draw_kind(rng: np.random.Generator, kinds: tuple[VehicleKind, ...]) -> Vehi
 
 
 def _draw_ego_start(rng: np.random.Generator, town: Town) -> tuple[int, float]:
-    """Draw a random start of the ego vehicle: index of a lane near the centre of the town, and distance along it, metres."""
+    """Draw a random start of the ego vehicle: index of a lane near the centre of the town, and
+    distance along it, metres.
+    """
     lanes = [(i, lane) for i, lane in enumerate(town.streets.lanes) if not lane.turn]
     lanes.sort(key=lambda item: float(np.linalg.norm(item[1].point(item[1].length_m / 2))))
     index, lane = lanes[int(rng.integers(8))]

@@ -1,7 +1,7 @@
 """A drive through the town: the state of the town in any frame, and the scans of any LiDAR.
 
-All randomness comes from the seed. A recording depends only on the seed, the frame and the sensor, so any frame can be made separately, in
-any process, with the same bytes.
+All randomness comes from the seed. A recording depends only on the seed, the frame and the sensor,
+so any frame can be made separately, in any process, with the same bytes.
 """
 
 from __future__ import annotations
@@ -13,14 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.captures.raw import SensorRecording
-from carlasc.captures.settings import EGO_SENSOR_M, HEIGHTS_M, Lidar, TrafficLevel, check_at_least, sensor_offsets
+from carlasc.captures.settings import (
+    EGO_SENSOR_M,
+    HEIGHTS_M,
+    Lidar,
+    TrafficLevel,
+    check_at_least,
+    sensor_offsets,
+)
 from carlasc.captures.town.actors import EGO_ID, Population, TownActor
 from carlasc.captures.town.meshes import Mesh, RayScene, concatenate, rotate_exactly
 from carlasc.captures.town.town import Town, build_town
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points, translation
 from carlasc.core.scans import Scan
 
-REFERENCE_OFFSET_M = 25.6  # maximum offset of a reference sensor in x and y: half the width of the published grid
+REFERENCE_OFFSET_M = (
+    25.6  # maximum offset of a reference sensor in x and y: half the width of the published grid
+)
 SENSOR_MARGIN_M = 37.0  # maximum distance of a sensor from the ego vehicle
 LONGEST_HALF_M = 6.0  # half the length of the longest vehicle, rounded up
 
@@ -50,7 +59,8 @@ class Snapshot:
 
 
 class TownDrive:
-    """A simulated drive: a town with traffic, and an ego vehicle with LiDARs that drives through it.
+    """A simulated drive: a town with traffic, and an ego vehicle with LiDARs that drives through
+    it.
 
     Attributes:
         seed: seed of the town, its traffic, the offsets of the sensors, and the noise.
@@ -59,12 +69,15 @@ class TownDrive:
         town: the town.
     """
 
-    def __init__(self, seed: int = 0, traffic: TrafficLevel = "medium", lidar: Lidar | None = None) -> None:
+    def __init__(
+        self, seed: int = 0, traffic: TrafficLevel = "medium", lidar: Lidar | None = None
+    ) -> None:
         """Build the town.
 
         Args:
             seed: 0 or more.
-            traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many pedestrians.
+            traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many
+                pedestrians.
             lidar: model of the LiDARs; None takes the model of the data set.
 
         Raises:
@@ -79,7 +92,9 @@ class TownDrive:
         self._snapshot: Snapshot | None = None
 
     def ego_pose(self, frame: int) -> Transform:
-        """Return (4, 4) world_T_ego. The origin of the ego frame is on the ground below the centre of the vehicle.
+        """Return (4, 4) world_T_ego.
+
+        The origin of the ego frame is on the ground below the centre of the vehicle.
 
         Raises:
             ArgumentError: the frame is negative.
@@ -97,7 +112,8 @@ class TownDrive:
         return self._population.at(frame)
 
     def sensor_offsets(self, sensors: int) -> NDArray[np.float64]:
-        """Return the (S, 3) offsets of the sensors in the vehicle frame, metres, the ego sensor first.
+        """Return the (S, 3) offsets of the sensors in the vehicle frame, metres, the ego sensor
+        first.
 
         A drive with more sensors has the same offsets for the first ones.
 
@@ -108,7 +124,9 @@ class TownDrive:
         return sensor_offsets(sensors, self._random(_SENSORS))
 
     def sensor_poses(self, frame: int, sensors: int) -> NDArray[np.float64]:
-        """Return world_T_sensor of each sensor, shape (S, 4, 4). The sensors have the orientation of the vehicle.
+        """Return world_T_sensor of each sensor, shape (S, 4, 4).
+
+        The sensors have the orientation of the vehicle.
 
         Raises:
             ArgumentError: the frame is negative, or the number of sensors is less than 1.
@@ -119,14 +137,17 @@ class TownDrive:
     def record(self, frame: int, sensor: int = 0) -> SensorRecording:
         """Return the recording of a sensor of the vehicle in a frame. Sensor 0 is the ego sensor.
 
-        Points are in the sensor frame. Velocities are over ground (without ego motion), on the axes of the sensor frame.
+        Points are in the sensor frame. Velocities are over ground (without ego motion), on the axes
+        of the sensor frame.
 
         Raises:
             ArgumentError: the frame or the sensor is negative.
         """
         check_at_least(0, sensor=sensor)
         pose = self.sensor_poses(frame, sensor + 1)[sensor]
-        return scan_snapshot(self.snapshot(frame), pose, self.lidar, self._random(_NOISE, frame, sensor))
+        return scan_snapshot(
+            self.snapshot(frame), pose, self.lidar, self._random(_NOISE, frame, sensor)
+        )
 
     def scan(self, frame: int, sensor: int = 0) -> Scan:
         """Return the scan of a sensor with labels, flow and instances.
@@ -137,11 +158,15 @@ class TownDrive:
         recording = self.record(frame, sensor)
         return replace(recording.scan, flow=recording.flow())
 
-    def reference_observations(self, frame: int, sensors: int = 60, seed: int = 0) -> list[SensorRecording]:
-        """Return recordings of additional sensors at the time of a frame, as a reference for ground truth.
+    def reference_observations(
+        self, frame: int, sensors: int = 60, seed: int = 0
+    ) -> list[SensorRecording]:
+        """Return recordings of additional sensors at the time of a frame, as a reference for ground
+        truth.
 
-        These sensors are at random positions in free space within the area of the published grid, 1 to 5 m high; one in ten is near the
-        ground and one in ten is high above it. They are not sensors of the vehicle.
+        These sensors are at random positions in free space within the area of the published grid, 1
+        to 5 m high; one in ten is near the ground and one in ten is high above it. They are not
+        sensors of the vehicle.
 
         Args:
             frame: frame number.
@@ -158,7 +183,9 @@ class TownDrive:
         while len(recordings) < sensors:
             kind = len(recordings) % 10
             heights = (0.4, 1.0) if kind == 4 else (7.0, 14.0) if kind == 9 else HEIGHTS_M
-            offset = np.append(rng.uniform(-REFERENCE_OFFSET_M, REFERENCE_OFFSET_M, 2), rng.uniform(*heights))
+            offset = np.append(
+                rng.uniform(-REFERENCE_OFFSET_M, REFERENCE_OFFSET_M, 2), rng.uniform(*heights)
+            )
             pose = ego @ translation(offset)
             if self.is_free(frame, pose[:3, 3]):
                 recordings.append(scan_snapshot(self.snapshot(frame), pose, self.lidar, rng))
@@ -167,7 +194,8 @@ class TownDrive:
     def is_free(self, frame: int, point: NDArray[np.float64]) -> bool:
         """Whether a point (3,) of the world is outside all buildings and actors, with a margin."""
         for footprint, height in self.town.buildings:
-            if point[2] < height + 4.0 and footprint.contains(point[:2], 0.8):  # the roof is within these 4 m
+            # the roof is within these 4 m
+            if point[2] < height + 4.0 and footprint.contains(point[:2], 0.8):
                 return False
         for actor in self.snapshot(frame).actors.values():
             local = transform_points(invert(actor.world_T_actor), point)
@@ -220,8 +248,8 @@ def scan_snapshot(
 ) -> SensorRecording:
     """Return the recording of a LiDAR at a pose in a snapshot.
 
-    Points on the ego vehicle and unlabelled points are not recorded. Noise is drawn for every ray, so that it does not depend on which rays
-    hit a surface.
+    Points on the ego vehicle and unlabelled points are not recorded. Noise is drawn for every ray,
+    so that it does not depend on which rays hit a surface.
 
     Args:
         snapshot: the town at one instant.
@@ -230,7 +258,9 @@ def scan_snapshot(
         rng: source of the noise.
     """
     world_rays = rotate_exactly(world_T_sensor, lidar.directions)
-    rays, triangles, distances = snapshot.scene.cast(world_T_sensor[:3, 3], world_rays, lidar.range_m)
+    rays, triangles, distances = snapshot.scene.cast(
+        world_T_sensor[:3, 3], world_rays, lidar.range_m
+    )
     noise = rng.uniform(-lidar.noise_m, lidar.noise_m, lidar.directions.shape)
     labels, instances = snapshot.mesh.labels[triangles], snapshot.instances[triangles]
     keep = (instances != EGO_ID) & (labels != 0)
@@ -240,8 +270,12 @@ def scan_snapshot(
     return SensorRecording(scan, world_T_sensor, _velocities(snapshot, world_T_sensor, instances))
 
 
-def _velocities(snapshot: Snapshot, world_T_sensor: Transform, instances: NDArray[np.uint32]) -> NDArray[np.float64]:
+def _velocities(
+    snapshot: Snapshot, world_T_sensor: Transform, instances: NDArray[np.uint32]
+) -> NDArray[np.float64]:
     """Return (K, 4) id and velocity over ground, m/s, sensor frame, of every actor that was hit."""
     hit = np.unique(instances[instances != 0])
     velocities = np.array([snapshot.actors[int(id)].velocity for id in hit]).reshape(-1, 3)
-    return np.column_stack([hit.astype(np.float64), rotate_vectors(invert(world_T_sensor), velocities)])
+    return np.column_stack(
+        [hit.astype(np.float64), rotate_vectors(invert(world_T_sensor), velocities)]
+    )

@@ -1,6 +1,7 @@
 """Street furniture, along streets and at crossings, and buildings with details such as balconies.
 
-Each object is made in its own frame: origin on the ground, x along the street, y away from the street.
+Each object is made in its own frame: origin on the ground, x along the street, y away from the
+street.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ def sign(rng: np.random.Generator) -> Mesh:
     builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.045, height + 0.7 + POST_DEPTH_M, 7)
     shape = int(rng.integers(3))
     if shape == 0:
-        builder.rod(TRAFFIC_SIGN, (-0.07, 0, height + 0.35), (-0.04, 0, height + 0.35), 0.36, sections=14)
+        builder.rod(
+            TRAFFIC_SIGN, (-0.07, 0, height + 0.35), (-0.04, 0, height + 0.35), 0.36, sections=14
+        )
     elif shape == 1:
         builder.boxes(TRAFFIC_SIGN, (-0.055, 0, height), (0.03, 0.65, 0.65))
     else:
@@ -63,7 +66,8 @@ def sign(rng: np.random.Generator) -> Mesh:
 
 
 def traffic_light(reach_m: float) -> Mesh:
-    """Return traffic lights that face traffic along +x: one on the post, and one on an arm over the lane.
+    """Return traffic lights that face traffic along +x: one on the post, and one on an arm over the
+    lane.
 
     Args:
         reach_m: length of the arm.
@@ -116,7 +120,9 @@ def trash(rng: np.random.Generator) -> Mesh:
     for _ in range(int(rng.integers(2, 5))):
         position, size = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.3, 0.65, 3)
         if rng.random() < 0.5:
-            builder.cylinder(DYNAMIC, (*position, 0), float(size[0]) / 2, float(size[2]), 7, top=0.5)
+            builder.cylinder(
+                DYNAMIC, (*position, 0), float(size[0]) / 2, float(size[2]), 7, top=0.5
+            )
         else:
             builder.boxes(DYNAMIC, (*position, 0), size, float(rng.uniform(0, np.pi)))
     return builder.build()
@@ -140,14 +146,20 @@ def kiosk() -> Mesh:
 
 
 def fence(length_m: float, height_m: float = 1.3) -> Mesh:
-    """Return a fence along x with its middle at the origin: posts, rails, and slats with gaps that some rays pass."""
+    """Return a fence along x with its middle at the origin: posts, rails, and slats with gaps that
+    some rays pass.
+    """
     builder = MeshBuilder()
     posts = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 2.2), 1) + 1)
     builder.boxes(
-        FENCE, np.column_stack([posts, 0 * posts, 0 * posts - POST_DEPTH_M]), (0.1, 0.1, height_m + POST_DEPTH_M)
+        FENCE,
+        np.column_stack([posts, 0 * posts, 0 * posts - POST_DEPTH_M]),
+        (0.1, 0.1, height_m + POST_DEPTH_M),
     )
     slats = np.arange(-length_m / 2 + 0.1, length_m / 2, 0.17)
-    builder.boxes(FENCE, np.column_stack([slats, 0 * slats, 0 * slats]), (0.1, 0.025, height_m - 0.08))
+    builder.boxes(
+        FENCE, np.column_stack([slats, 0 * slats, 0 * slats]), (0.1, 0.025, height_m - 0.08)
+    )
     for z in (0.25, height_m - 0.3):
         builder.boxes(FENCE, (0, 0.03, z), (length_m, 0.04, 0.09))
     return builder.build()
@@ -159,16 +171,25 @@ def wall(length_m: float, height_m: float) -> Mesh:
     builder.boxes(WALL, (0, 0, -0.5), (length_m, 0.24, height_m + 0.5))
     builder.boxes(WALL, (0, 0, height_m), (length_m + 0.1, 0.34, 0.09))
     pillars = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 4), 1) + 1)
-    builder.boxes(WALL, np.column_stack([pillars, 0 * pillars, 0 * pillars - 0.5]), (0.4, 0.4, height_m + 0.65))
+    builder.boxes(
+        WALL,
+        np.column_stack([pillars, 0 * pillars, 0 * pillars - 0.5]),
+        (0.4, 0.4, height_m + 0.65),
+    )
     return builder.build()
 
 
 def guard_rail(length_m: float) -> Mesh:
-    """Return a guard rail along x with its middle at the origin. Its beam is on the side of the street."""
+    """Return a guard rail along x with its middle at the origin.
+
+    Its beam is on the side of the street.
+    """
     builder = MeshBuilder()
     posts = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 2.0), 1) + 1)
     builder.boxes(
-        GUARD_RAIL, np.column_stack([posts, 0 * posts, 0 * posts - POST_DEPTH_M]), (0.1, 0.14, 0.72 + POST_DEPTH_M)
+        GUARD_RAIL,
+        np.column_stack([posts, 0 * posts, 0 * posts - POST_DEPTH_M]),
+        (0.1, 0.14, 0.72 + POST_DEPTH_M),
     )
     for z, y in ((0.48, -0.12), (0.6, -0.16), (0.7, -0.12)):
         builder.boxes(GUARD_RAIL, (0, y, z), (length_m, 0.05, 0.12))
@@ -176,7 +197,9 @@ def guard_rail(length_m: float) -> Mesh:
 
 
 def footbridge(span_m: float) -> Mesh:
-    """Return a footbridge across a street, along y, with its middle at the origin and stairs at both ends."""
+    """Return a footbridge across a street, along y, with its middle at the origin and stairs at
+    both ends.
+    """
     builder = MeshBuilder()
     half, deck = span_m / 2, 5.3
     builder.boxes(BRIDGE, (0, 0, deck), (2.4, span_m, 0.35))
@@ -193,18 +216,25 @@ def footbridge(span_m: float) -> Mesh:
 
 
 def rail_track(length_m: float) -> Mesh:
-    """Return a railway track along x. The ballast is of the class Ground, sleepers and rails of RailTrack."""
+    """Return a railway track along x.
+
+    The ballast is of the class Ground, sleepers and rails of RailTrack.
+    """
     builder = MeshBuilder()
     builder.boxes(GROUND, (0, 0, -0.6), (length_m, 3.6, 0.78))
     sleepers = np.arange(-length_m / 2, length_m / 2, 0.65)
-    builder.boxes(RAIL_TRACK, np.column_stack([sleepers, 0 * sleepers, 0 * sleepers + 0.1]), (0.26, 2.5, 0.16))
+    builder.boxes(
+        RAIL_TRACK, np.column_stack([sleepers, 0 * sleepers, 0 * sleepers + 0.1]), (0.26, 2.5, 0.16)
+    )
     for y in (-0.72, 0.72):
         builder.boxes(RAIL_TRACK, (0, y, 0.2), (length_m, 0.08, 0.2))
     return builder.build()
 
 
 def add_street_furniture(plan: TownPlan, side: Side, trees: bool) -> None:
-    """Add lamps, trees or bollards, signs, bins and other street furniture along the kerb of a sidewalk."""
+    """Add lamps, trees or bollards, signs, bins and other street furniture along the kerb of a
+    sidewalk.
+    """
     rng = plan.rng
     lamps = np.arange(float(rng.uniform(2, 8)), side.length_m, 22.0)
     for at in lamps:
@@ -235,15 +265,21 @@ def mark_parking_bay(plan: TownPlan, side: Side) -> None:
     if not side.has_bay:
         return
     for at in np.arange(6.0, side.length_m - 6.0, 6.4):
-        pose = translation((*side.point(at, HALF_ROAD_M + BAY_M / 2 - 0.05), 0.0)) @ rotation_z(side.yaw_rad)
+        pose = translation((*side.point(at, HALF_ROAD_M + BAY_M / 2 - 0.05), 0.0)) @ rotation_z(
+            side.yaw_rad
+        )
         plan.parking.append(pose)
 
 
 def add_traffic_signals(plan: TownPlan, streets: Streets) -> None:
-    """Add a traffic light at the end of each lane where at least three streets meet, and a sign elsewhere."""
+    """Add a traffic light at the end of each lane where at least three streets meet, and a sign
+    elsewhere.
+    """
     for block in streets.blocks:
         for side in block.sides:
-            node = int(np.argmin(np.linalg.norm(streets.nodes - side.point(side.length_m + 8, 0), axis=1)))
+            node = int(
+                np.argmin(np.linalg.norm(streets.nodes - side.point(side.length_m + 8, 0), axis=1))
+            )
             position = side.point(side.length_m + 0.3, HALF_ROAD_M + 0.6)
             if streets.degree(node) >= 3:
                 plan.add(traffic_light(HALF_ROAD_M / 2 + 0.6), position, side.yaw_rad)
@@ -262,7 +298,9 @@ BUILDING = CARLA.id_of("Building")
 FOUNDATION_M = 1.0  # depth of the walls below the ground, which is not level
 
 
-def add_building(plan: TownPlan, footprint: Rectangle, height_m: float, pitched: bool, base_m: float = KERB_M) -> None:
+def add_building(
+    plan: TownPlan, footprint: Rectangle, height_m: float, pitched: bool, base_m: float = KERB_M
+) -> None:
     """Add a building to the plan of a town.
 
     Args:
@@ -289,7 +327,8 @@ def make_building(
         pitched: whether the roof is pitched; otherwise it is flat.
 
     Returns:
-        The mesh in the frame of the building (x along the street, y away from the street), and (4, 4) world_T_building.
+        The mesh in the frame of the building (x along the street, y away from the street), and (4,
+        4) world_T_building.
     """
     width, depth = footprint.size
     storey = float(rng.uniform(2.9, 3.5))
@@ -304,7 +343,9 @@ def make_building(
     return builder.build(), translation((*footprint.centre, 0.0)) @ rotation_z(footprint.yaw_rad)
 
 
-def _add_entrance(builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float) -> None:
+def _add_entrance(
+    builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float
+) -> None:
     """Add a door with steps and a porch roof on the side of the street (y < 0)."""
     x = float(rng.uniform(-0.3, 0.3)) * width
     builder.boxes(BUILDING, (x, -depth / 2 - 0.35, -0.5), (2.0, 0.7, 0.5 + 0.3))
@@ -314,9 +355,16 @@ def _add_entrance(builder: MeshBuilder, rng: np.random.Generator, width: float, 
 
 
 def _add_facades(
-    builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float, storey: float
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    width: float,
+    depth: float,
+    height: float,
+    storey: float,
 ) -> None:
-    """Add window frames and sills on all four sides, a ledge per storey, pillars at the corners, and some balconies."""
+    """Add window frames and sills on all four sides, a ledge per storey, pillars at the corners,
+    and some balconies.
+    """
     pitch = float(rng.uniform(2.2, 3.6))
     floors = np.arange(int(height // storey)) * storey
     balconies = rng.random() < 0.35
@@ -344,14 +392,18 @@ def _add_facades(
         if rng.random() < 0.7:
             levels = floors[1:]
             if len(levels):
-                ledge = np.column_stack([np.zeros(len(levels)), np.full(len(levels), -reach / 2 - 0.05), levels - 0.1])
+                ledge = np.column_stack(
+                    [np.zeros(len(levels)), np.full(len(levels), -reach / 2 - 0.05), levels - 0.1]
+                )
                 frame.boxes(BUILDING, ledge, (length, 0.16, 0.18))
         builder.add_mesh(frame.build(), rotation_z(yaw))
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * (width / 2, depth / 2, 1)
     builder.boxes(BUILDING, corners - (0, 0, FOUNDATION_M), (0.5, 0.5, height + FOUNDATION_M))
 
 
-def _add_flat_roof(builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float) -> None:
+def _add_flat_roof(
+    builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float
+) -> None:
     for y in (-1, 1):
         builder.boxes(BUILDING, (0, y * (depth / 2), height - 0.1), (width + 0.5, 0.45, 0.75))
     for x in (-1, 1):
@@ -367,8 +419,14 @@ def _add_pitched_roof(
     eaves, rise = 0.45, depth / 2 * float(rng.uniform(0.5, 0.9))
     roof = np.array([(-width / 2 - eaves, height - 0.15), (width / 2 + eaves, height - 0.15)])
     x = np.array([roof[0, 0], roof[1, 0], roof[1, 0], roof[0, 0], roof[0, 0], roof[1, 0]])
-    y = np.array([-depth / 2 - eaves, -depth / 2 - eaves, depth / 2 + eaves, depth / 2 + eaves, 0, 0])
+    y = np.array(
+        [-depth / 2 - eaves, -depth / 2 - eaves, depth / 2 + eaves, depth / 2 + eaves, 0, 0]
+    )
     z = np.array([height - 0.15] * 4 + [height + rise] * 2)
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
     builder.add(BUILDING, np.column_stack([x, y, z]), faces)
-    builder.boxes(BUILDING, (width * float(rng.uniform(-0.35, 0.35)), depth * 0.15, height), (0.7, 0.7, rise + 0.6))
+    builder.boxes(
+        BUILDING,
+        (width * float(rng.uniform(-0.35, 0.35)), depth * 0.15, height),
+        (0.7, 0.7, rise + 0.6),
+    )

@@ -61,7 +61,11 @@ class MeshBuilder:
         """Return the mesh of all added parts."""
         if not self._faces:
             return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.uint8))
-        return Mesh(np.concatenate(self._vertices), np.concatenate(self._faces), np.concatenate(self._labels))
+        return Mesh(
+            np.concatenate(self._vertices),
+            np.concatenate(self._faces),
+            np.concatenate(self._labels),
+        )
 
     def add(self, label: int, vertices: ArrayLike, faces: ArrayLike) -> None:
         """Add triangles of one class.
@@ -78,7 +82,9 @@ class MeshBuilder:
         self._count += len(corners)
 
     def add_mesh(self, mesh: Mesh, dst_T_src: Transform) -> None:
-        """Add a mesh with its classes, transformed from its frame `src` to the frame `dst` of the builder."""
+        """Add a mesh with its classes, transformed from its frame `src` to the frame `dst` of the
+        builder.
+        """
         self._vertices.append(transform_points(dst_T_src, mesh.vertices))
         self._faces.append(mesh.faces + np.int32(self._count))
         self._labels.append(mesh.labels)
@@ -93,15 +99,23 @@ class MeshBuilder:
             size: (3,) or (N, 3) lengths along x, y and z of each box, metres.
             yaw_rad: () or (N,) rotations about z.
         """
-        base, size = np.atleast_2d(np.asarray(base, np.float64)), np.atleast_2d(np.asarray(size, np.float64))
+        base, size = (
+            np.atleast_2d(np.asarray(base, np.float64)),
+            np.atleast_2d(np.asarray(size, np.float64)),
+        )
         count = max(len(base), len(size))
         corners, faces = _unit_box()
         local = corners * np.broadcast_to(size, (count, 3))[:, None, :]
-        moved = _rotate_z(local, np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,))) + base[:, None, :]
+        moved = (
+            _rotate_z(local, np.broadcast_to(np.asarray(yaw_rad, np.float64), (count,)))
+            + base[:, None, :]
+        )
         offsets = np.arange(count, dtype=np.int32)[:, None, None] * np.int32(len(corners))
         self.add(label, moved.reshape(-1, 3), (faces + offsets).reshape(-1, 3))
 
-    def level_rectangles(self, label: int, centre: ArrayLike, size: ArrayLike, yaw_rad: float = 0.0) -> None:
+    def level_rectangles(
+        self, label: int, centre: ArrayLike, size: ArrayLike, yaw_rad: float = 0.0
+    ) -> None:
         """Add horizontal rectangles, such as road markings.
 
         Args:
@@ -110,15 +124,26 @@ class MeshBuilder:
             size: (2,) or (N, 2) lengths along x and y of each rectangle, metres.
             yaw_rad: rotation about z.
         """
-        centre, size = np.atleast_2d(np.asarray(centre, np.float64)), np.atleast_2d(np.asarray(size, np.float64))
+        centre, size = (
+            np.atleast_2d(np.asarray(centre, np.float64)),
+            np.atleast_2d(np.asarray(size, np.float64)),
+        )
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
         local = corners * at_height(np.broadcast_to(size, (len(centre), 2)), 1.0)[:, None, :]
         moved = _rotate_z(local, np.full(len(centre), yaw_rad)) + centre[:, None, :]
         first = np.arange(len(centre), dtype=np.int32)[:, None, None] * np.int32(4)
-        self.add(label, moved.reshape(-1, 3), (np.array([[0, 1, 2], [0, 2, 3]]) + first).reshape(-1, 3))
+        self.add(
+            label, moved.reshape(-1, 3), (np.array([[0, 1, 2], [0, 2, 3]]) + first).reshape(-1, 3)
+        )
 
     def cylinder(
-        self, label: int, base: ArrayLike, radius: float, height: float, sections: int = 8, top: float = 1.0
+        self,
+        label: int,
+        base: ArrayLike,
+        radius: float,
+        height: float,
+        sections: int = 8,
+        top: float = 1.0,
     ) -> None:
         """Add an upright cylinder, or a truncated cone.
 
@@ -135,7 +160,9 @@ class MeshBuilder:
         scaled = np.hstack([vertices[:, :2] * radius * taper, vertices[:, 2:] * height])
         self.add(label, scaled + np.asarray(base, np.float64), faces)
 
-    def rod(self, label: int, start: ArrayLike, end: ArrayLike, radius: float, sections: int = 6) -> None:
+    def rod(
+        self, label: int, start: ArrayLike, end: ArrayLike, radius: float, sections: int = 6
+    ) -> None:
         """Add a cylinder in any direction.
 
         Args:
@@ -174,7 +201,9 @@ class MeshBuilder:
         outline = np.asarray(outline, np.float64)
         count = len(outline)
         sides = [
-            np.column_stack([outline[:, 0], np.broadcast_to(np.asarray(y, np.float64), (count,)), outline[:, 1]])
+            np.column_stack(
+                [outline[:, 0], np.broadcast_to(np.asarray(y, np.float64), (count,)), outline[:, 1]]
+            )
             for y in (near, far)
         ]
         ring = np.arange(count)
@@ -185,14 +214,18 @@ class MeshBuilder:
                 np.stack([following, following + count, ring + count], axis=1),
             ]
         )
-        cap = np.stack([np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)], axis=1)
+        cap = np.stack(
+            [np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)], axis=1
+        )
         self.add(label, np.concatenate(sides), np.concatenate([walls, cap, cap + count]))
 
 
 def concatenate(meshes: list[Mesh]) -> Mesh:
     """Return the mesh of all triangles of several meshes of one frame."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [mesh.faces + np.int32(offset) for mesh, offset in zip(meshes, offsets[:-1], strict=True)]
+    faces = [
+        mesh.faces + np.int32(offset) for mesh, offset in zip(meshes, offsets[:-1], strict=True)
+    ]
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate(faces),
@@ -207,7 +240,9 @@ def close_loop(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def at_height(points: NDArray[np.float64], height: ArrayLike) -> NDArray[np.float64]:
     """Return (P, 3) points from their x and y, (P, 2), and their z, () or (P,)."""
-    return np.column_stack([points, np.broadcast_to(np.asarray(height, np.float64), (len(points),))])
+    return np.column_stack(
+        [points, np.broadcast_to(np.asarray(height, np.float64), (len(points),))]
+    )
 
 
 @cache
@@ -237,12 +272,16 @@ def _unit_box() -> tuple[Vertices, NDArray[np.int64]]:
 
 @cache
 def _unit_cylinder(sections: int) -> tuple[Vertices, NDArray[np.int64]]:
-    """Return vertices and faces of a cylinder of radius and height 1 m whose lower face is at z = 0."""
+    """Return vertices and faces of a cylinder of radius and height 1 m whose lower face is at z =
+    0.
+    """
     cylinder = _trimesh_creation().cylinder(radius=1.0, height=1.0, sections=sections)
     return np.asarray(cylinder.vertices) + (0, 0, 0.5), np.asarray(cylinder.faces)
 
 
-_EDGE_ON = 1e-4  # below this sine of the angle between ray and triangle, the triangle counts as edge-on
+_EDGE_ON = (
+    1e-4  # below this sine of the angle between ray and triangle, the triangle counts as edge-on
+)
 
 
 def rotate_exactly(dst_T_src: Transform, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -262,7 +301,8 @@ class RayScene:
 
         Args:
             mesh: the triangles.
-            centre: (3,) origin of the single-precision coordinates in the search tree, metres. Precision is best near it.
+            centre: (3,) origin of the single-precision coordinates in the search tree, metres.
+                Precision is best near it.
 
         Raises:
             DependencyError: embreex is not installed.
@@ -299,7 +339,8 @@ class RayScene:
         rays = np.flatnonzero(found >= 0)
         triangles = found[rays]
         x, y, z = (self._normals[triangles, axis] for axis in range(3))
-        # Embree returns the triangle only. The distance to its plane is computed here in double precision.
+        # Embree returns the triangle only. The distance to its plane is computed here in double
+        # precision.
         start_x, start_y, start_z = origin - self._centre
         height = self._offsets[triangles] - (x * start_x + y * start_y + z * start_z)
         with np.errstate(divide="ignore", invalid="ignore"):

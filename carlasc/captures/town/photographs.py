@@ -1,4 +1,6 @@
-"""Images of cameras on the roof of the ego vehicle: colour, class, depth and instance of every pixel, at one time."""
+"""Images of cameras on the roof of the ego vehicle: colour, class, depth and instance of every
+pixel, at one time.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ CAMERA_YAWS_DEG = MappingProxyType(
         "back": 180,
     }
 )
-"""The available cameras of the ego vehicle, and their viewing directions: degrees from x towards y (to the right)."""
+"""The available cameras of the ego vehicle, and their viewing directions: degrees from x towards y
+(to the right).
+"""
 
 IMAGE_SIZE = (800, 450)
 """Numbers of columns and rows of the images."""
@@ -39,7 +43,9 @@ _FIELD_DEG, _AHEAD_M, _BELOW_M = (
     70.0,
     0.4,
     0.15,
-)  # horizontal field of view; position of a camera relative to the ego sensor: ahead in its viewing direction, and below
+    # horizontal field of view; position of a camera relative to the ego sensor: ahead in its
+    # viewing direction, and below
+)
 _RANGE_M, _DEPTH_STEP = 255.0, 256.0
 _SKY, _SKY_LABEL = (196, 216, 235), 13
 _SUN = np.array([0.35, -0.45, 0.82])
@@ -55,7 +61,9 @@ def town_cameras(names: Sequence[str]) -> tuple[CameraModel, ...]:
         ArgumentError: a name is unknown, or occurs twice.
     """
     if unknown := [name for name in names if name not in CAMERA_YAWS_DEG]:
-        raise ArgumentError("cameras", expected=f"any of {', '.join(CAMERA_YAWS_DEG)}", found=", ".join(unknown))
+        raise ArgumentError(
+            "cameras", expected=f"any of {', '.join(CAMERA_YAWS_DEG)}", found=", ".join(unknown)
+        )
     if len(set(names)) < len(names):
         raise ArgumentError("cameras", expected="each camera once", found=", ".join(names))
     return tuple(map(_camera, names))
@@ -68,12 +76,18 @@ def _camera(name: str) -> CameraModel:
     place = optical_axes((math.cos(yaw), math.sin(yaw)), "left")
     place[:3, 3] = _AHEAD_M * math.cos(yaw), _AHEAD_M * math.sin(yaw), -_BELOW_M
     matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-    return CameraModel(name=name, width=width, height=height, matrix=matrix, sensor_T_camera=place.round(12))
+    return CameraModel(
+        name=name, width=width, height=height, matrix=matrix, sensor_T_camera=place.round(12)
+    )
 
 
 def photo_fields(cameras: Iterable[CameraModel]) -> tuple[str, ...]:
     """Return the fields of the layout for the images of cameras."""
-    return tuple(f"{folder}.{camera.name}.{suffix}" for camera in cameras for folder, suffix in PHOTO_SUFFIXES.items())
+    return tuple(
+        f"{folder}.{camera.name}.{suffix}"
+        for camera in cameras
+        for folder, suffix in PHOTO_SUFFIXES.items()
+    )
 
 
 def photograph(
@@ -105,11 +119,21 @@ def photograph(
         shape, labels = (camera.height, camera.width), mesh.labels[triangles]
         color = np.tile(np.array(_SKY, np.uint8), (len(rays), 1))
         color[hit] = CARLA.palette[labels] * light[:, None]
-        classes, actors, depths = np.full(len(rays), _SKY_LABEL, np.uint8), *np.zeros((2, len(rays)), np.uint16)
+        classes, actors, depths = (
+            np.full(len(rays), _SKY_LABEL, np.uint8),
+            *np.zeros((2, len(rays)), np.uint16),
+        )
         classes[hit], actors[hit] = labels, instances[triangles]
         depths[hit] = np.rint(distances * looks[hit, 2] * _DEPTH_STEP).clip(1, 65535)
-        layers: tuple[NDArray[np.unsignedinteger], ...] = (color.reshape(*shape, 3), classes, actors, depths)
+        layers: tuple[NDArray[np.unsignedinteger], ...] = (
+            color.reshape(*shape, 3),
+            classes,
+            actors,
+            depths,
+        )
         for (folder, suffix), pixels in zip(PHOTO_SUFFIXES.items(), layers, strict=True):
             image = pixels if folder == "images" else pixels.reshape(shape)
-            found[f"{folder}.{camera.name}.{suffix}"] = encode_image(image, "JPEG" if suffix == "jpg" else "PNG")
+            found[f"{folder}.{camera.name}.{suffix}"] = encode_image(
+                image, "JPEG" if suffix == "jpg" else "PNG"
+            )
     return found

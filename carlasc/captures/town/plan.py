@@ -1,6 +1,7 @@
 """The plan of a town while it is built: mesh, buildings, parking spaces, plants and occupied land.
 
-Leaves of plants are separate triangles, so that some rays of a LiDAR enter a crown and some pass through it.
+Leaves of plants are separate triangles, so that some rays of a LiDAR enter a crown and some pass
+through it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ VEGETATION = CARLA.id_of("Vegetation")
 
 
 class PlantCatalogue:
-    """The plants of a town: a few of each kind, used many times with different rotations and scales."""
+    """The plants of a town: a few of each kind, used many times with different rotations and
+    scales.
+    """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -59,10 +62,16 @@ def broadleaf(rng: np.random.Generator) -> Mesh:
         angle = rng.uniform(0, 2 * np.pi)
         reach = radius * rng.uniform(0.2, 0.75)
         crown = np.array(
-            [np.cos(angle) * reach, np.sin(angle) * reach, rng.uniform(clear + radius * 0.5, height - radius * 0.4)]
+            [
+                np.cos(angle) * reach,
+                np.sin(angle) * reach,
+                rng.uniform(clear + radius * 0.5, height - radius * 0.4),
+            ]
         )
         builder.rod(VEGETATION, (0, 0, clear * 0.9), crown, trunk * 0.35, 5)
-        _add_leaves(builder, rng, crown, radius * rng.uniform(0.5, 0.8, 3) * (1, 1, 0.8), 70, (0.25, 0.6))
+        _add_leaves(
+            builder, rng, crown, radius * rng.uniform(0.5, 0.8, 3) * (1, 1, 0.8), 70, (0.25, 0.6)
+        )
     _add_leaves(
         builder,
         rng,
@@ -81,7 +90,9 @@ def conifer(rng: np.random.Generator) -> Mesh:
     builder.cylinder(VEGETATION, (0, 0, -0.3), 0.16, height * 0.9, 7, top=0.4)
     for level in np.linspace(1.0, height - 0.6, int(height / 0.7)):
         reach = radius * (1.05 - level / height)
-        _add_leaves(builder, rng, np.array([0, 0, level]), np.array([reach, reach, 0.35]), 34, (0.25, 0.55))
+        _add_leaves(
+            builder, rng, np.array([0, 0, level]), np.array([reach, reach, 0.35]), 34, (0.25, 0.55)
+        )
     return builder.build()
 
 
@@ -126,18 +137,27 @@ def _add_leaves(
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     depth = rng.uniform(0.35, 1.0, (count, 1)) ** 0.5
-    _add_leaf_triangles(builder, rng, centre + directions * depth * radii, rng.uniform(*size, count))
+    _add_leaf_triangles(
+        builder, rng, centre + directions * depth * radii, rng.uniform(*size, count)
+    )
 
 
 def _add_leaf_triangles(
-    builder: MeshBuilder, rng: np.random.Generator, positions: NDArray[np.float64], sizes: NDArray[np.float64]
+    builder: MeshBuilder,
+    rng: np.random.Generator,
+    positions: NDArray[np.float64],
+    sizes: NDArray[np.float64],
 ) -> None:
     """Add a randomly oriented triangle of a given size, (N,), at each position, (N, 3)."""
     corners = rng.normal(size=(len(positions), 3, 3))
     corners -= corners.mean(axis=1, keepdims=True)
-    corners *= sizes[:, None, None] / np.linalg.norm(corners, axis=2, keepdims=True).mean(axis=1, keepdims=True)
+    corners *= sizes[:, None, None] / np.linalg.norm(corners, axis=2, keepdims=True).mean(
+        axis=1, keepdims=True
+    )
     builder.add(
-        VEGETATION, (positions[:, None, :] + corners).reshape(-1, 3), np.arange(3 * len(positions)).reshape(-1, 3)
+        VEGETATION,
+        (positions[:, None, :] + corners).reshape(-1, 3),
+        np.arange(3 * len(positions)).reshape(-1, 3),
     )
 
 
@@ -169,7 +189,9 @@ class Rectangle:
         return (points - self.centre) @ self.axes.T
 
     def contains(self, points: Points, margin_m: float = 0.0) -> NDArray[np.bool_]:
-        """Return (...) bool: whether points (..., 2) are inside the rectangle, enlarged by a margin."""
+        """Return (...) bool: whether points (..., 2) are inside the rectangle, enlarged by a
+        margin.
+        """
         inside: NDArray[np.bool_] = np.abs(self.local(points)) <= np.array(self.size) / 2 + margin_m
         return np.asarray(inside.all(axis=-1))
 
@@ -190,7 +212,9 @@ class Rectangle:
             return False
         axes = np.concatenate([self.axes, other.axes])
         a, b = self.corners @ axes.T, other.corners @ axes.T
-        apart = (a.max(axis=0) + margin_m <= b.min(axis=0)) | (b.max(axis=0) + margin_m <= a.min(axis=0))
+        apart = (a.max(axis=0) + margin_m <= b.min(axis=0)) | (
+            b.max(axis=0) + margin_m <= a.min(axis=0)
+        )
         return not bool(apart.any())
 
 
@@ -210,7 +234,9 @@ class Land:
         """Whether all points (N, 2) are inside the boundary, and at least a margin away from it."""
         (start_x, start_y), (end_x, end_y) = self.boundary.T, np.roll(self.boundary, -1, axis=0).T
         along_x, along_y, x, y = end_x - start_x, end_y - start_y, points[:, :1], points[:, 1:]
-        share = ((x - start_x) * along_x + (y - start_y) * along_y) / np.maximum(along_x**2 + along_y**2, 1e-12)
+        share = ((x - start_x) * along_x + (y - start_y) * along_y) / np.maximum(
+            along_x**2 + along_y**2, 1e-12
+        )
         share = np.clip(share, 0, 1)
         beside_x, beside_y = x - (start_x + share * along_x), y - (start_y + share * along_y)
         far_enough = np.sqrt(beside_x**2 + beside_y**2).min(axis=1) >= margin_m
@@ -232,15 +258,20 @@ class Land:
         Returns:
             Whether the rectangle was free.
         """
-        around = np.concatenate([rectangle.corners, (rectangle.corners + rectangle.corners[[3, 0, 1, 2]]) / 2])
-        free = self.inside(around, edge_m) and not any(rectangle.overlaps(other, margin_m) for other in self.occupied)
+        around = np.concatenate(
+            [rectangle.corners, (rectangle.corners + rectangle.corners[[3, 0, 1, 2]]) / 2]
+        )
+        free = self.inside(around, edge_m) and not any(
+            rectangle.overlaps(other, margin_m) for other in self.occupied
+        )
         self.occupied += [rectangle] if free else []
         return free
 
 
 KERB_M = 0.15  # height of the sidewalks above the road
 PAINT_M = 0.01  # height of road markings above the road
-INNER_M = HALF_ROAD_M + SIDEWALK_M  # distance from the centre line of a street to the land behind the sidewalk
+# distance from the centre line of a street to the land behind the sidewalk
+INNER_M = HALF_ROAD_M + SIDEWALK_M
 
 
 @dataclass
@@ -261,7 +292,9 @@ class TownPlan:
     buildings: list[tuple[Rectangle, float]] = field(default_factory=list)
     parking: list[Transform] = field(default_factory=list)
 
-    def add(self, mesh: Mesh, position: NDArray[np.float64], yaw_rad: float, height_m: float = KERB_M) -> None:
+    def add(
+        self, mesh: Mesh, position: NDArray[np.float64], yaw_rad: float, height_m: float = KERB_M
+    ) -> None:
         """Add an object.
 
         Args:

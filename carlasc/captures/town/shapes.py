@@ -26,8 +26,10 @@ class VehicleKind:
         name: name of the kind.
         length_m: length from bumper to bumper, metres.
         width_m: width without mirrors, metres.
-        body: (x, z) corners of the convex side view of the body; x from 0 (rear) to 1 (front), z in metres.
-        cabin: (x, z) corners of the side view of the cabin or box on the body, which is narrower at its top.
+        body: (x, z) corners of the convex side view of the body; x from 0 (rear) to 1 (front), z in
+            metres.
+        cabin: (x, z) corners of the side view of the cabin or box on the body, which is narrower at
+            its top.
         wheels: (x, radius) of the wheels of each axle; x from 0 to 1, radius in metres.
         share: frequency relative to other kinds.
         cabin_taper: difference of the half widths of the cabin at its base and at its top, metres.
@@ -76,7 +78,15 @@ VEHICLE_KINDS = (
         "suv",
         4.8,
         1.95,
-        ((0.0, 0.45), (0.03, 0.32), (0.97, 0.32), (1.0, 0.5), (0.99, 0.9), (0.72, 1.08), (0.01, 1.08)),
+        (
+            (0.0, 0.45),
+            (0.03, 0.32),
+            (0.97, 0.32),
+            (1.0, 0.5),
+            (0.99, 0.9),
+            (0.72, 1.08),
+            (0.01, 1.08),
+        ),
         ((0.01, 1.05), (0.73, 1.05), (0.58, 1.76), (0.05, 1.8)),
         ((0.19, 0.38), (0.81, 0.38)),
         3,
@@ -95,7 +105,15 @@ VEHICLE_KINDS = (
         "pickup",
         5.5,
         1.98,
-        ((0.0, 0.5), (0.02, 0.38), (0.98, 0.38), (1.0, 0.5), (0.99, 0.95), (0.74, 1.1), (0.0, 1.05)),
+        (
+            (0.0, 0.5),
+            (0.02, 0.38),
+            (0.98, 0.38),
+            (1.0, 0.5),
+            (0.99, 0.95),
+            (0.74, 1.1),
+            (0.0, 1.05),
+        ),
         ((0.42, 1.05), (0.76, 1.08), (0.64, 1.8), (0.45, 1.82)),
         ((0.18, 0.4), (0.82, 0.4)),
         1.5,
@@ -138,7 +156,10 @@ def vehicle_mesh(kind: VehicleKind) -> Mesh:
     sides = half - 0.04 - kind.cabin_taper * (cabin[:, 1] - low) / (high - low)
     builder.prism(VEHICLE, cabin, -sides, sides)
     if kind.name == "truck":  # the cab is separate from the box
-        cab = np.array(((0.76, 0.98), (1.0, 0.98), (0.995, 1.7), (0.95, 2.6), (0.77, 2.65))) * stretch - middle
+        cab = (
+            np.array(((0.76, 0.98), (1.0, 0.98), (0.995, 1.7), (0.95, 2.6), (0.77, 2.65))) * stretch
+            - middle
+        )
         builder.prism(VEHICLE, cab, -half + 0.1, half - 0.1)
     for x, radius in kind.wheels:
         for side in (-1.0, 1.0):
@@ -187,17 +208,30 @@ def pedestrian_mesh(height_m: float, phase: int) -> Mesh:
         builder.rod(PEDESTRIAN, hip, knee, 0.085)
         builder.rod(PEDESTRIAN, knee, foot, 0.06)
         builder.boxes(PEDESTRIAN, foot + (0.06, 0, -0.06), (0.27, 0.1, 0.09))
-        shoulder, hand = np.array([0.0, side * 0.21, 1.42]), np.array([-side * swing * 0.7, side * 0.27, 0.82])
+        shoulder, hand = (
+            np.array([0.0, side * 0.21, 1.42]),
+            np.array([-side * swing * 0.7, side * 0.27, 0.82]),
+        )
         builder.rod(PEDESTRIAN, shoulder, hand, 0.05)
-    torso = np.array(((-0.11, 0.85), (0.11, 0.85), (0.13, 1.2), (0.09, 1.48), (-0.1, 1.48), (-0.13, 1.2)))
-    builder.prism(PEDESTRIAN, torso, (-0.16, -0.16, -0.19, -0.2, -0.2, -0.19), (0.16, 0.16, 0.19, 0.2, 0.2, 0.19))
+    torso = np.array(
+        ((-0.11, 0.85), (0.11, 0.85), (0.13, 1.2), (0.09, 1.48), (-0.1, 1.48), (-0.13, 1.2))
+    )
+    builder.prism(
+        PEDESTRIAN,
+        torso,
+        (-0.16, -0.16, -0.19, -0.2, -0.2, -0.19),
+        (0.16, 0.16, 0.19, 0.2, 0.2, 0.19),
+    )
     _add_ellipsoid(builder, PEDESTRIAN, (0.01, 0, 1.62), (0.1, 0.08, 0.13))
     mesh = builder.build()
     return Mesh(mesh.vertices * scale, mesh.faces, mesh.labels)
 
 
 def _add_ellipsoid(
-    builder: MeshBuilder, label: int, centre: tuple[float, float, float], radii: tuple[float, float, float]
+    builder: MeshBuilder,
+    label: int,
+    centre: tuple[float, float, float],
+    radii: tuple[float, float, float],
 ) -> None:
     vertices, faces = unit_sphere(1)
     builder.add(label, vertices * radii + centre, faces)

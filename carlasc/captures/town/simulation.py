@@ -1,4 +1,5 @@
-"""A drive through the simulated town: a capture that is computed on reading, and `simulate`, which writes it.
+"""A drive through the simulated town: a capture that is computed on reading, and `simulate`, which
+writes it.
 
 See the format page, `docs/format.md#raw-capture`.
 """
@@ -39,11 +40,14 @@ from carlasc.storage.transport.targets import check_shared
 
 _SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
 _BACKGROUND = (255, 255, 255)
-_REDUCTION = 2  # rays are cast for every second row and column of pixels; the picture is enlarged afterwards
+_REDUCTION = (
+    2  # rays are cast for every second row and column of pixels; the picture is enlarged afterwards
+)
 
 
 def render_birdseye(snapshot: Snapshot) -> bytes:
-    """Return the bird's-eye picture as JPEG bytes: 1920 x 1080 pixels, 90 degrees wide, with its upper edge ahead of the vehicle.
+    """Return the bird's-eye picture as JPEG bytes: 1920 x 1080 pixels, 90 degrees wide, with its
+    upper edge ahead of the vehicle.
 
     Raises:
         DependencyError: a package of the extra `simulate` is missing.
@@ -86,7 +90,10 @@ def _render(
 
 
 def _downward_rays() -> NDArray[np.float64]:
-    """Return (H, W, 3) rays of a camera that looks down. Its upper edge is ahead, its right edge on the right."""
+    """Return (H, W, 3) rays of a camera that looks down.
+
+    Its upper edge is ahead, its right edge on the right.
+    """
     width, height = BEV_SIZE[0] // _REDUCTION, BEV_SIZE[1] // _REDUCTION
     right = (np.arange(width) + 0.5 - width / 2) / (width / 2)
     ahead = -(np.arange(height) + 0.5 - height / 2) / (width / 2)
@@ -95,9 +102,11 @@ def _downward_rays() -> NDArray[np.float64]:
 
 
 class SimulatedCapture(Capture):
-    """A drive through the simulated town, to make ground truth with `carlasc.regrid` without a capture on disk.
+    """A drive through the simulated town, to make ground truth with `carlasc.regrid` without a
+    capture on disk.
 
-    Its data are equal to the output of `carlasc.simulate` with the same settings. It can be pickled.
+    Its data are equal to the output of `carlasc.simulate` with the same settings. It can be
+    pickled.
 
     Attributes:
         location: name of the capture in errors.
@@ -145,7 +154,9 @@ class SimulatedCapture(Capture):
         return self._drive.record(frame, sensor)
 
     def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
-        """Return the (3,) velocity over ground, m/s, world frame, of each actor of the town in a frame."""
+        """Return the (3,) velocity over ground, m/s, world frame, of each actor of the town in a
+        frame.
+        """
         self._check(frame)
         return {actor.id: actor.velocity for actor in self._drive.actors(frame)}
 
@@ -179,7 +190,9 @@ class SimulatedCapture(Capture):
         """Return the image files of a frame as bytes, by their layout names."""
         if not self.cameras:
             return {}
-        return photograph(self._drive.snapshot(frame), tuple(self.cameras.values()), self.read_pose(0, frame))
+        return photograph(
+            self._drive.snapshot(frame), tuple(self.cameras.values()), self.read_pose(0, frame)
+        )
 
     def light(self) -> Capture:
         """Return the capture itself, which has only settings."""
@@ -204,7 +217,11 @@ def _cached_drive(seed: int, traffic: TrafficLevel, lidar: Lidar) -> TownDrive:
 SETTINGS_FILE = "simulation.json"
 
 TOWN_VERSION = 1
-"""Version of the simulation. It increases when the same seed gives another town, because their frames must not be mixed in one capture."""
+"""Version of the simulation.
+
+It increases when the same seed gives another town, because their frames must not be mixed in one
+capture.
+"""
 
 
 @dataclass(frozen=True)
@@ -253,9 +270,12 @@ def simulate(
     cameras: Sequence[str] = (),
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> SimulationResult:
-    """Record a drive through a simulated town as a raw capture. The same arguments write the same bytes.
+    """Record a drive through a simulated town as a raw capture.
 
-    A second run with the same settings writes the missing frames. It continues an interrupted run, or adds frames.
+    The same arguments write the same bytes.
+
+    A second run with the same settings writes the missing frames. It continues an interrupted run,
+    or adds frames.
 
     Args:
         out: folder of the sequence, or its URL in an object store. Files go to `<out>/raw`.
@@ -263,12 +283,15 @@ def simulate(
         first_frame: number of the first frame. The drive starts at rest in frame 0.
         sensors: number of LiDARs. The first is the ego sensor.
         seed: seed of the town, its traffic, the sensors' offsets and the noise.
-        traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many pedestrians.
+        traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many
+            pedestrians.
         lidar: model of the LiDARs. None: the data set's.
         bev: whether to write bird's-eye pictures.
-        cameras: names of the cameras on the roof of the vehicle, from "front", "front_left", "front_right", "left", "right", "back_left",
-            "back_right" and "back". Each has images of colour, class, instance and depth; see the format page, `docs/format.md#cameras`.
-        run: how the work is distributed, the part of it, and the progress callback. The last part to finish writes the times.
+        cameras: names of the cameras on the roof of the vehicle, from "front", "front_left",
+            "front_right", "left", "right", "back_left", "back_right" and "back". Each has images of
+            colour, class, instance and depth; see the format page, `docs/format.md#cameras`.
+        run: how the work is distributed, the part of it, and the progress callback. The last part
+            to finish writes the times.
 
     Returns:
         Numbers of the written frames, sensors and points.
@@ -276,7 +299,8 @@ def simulate(
     Raises:
         ArgumentError: an argument is out of its range.
         DependencyError: a package of the extra `simulate` is missing. Nothing is written.
-        ConflictError: `out` holds a capture with other settings, or one that `simulate` did not write.
+        ConflictError: `out` holds a capture with other settings, or one that `simulate` did not
+            write.
         StorageError: `out` cannot be written to.
         CarlascError: a worker process died.
     """
@@ -284,7 +308,9 @@ def simulate(
         count=count, first_frame=first_frame, sensors=sensors, seed=seed, traffic=traffic, lidar=lidar, bev=bev, cameras=cameras
     )  # fmt: skip
     check_shared(os.fspath(out), run)
-    settings = dataclasses.asdict(_SimulationSettings(seed, traffic, sensors, bev, lidar or Lidar()))
+    settings = dataclasses.asdict(
+        _SimulationSettings(seed, traffic, sensors, bev, lidar or Lidar())
+    )
     settings |= {"cameras": list(cameras)} if cameras else {}
     images = photo_fields(drive.cameras.values())
     check_dependencies(bev or bool(cameras))
@@ -307,7 +333,8 @@ def simulate(
             if run.part.count == 1:  # several parts would overwrite the lines of each other
                 log.add(frame, [frame * FRAME_PERIOD_S] * sensors)
 
-        for frame in sorted(complete - writer.timed_frames(sensors)):  # frames whose times a killed run did not write
+        # frames whose times a killed run did not write
+        for frame in sorted(complete - writer.timed_frames(sensors)):
             note(frame)
         for frame, points_of_frame in zip(missing, recorded, strict=True):
             points.update(points_of_frame)
@@ -318,7 +345,13 @@ def simulate(
         frames = range(first_frame, first_frame + count)
         if all(writer.has_frame(frame, sensors, bev, images) for frame in frames):
             timed = writer.timed_frames(sensors)
-            writer.write_times({frame: [frame * FRAME_PERIOD_S] * sensors for frame in frames if frame not in timed})
+            writer.write_times(
+                {
+                    frame: [frame * FRAME_PERIOD_S] * sensors
+                    for frame in frames
+                    if frame not in timed
+                }
+            )
     classes = {name: points[name] for name in CARLA.names.values() if points[name]}
     return SimulationResult(writer.out, len(wanted), len(missing), sensors, points.total(), classes)
 
@@ -338,7 +371,9 @@ def check_dependencies(bev: bool = True) -> None:
 
 
 def _record_frame(writer: CaptureWriter, drive: SimulatedCapture, frame: int) -> dict[str, int]:
-    """Write the recordings of all sensors and the picture of a frame, and return the number of points by class name."""
+    """Write the recordings of all sensors and the picture of a frame, and return the number of
+    points by class name.
+    """
     points = np.zeros(CARLA.num_channels, np.int64)
     for sensor in drive.sensors:
         recording = drive.read(sensor, frame)

@@ -1,7 +1,8 @@
 """The street network: streets, the blocks between them, and the lanes that vehicles follow.
 
-All coordinates are x and y of the world frame, in metres. The frame is left-handed, as in CarlaSC: for a direction d = (dx, dy),
-the vector (-dy, dx) points to the *right*. The outline of a block has its inside on the right, and vehicles drive on the right.
+All coordinates are x and y of the world frame, in metres. The frame is left-handed, as in CarlaSC:
+for a direction d = (dx, dy), the vector (-dy, dx) points to the *right*. The outline of a block has
+its inside on the right, and vehicles drive on the right.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ LANE_WIDTH_M = 3.5
 HALF_ROAD_M = LANE_WIDTH_M  # a road has two lanes, one per direction
 SIDEWALK_M = 2.6
 CORNER_RADIUS_M = 6.0  # radius of the kerb at a crossing
-STOP_BACK_M = 4.5  # distance from the end of the corner of the kerb to the stop line; the crosswalk is between them
+# distance from the end of the corner of the kerb to the stop line; the crosswalk is between them
+STOP_BACK_M = 4.5
 BAY_M = 2.2  # depth of a parking bay
 PATH_STEP_M = 0.5
 
 
 @dataclass(frozen=True)
 class Outline:
-    """The edge of a block at any offset from the centre lines of its streets: `anchor + offset * normal`.
+    """The edge of a block at any offset from the centre lines of its streets: `anchor + offset *
+    normal`.
 
     Attributes:
         anchor: (K, 2) metres.
@@ -36,7 +39,10 @@ class Outline:
     normal: Points
 
     def at(self, offset_m: float) -> Points:
-        """Return the (K, 2) loop at an offset from the centre lines. The offset must not exceed the radius of the corners."""
+        """Return the (K, 2) loop at an offset from the centre lines.
+
+        The offset must not exceed the radius of the corners.
+        """
         return self.anchor + offset_m * self.normal
 
 
@@ -67,7 +73,9 @@ class Side:
         return float(np.arctan2(self.direction[1], self.direction[0]))
 
     def point(self, along_m: float, offset_m: float) -> Points:
-        """Return the (2,) point at a distance along the street and an offset to the right of its centre line."""
+        """Return the (2,) point at a distance along the street and an offset to the right of its
+        centre line.
+        """
         return self.start + along_m * self.direction + offset_m * self.normal
 
     def kerb_offset(self, along_m: float) -> float:
@@ -161,7 +169,9 @@ def right_of(direction: Points) -> Points:
 
 
 def draw_streets(rng: np.random.Generator, rows: int = 5, columns: int = 5) -> Streets:
-    """Draw the random streets of a town: a grid with random spacing and crossings, with some streets left out."""
+    """Draw the random streets of a town: a grid with random spacing and crossings, with some
+    streets left out.
+    """
     nodes, edges = _draw_grid(rng, rows, columns)
     loops = _trace_faces(nodes, edges)
     stop_distances = _stop_distances(nodes, loops)
@@ -170,10 +180,14 @@ def draw_streets(rng: np.random.Generator, rows: int = 5, columns: int = 5) -> S
     return Streets(nodes, edges, tuple(blocks), _make_lanes(nodes, edges, stop_distances))
 
 
-def _draw_grid(rng: np.random.Generator, rows: int, columns: int) -> tuple[Points, NDArray[np.int64]]:
+def _draw_grid(
+    rng: np.random.Generator, rows: int, columns: int
+) -> tuple[Points, NDArray[np.int64]]:
     xs = np.concatenate([[0.0], np.cumsum(rng.uniform(62, 88, rows - 1))])
     ys = np.concatenate([[0.0], np.cumsum(rng.uniform(58, 80, columns - 1))])
-    nodes = np.stack(np.meshgrid(xs - xs.mean(), ys - ys.mean(), indexing="ij"), axis=-1).reshape(-1, 2)
+    nodes = np.stack(np.meshgrid(xs - xs.mean(), ys - ys.mean(), indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
     nodes += rng.uniform(-5, 5, nodes.shape)
     index = np.arange(rows * columns).reshape(rows, columns)
     along = np.stack([index[:-1].ravel(), index[1:].ravel()], axis=1)
@@ -181,16 +195,19 @@ def _draw_grid(rng: np.random.Generator, rows: int, columns: int) -> tuple[Point
     inner = [(int(a), int(b)) for a, b in across if rows - 1 > a // columns > 0]
     dropped: set[tuple[int, int]] = set()
     touched: set[int] = set()
-    for index_of_street in rng.permutation(
-        len(inner)
-    ):  # leaving out a street makes two T-junctions and one longer block
+    # leaving out a street makes two T-junctions and one longer block
+    for index_of_street in rng.permutation(len(inner)):
         a, b = inner[index_of_street]
         around = {a, b, a + columns, b + columns, a - columns, b - columns}
         inside = a % columns > 0 and b % columns < columns - 1
         if inside and not touched & around and len(dropped) < (rows * columns) // 8:
             dropped.add((a, b))
             touched |= around
-    edges = [(int(a), int(b)) for a, b in np.concatenate([along, across]) if (int(a), int(b)) not in dropped]
+    edges = [
+        (int(a), int(b))
+        for a, b in np.concatenate([along, across])
+        if (int(a), int(b)) not in dropped
+    ]
     return nodes, np.array(edges, np.int64)
 
 
@@ -228,14 +245,18 @@ def _corner(nodes: Points, before: int, node: int, after: int) -> tuple[Points, 
 
 
 def _stop_distances(nodes: Points, loops: list[list[int]]) -> dict[tuple[int, int], float]:
-    """Return the distance of the stop line from a crossing, metres, by (crossing, other end of the street)."""
+    """Return the distance of the stop line from a crossing, metres, by (crossing, other end of the
+    street).
+    """
     stop_distances: dict[tuple[int, int], float] = {}
     for loop in loops:
         for before, node, after in _corners_of(loop):
             turn = _corner(nodes, before, node, after)[2]
             tangent = (HALF_ROAD_M + CORNER_RADIUS_M) * np.tan(max(turn, 0.0) / 2)
             for other in (before, after):
-                stop_distances[node, other] = max(stop_distances.get((node, other), 4.0), float(tangent) + STOP_BACK_M)
+                stop_distances[node, other] = max(
+                    stop_distances.get((node, other), 4.0), float(tangent) + STOP_BACK_M
+                )
     return stop_distances
 
 
@@ -244,7 +265,10 @@ def _corners_of(loop: list[int]) -> list[tuple[int, int, int]]:
 
 
 def _make_block(
-    rng: np.random.Generator, nodes: Points, loop: list[int], stop_distances: dict[tuple[int, int], float]
+    rng: np.random.Generator,
+    nodes: Points,
+    loop: list[int],
+    stop_distances: dict[tuple[int, int], float],
 ) -> CityBlock:
     corners = nodes[loop]
     following = np.roll(corners, -1, axis=0)
@@ -257,21 +281,28 @@ def _make_block(
         normals.append(normal)
         near, far = stop_distances[node, after], stop_distances[after, node]
         length = float(np.linalg.norm(nodes[after] - nodes[node])) - near - far
-        side = Side(nodes[node] + near * leaving, leaving, length, bool(not outside and rng.random() < 0.45))
+        side = Side(
+            nodes[node] + near * leaving, leaving, length, bool(not outside and rng.random() < 0.45)
+        )
         sides.append(side)
         stations = np.array([0.0, 3.0, length - 3.0, length])
         depth = np.array([0.0, BAY_M, BAY_M, 0.0]) * side.has_bay
         anchors.append(side.start + stations[:, None] * leaving + depth[:, None] * side.normal)
         normals.append(np.tile(side.normal, (4, 1)))
-    return CityBlock(Outline(np.concatenate(anchors), np.concatenate(normals)), tuple(sides), outside)
+    return CityBlock(
+        Outline(np.concatenate(anchors), np.concatenate(normals)), tuple(sides), outside
+    )
 
 
-def _rounded_corner(node: Points, arriving: Points, leaving: Points, turn: float) -> tuple[Points, Points]:
+def _rounded_corner(
+    node: Points, arriving: Points, leaving: Points, turn: float
+) -> tuple[Points, Points]:
     """Return anchors and normals of the outline of a block at a corner."""
     count = max(2, int(np.ceil(abs(turn) / 0.16)) + 1)
     heading = np.arctan2(arriving[1], arriving[0]) + np.linspace(0, turn, count)
     normal = right_of(np.stack([np.cos(heading), np.sin(heading)], axis=1))
-    if turn <= 0:  # the corner of the block is not convex: the outline is an arc around the crossing
+    # the corner of the block is not convex: the outline is an arc around the crossing
+    if turn <= 0:
         return np.tile(node, (count, 1)), normal
     bisector = right_of(arriving) + right_of(leaving)
     centre = node + (HALF_ROAD_M + CORNER_RADIUS_M) * bisector / (1 + arriving @ leaving)
@@ -289,20 +320,37 @@ def _make_lanes(
             first = nodes[start] + stop_distances[start, end] * direction + offset
             last = nodes[end] - stop_distances[end, start] * direction + offset
             count = max(2, int(np.ceil(np.linalg.norm(last - first) / PATH_STEP_M)) + 1)
-            lanes.append(Lane(first + np.linspace(0, 1, count)[:, None] * (last - first), start, end, turn=False))
+            lanes.append(
+                Lane(
+                    first + np.linspace(0, 1, count)[:, None] * (last - first),
+                    start,
+                    end,
+                    turn=False,
+                )
+            )
     streets = list(lanes)
     for index, lane in enumerate(streets):
         exits = []
         for follow, other in enumerate(streets):
             if other.start == lane.end and other.end != lane.start:
                 exits.append(len(lanes))
-                lanes.append(Lane(_curve(lane.path, other.path), lane.end, lane.end, turn=True, exits=(follow,)))
+                lanes.append(
+                    Lane(
+                        _curve(lane.path, other.path),
+                        lane.end,
+                        lane.end,
+                        turn=True,
+                        exits=(follow,),
+                    )
+                )
         lanes[index] = Lane(lane.path, lane.start, lane.end, turn=False, exits=tuple(exits))
     return tuple(lanes)
 
 
 def _curve(before: Points, after: Points) -> Points:
-    """Return the path of a turn from the end of one lane to the start of another: a cubic Bezier curve, close to an arc."""
+    """Return the path of a turn from the end of one lane to the start of another: a cubic Bezier
+    curve, close to an arc.
+    """
     first, last = before[-1], after[0]
     leaving = (before[-1] - before[-2]) / np.linalg.norm(before[-1] - before[-2])
     arriving = (after[1] - after[0]) / np.linalg.norm(after[1] - after[0])

@@ -1,4 +1,5 @@
-"""The static town: its surfaces, its blocks (downtown buildings, houses with gardens, a park or a square), and the land around it.
+"""The static town: its surfaces, its blocks (downtown buildings, houses with gardens, a park or a
+square), and the land around it.
 
 Around the town are guard rails, a railway, woods, some walls and large buildings.
 """
@@ -21,7 +22,16 @@ from carlasc.captures.town.furniture import (
     mark_parking_bay,
 )
 from carlasc.captures.town.meshes import Mesh, at_height, close_loop
-from carlasc.captures.town.plan import INNER_M, KERB_M, PAINT_M, Land, PlantCatalogue, Rectangle, TownPlan, hedge
+from carlasc.captures.town.plan import (
+    INNER_M,
+    KERB_M,
+    PAINT_M,
+    Land,
+    PlantCatalogue,
+    Rectangle,
+    TownPlan,
+    hedge,
+)
 from carlasc.captures.town.streets import BAY_M, HALF_ROAD_M, CityBlock, Side, Streets, draw_streets
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
@@ -37,7 +47,8 @@ def pave_roads(plan: TownPlan, streets: Streets) -> None:
     xs, ys = np.arange(low[0], high[0] + tile, tile), np.arange(low[1], high[1] + tile, tile)
     for x, following in pairwise(xs):
         plan.builder.ribbon(
-            ROAD, *(at_height(np.column_stack([np.full(len(ys), at), ys]), 0.0) for at in (x, following))
+            ROAD,
+            *(at_height(np.column_stack([np.full(len(ys), at), ys]), 0.0) for at in (x, following)),
         )
 
 
@@ -45,7 +56,8 @@ def paint_markings(plan: TownPlan, streets: Streets) -> None:
     """Add centre lines, edge lines, stop lines and crosswalks."""
     for block in streets.blocks:
         for side in block.sides:
-            if -np.pi / 2 < side.yaw_rad <= np.pi / 2:  # only one of the two sides of a street adds the centre line
+            # only one of the two sides of a street adds the centre line
+            if -np.pi / 2 < side.yaw_rad <= np.pi / 2:
                 if plan.rng.random() < 0.4:
                     for offset in (-0.12, 0.12):
                         _paint_line(plan, side, offset, 0.0, side.length_m, dashed=False)
@@ -54,18 +66,28 @@ def paint_markings(plan: TownPlan, streets: Streets) -> None:
             _paint_line(plan, side, HALF_ROAD_M - 0.25, 0.0, side.length_m, dashed=side.has_bay)
             zebra = np.arange(0.4, HALF_ROAD_M, 0.9)
             bars = np.array([side.point(-2.0 - 0.5, offset) for offset in zebra])
-            plan.builder.level_rectangles(ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad)
+            plan.builder.level_rectangles(
+                ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad
+            )
             bars = np.array([side.point(side.length_m + 2.0 + 0.5, offset) for offset in zebra])
-            plan.builder.level_rectangles(ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad)
+            plan.builder.level_rectangles(
+                ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad
+            )
             stop = side.point(side.length_m + 0.25, HALF_ROAD_M / 2)
-            plan.builder.level_rectangles(ROAD_LINE, (*stop, PAINT_M), (0.4, HALF_ROAD_M - 0.3), side.yaw_rad)
+            plan.builder.level_rectangles(
+                ROAD_LINE, (*stop, PAINT_M), (0.4, HALF_ROAD_M - 0.3), side.yaw_rad
+            )
 
 
-def _paint_line(plan: TownPlan, side: Side, offset: float, start: float, end: float, dashed: bool) -> None:
+def _paint_line(
+    plan: TownPlan, side: Side, offset: float, start: float, end: float, dashed: bool
+) -> None:
     length, gap = (3.0, 4.5) if dashed else (6.0, 0.0)
     starts = np.arange(start, end - 0.5, length + gap)
     lengths = np.minimum(length, end - starts)
-    middles = np.array([side.point(at + run / 2, offset) for at, run in zip(starts, lengths, strict=True)])
+    middles = np.array(
+        [side.point(at + run / 2, offset) for at, run in zip(starts, lengths, strict=True)]
+    )
     sizes = np.column_stack([lengths, np.full(len(starts), 0.15)])
     plan.builder.level_rectangles(ROAD_LINE, at_height(middles, PAINT_M), sizes, side.yaw_rad)
 
@@ -93,9 +115,9 @@ def lay_ground(plan: TownPlan, loop: NDArray[np.float64], label: int) -> None:
     for ring in range(1, rings + 1):
         points = close_loop(centre + (loop - centre) * (1 - ring / rings))
         x, y = points[:, 0] / 7.0, points[:, 1] / 9.0
-        waves = np.sin(x + phase[0]) * np.sin(y + phase[1]) + 0.4 * np.sin(2.3 * x + phase[2]) * np.sin(
-            1.9 * y + phase[3]
-        )
+        waves = np.sin(x + phase[0]) * np.sin(y + phase[1]) + 0.4 * np.sin(
+            2.3 * x + phase[2]
+        ) * np.sin(1.9 * y + phase[3])
         height = KERB_M + relief * float(np.clip((ring - 2) / 4, 0, 1)) * (0.5 + 0.5 * waves)
         current = at_height(points, height)
         plan.builder.ribbon(label, previous, current)
@@ -132,7 +154,9 @@ def _add_row_of_buildings(plan: TownPlan, side: Side, land: Land, downtown: bool
         depth = float(rng.uniform(10, 15) if downtown else rng.uniform(8, 11))
         back = float(rng.uniform(0.9, 1.6) if downtown else rng.uniform(3.0, 6.5))
         bay = side.kerb_offset(min(max(along + width / 2, 0), side.length_m)) - HALF_ROAD_M
-        middle = side.point(along + width / 2, INNER_M + max(bay, BAY_M * side.has_bay) + back + depth / 2)
+        middle = side.point(
+            along + width / 2, INNER_M + max(bay, BAY_M * side.has_bay) + back + depth / 2
+        )
         footprint = Rectangle(middle, (width, depth), side.yaw_rad)
         if land.reserve(footprint, margin_m=0.0 if downtown else 2.0, edge_m=0.6):
             height = float(rng.uniform(8, 24) if downtown else rng.uniform(3.2, 7.0))
@@ -146,8 +170,12 @@ def _add_row_of_buildings(plan: TownPlan, side: Side, land: Land, downtown: bool
             along += 2.0
 
 
-def _add_front_garden(plan: TownPlan, side: Side, land: Land, along: float, width: float, back: float) -> None:
-    """Add a fence, wall or hedge along the sidewalk, a driveway beside the house, and up to two bushes."""
+def _add_front_garden(
+    plan: TownPlan, side: Side, land: Land, along: float, width: float, back: float
+) -> None:
+    """Add a fence, wall or hedge along the sidewalk, a driveway beside the house, and up to two
+    bushes.
+    """
     rng = plan.rng
     bay = BAY_M * side.has_bay
     edge = side.point(along + width / 2, INNER_M + bay + 0.4)
@@ -163,11 +191,14 @@ def _add_front_garden(plan: TownPlan, side: Side, land: Land, along: float, widt
     drive = side.point(along + width + 1.8, INNER_M + bay + 3.2)
     if land.reserve(Rectangle(drive, (2.6, 5.6), side.yaw_rad), 0.2):
         plan.builder.boxes(GROUND, (*drive, KERB_M - 0.3), (2.8, 6.2, 0.33), side.yaw_rad)
-        pose = translation((*drive, KERB_M + 0.03)) @ rotation_z(side.yaw_rad + np.pi / 2 * float(rng.choice([-1, 1])))
+        pose = translation((*drive, KERB_M + 0.03)) @ rotation_z(
+            side.yaw_rad + np.pi / 2 * float(rng.choice([-1, 1]))
+        )
         plan.parking.append(pose)
     for _ in range(2):
         position = side.point(
-            along + float(rng.uniform(0, width)), INNER_M + bay + float(rng.uniform(1.2, max(back - 0.5, 1.5)))
+            along + float(rng.uniform(0, width)),
+            INNER_M + bay + float(rng.uniform(1.2, max(back - 0.5, 1.5))),
         )
         if land.reserve(Rectangle(position, (1.2, 1.2), 0.0), 0.0):
             plan.add(plan.plants.bush(), position, 0.0)
@@ -189,7 +220,11 @@ def _add_yard(plan: TownPlan, block: CityBlock, land: Land, attempts: int) -> No
             length = float(rng.uniform(6, 12))
             if land.reserve(Rectangle(position, (length, 0.4), yaw), 0.2, 0.5):
                 plan.add(
-                    furniture.fence(length, 1.7) if rng.random() < 0.6 else furniture.wall(length, 1.9), position, yaw
+                    furniture.fence(length, 1.7)
+                    if rng.random() < 0.6
+                    else furniture.wall(length, 1.9),
+                    position,
+                    yaw,
                 )
         elif number < 0.9:
             if land.reserve(Rectangle(position, (1.4, 1.4), 0.0), 0.1, 0.5):
@@ -199,7 +234,9 @@ def _add_yard(plan: TownPlan, block: CityBlock, land: Land, attempts: int) -> No
 
 
 def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
-    """Add a lawn with a pond, benches, bins and many trees, a low wall along one street and a fence along another."""
+    """Add a lawn with a pond, benches, bins and many trees, a low wall along one street and a fence
+    along another.
+    """
     rng, centre = plan.rng, land.boundary.mean(axis=0)
     radius = float(rng.uniform(5, 8))
     land.occupied.append(Rectangle(centre, (2 * radius + 2, 2 * radius + 2), 0.0))
@@ -207,13 +244,23 @@ def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
     rim = centre + radius * (1 + 0.15 * np.sin(3 * angles + 1))[:, None] * np.column_stack(
         [np.cos(angles), np.sin(angles)]
     )
-    plan.builder.ribbon(WATER, at_height(rim, KERB_M + 0.42), at_height(np.tile(centre, (25, 1)), KERB_M + 0.42))
-    plan.builder.ribbon(GROUND, at_height(centre + (rim - centre) * 1.12, KERB_M - 0.2), at_height(rim, KERB_M + 0.45))
+    plan.builder.ribbon(
+        WATER, at_height(rim, KERB_M + 0.42), at_height(np.tile(centre, (25, 1)), KERB_M + 0.42)
+    )
+    plan.builder.ribbon(
+        GROUND,
+        at_height(centre + (rim - centre) * 1.12, KERB_M - 0.2),
+        at_height(rim, KERB_M + 0.45),
+    )
     for index, side in enumerate(block.sides[:2]):
         at = side.point(side.length_m / 2, INNER_M + BAY_M * side.has_bay + 0.5)
         length = side.length_m * 0.7
         if land.reserve(Rectangle(at, (length, 0.5), side.yaw_rad), 0.0):
-            plan.add(furniture.wall(length, 0.8) if index else furniture.fence(length, 1.2), at, side.yaw_rad)
+            plan.add(
+                furniture.wall(length, 0.8) if index else furniture.fence(length, 1.2),
+                at,
+                side.yaw_rad,
+            )
     low, span = land.boundary.min(axis=0), np.ptp(land.boundary, axis=0)
     for _ in range(150):
         position, number = low + rng.uniform(0, 1, 2) * span, rng.random()
@@ -234,10 +281,14 @@ def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
 
 
 def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
-    """Add a paved square: parking spaces, kiosks, planters, bollards along its edge, and one large building."""
+    """Add a paved square: parking spaces, kiosks, planters, bollards along its edge, and one large
+    building.
+    """
     rng, centre = plan.rng, land.boundary.mean(axis=0)
     side = block.sides[int(rng.integers(len(block.sides)))]
-    footprint = Rectangle(centre + side.normal * 6, (float(rng.uniform(18, 26)), 13.0), side.yaw_rad)
+    footprint = Rectangle(
+        centre + side.normal * 6, (float(rng.uniform(18, 26)), 13.0), side.yaw_rad
+    )
     if land.reserve(footprint, edge_m=3.0):
         add_building(plan, footprint, float(rng.uniform(7, 14)), pitched=False)
     for edge in block.sides:
@@ -253,7 +304,9 @@ def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
                 pose = translation((*position, KERB_M)) @ rotation_z(edge.yaw_rad + turn)
                 plan.parking.append(pose)
                 line = edge.point(at + 1.4, offset + 6.5)
-                plan.builder.level_rectangles(ROAD_LINE, (*line, KERB_M + PAINT_M), (0.12, 4.8), edge.yaw_rad)
+                plan.builder.level_rectangles(
+                    ROAD_LINE, (*line, KERB_M + PAINT_M), (0.12, 4.8), edge.yaw_rad
+                )
     low, span = land.boundary.min(axis=0), np.ptp(land.boundary, axis=0)
     makers: tuple[Callable[[], Mesh], ...] = (
         furniture.kiosk,
@@ -286,7 +339,9 @@ class Town:
 
 
 def build_town(rng: np.random.Generator) -> Town:
-    """Build a random town: first the streets, then the sidewalk, land, buildings, plants and street furniture of each block."""
+    """Build a random town: first the streets, then the sidewalk, land, buildings, plants and street
+    furniture of each block.
+    """
     streets = draw_streets(rng)
     plan = TownPlan(rng, PlantCatalogue(rng))
     pave_roads(plan, streets)
@@ -311,7 +366,9 @@ def fill_outskirts(plan: TownPlan, block: CityBlock) -> None:
     previous = at_height(close_loop(inner), KERB_M)
     for reach, rise in ((3.0, 0.0), (10.0, 0.3), (25.0, 1.0), (50.0, 2.0), (OUTSKIRTS_M, 3.0)):
         points = inner + reach * normals
-        heights = KERB_M + rise * (0.6 + 0.4 * np.sin(points[:, 0] / 23) * np.cos(points[:, 1] / 19))
+        heights = KERB_M + rise * (
+            0.6 + 0.4 * np.sin(points[:, 0] / 23) * np.cos(points[:, 1] / 19)
+        )
         current = at_height(close_loop(points), close_loop(heights[:, None])[:, 0])
         plan.builder.ribbon(TERRAIN, previous, current)
         previous = current
@@ -319,24 +376,48 @@ def fill_outskirts(plan: TownPlan, block: CityBlock) -> None:
     for number, side in enumerate(block.sides):
         add_street_furniture(plan, side, trees=True)
         middle = side.length_m / 2
-        plan.add(furniture.guard_rail(side.length_m), side.point(middle, INNER_M + 0.5), side.yaw_rad)
-        near = abs((number - railway + len(block.sides) // 2) % len(block.sides) - len(block.sides) // 2) <= 1
+        plan.add(
+            furniture.guard_rail(side.length_m), side.point(middle, INNER_M + 0.5), side.yaw_rad
+        )
+        near = (
+            abs(
+                (number - railway + len(block.sides) // 2) % len(block.sides)
+                - len(block.sides) // 2
+            )
+            <= 1
+        )
         if near:
             plan.add(
-                furniture.rail_track(side.length_m + 26), side.point(middle, INNER_M + 8.0), side.yaw_rad, KERB_M + 0.3
+                furniture.rail_track(side.length_m + 26),
+                side.point(middle, INNER_M + 8.0),
+                side.yaw_rad,
+                KERB_M + 0.3,
             )
         elif rng.random() < 0.6:
-            plan.add(furniture.wall(side.length_m * 0.8, 2.6), side.point(middle, INNER_M + 4.0), side.yaw_rad)
+            plan.add(
+                furniture.wall(side.length_m * 0.8, 2.6),
+                side.point(middle, INNER_M + 4.0),
+                side.yaw_rad,
+            )
         land = Land(
             np.array(
-                [side.point(x, INNER_M + y) for x, y in ((0, 12), (side.length_m, 12), (side.length_m, 45), (0, 45))]
+                [
+                    side.point(x, INNER_M + y)
+                    for x, y in ((0, 12), (side.length_m, 12), (side.length_m, 45), (0, 45))
+                ]
             )
         )
         if rng.random() < 0.6:
-            footprint = Rectangle(side.point(middle, INNER_M + 24), (float(rng.uniform(14, 24)), 12.0), side.yaw_rad)
+            footprint = Rectangle(
+                side.point(middle, INNER_M + 24), (float(rng.uniform(14, 24)), 12.0), side.yaw_rad
+            )
             if land.reserve(footprint):
-                add_building(plan, footprint, float(rng.uniform(6, 14)), pitched=False, base_m=KERB_M + 0.6)
+                add_building(
+                    plan, footprint, float(rng.uniform(6, 14)), pitched=False, base_m=KERB_M + 0.6
+                )
         for _ in range(22):
-            position = side.point(float(rng.uniform(2, side.length_m - 2)), INNER_M + float(rng.uniform(13, 40)))
+            position = side.point(
+                float(rng.uniform(2, side.length_m - 2)), INNER_M + float(rng.uniform(13, 40))
+            )
             if land.reserve(Rectangle(position, (3.0, 3.0), 0.0), 0.3):
                 plan.add(plan.plants.tree(), position, 0.0, KERB_M + 0.8)

@@ -1,7 +1,8 @@
 """The motion of vehicles: they follow each other along lanes and give way at crossings.
 
-Vehicles follow the intelligent driver model (Treiber, Hennecke and Helbing, 2000). A vehicle enters a crossing only if no vehicle on it has
-a conflicting turn, and if the next lane has room for it. Therefore, vehicles do not collide or stop on a crossing.
+Vehicles follow the intelligent driver model (Treiber, Hennecke and Helbing, 2000). A vehicle enters
+a crossing only if no vehicle on it has a conflicting turn, and if the next lane has room for it.
+Therefore, vehicles do not collide or stop on a crossing.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ LATERAL_ACCELERATION = 2.4  # m/s^2, maximum in a turn
 CLEARANCE_M = 3.1  # minimum distance between the centre lines of turns without a conflict
 
 Queues = dict[int, list[int]]
-"""Indices of the vehicles on the lane of a street and on the turns that leave it, by lane, the foremost vehicle first."""
+"""Indices of the vehicles on the lane of a street and on the turns that leave it, by lane, the
+foremost vehicle first.
+"""
 
 
 @dataclass
@@ -56,12 +59,17 @@ class Vehicle:
 
 @dataclass
 class _Crossing:
-    inside: list[int] = field(default_factory=list)  # vehicles that were let in and have not left yet
-    waiting: dict[int, int] = field(default_factory=dict)  # step of arrival of the first vehicle, by lane
+    # vehicles that were let in and have not left yet
+    inside: list[int] = field(default_factory=list)
+    # step of arrival of the first vehicle, by lane
+    waiting: dict[int, int] = field(default_factory=dict)
 
 
 class Traffic:
-    """All moving vehicles, simulated frame by frame from frame 0. The states of all frames are cached."""
+    """All moving vehicles, simulated frame by frame from frame 0.
+
+    The states of all frames are cached.
+    """
 
     def __init__(self, streets: Streets, vehicles: list[Vehicle]) -> None:
         """Start with the initial states of the vehicles. The first one is the ego vehicle."""
@@ -69,7 +77,8 @@ class Traffic:
         self.vehicles = vehicles
         self._conflicts = _find_conflicts(streets)
         self._crossings = [_Crossing() for _ in streets.nodes]
-        self._exit_claims: dict[int, list[int]] = {}  # vehicles on a crossing that will enter a lane, by lane
+        # vehicles on a crossing that will enter a lane, by lane
+        self._exit_claims: dict[int, list[int]] = {}
         self._limits = [_speed_limit(lane) for lane in streets.lanes]
         for vehicle in vehicles:
             self._extend_route(vehicle)
@@ -77,7 +86,9 @@ class Traffic:
         self._speed = [np.array([vehicle.speed_mps for vehicle in vehicles])]
 
     def at(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the distance along its route, (V,) metres, and the speed, (V,) m/s, of every vehicle in a frame."""
+        """Return the distance along its route, (V,) metres, and the speed, (V,) m/s, of every
+        vehicle in a frame.
+        """
         while len(self._along) <= frame:
             self._step(len(self._along))
             self._along.append(np.array([vehicle.along_m for vehicle in self.vehicles]))
@@ -85,7 +96,10 @@ class Traffic:
         return self._along[frame], self._speed[frame]
 
     def pose(self, index: int, along_m: float, wheelbase_m: float) -> Transform:
-        """Return (4, 4) world_T_vehicle of a vehicle at a distance along its route. The centres of both axles are on the route."""
+        """Return (4, 4) world_T_vehicle of a vehicle at a distance along its route.
+
+        The centres of both axles are on the route.
+        """
         vehicle = self.vehicles[index]
         front = self._point(vehicle, along_m + wheelbase_m / 2)
         rear = self._point(vehicle, along_m - wheelbase_m / 2)
@@ -97,7 +111,9 @@ class Traffic:
         leg = min(max(leg, 0), len(vehicle.route) - 1)
         lane, local = self.streets.lanes[vehicle.route[leg]], along_m - vehicle.starts[leg]
         if local < 0:  # before the first lane, the route is extended straight
-            return lane.path[0] + local * (lane.path[1] - lane.path[0]) / np.linalg.norm(lane.path[1] - lane.path[0])
+            return lane.path[0] + local * (lane.path[1] - lane.path[0]) / np.linalg.norm(
+                lane.path[1] - lane.path[0]
+            )
         return lane.point(local)
 
     def _step(self, step: int) -> None:
@@ -122,7 +138,9 @@ class Traffic:
             vehicle.starts.append(vehicle.starts[-1] + lane.length_m)
 
     def _queues(self) -> Queues:
-        """Return the vehicles on the lane of each street and on the turns that leave it, the foremost vehicle first."""
+        """Return the vehicles on the lane of each street and on the turns that leave it, the
+        foremost vehicle first.
+        """
         queues: dict[int, list[tuple[float, int]]] = {}
         for index, vehicle in enumerate(self.vehicles):
             leg = self._street_leg(vehicle)
@@ -131,7 +149,9 @@ class Traffic:
         return {lane: [index for _, index in sorted(queue)] for lane, queue in queues.items()}
 
     def _street_leg(self, vehicle: Vehicle) -> int:
-        """Return the index in the route of the lane of the street where the vehicle is; on a crossing, of the lane before it."""
+        """Return the index in the route of the lane of the street where the vehicle is; on a
+        crossing, of the lane before it.
+        """
         return vehicle.leg - self.streets.lanes[vehicle.route[vehicle.leg]].turn
 
     def _release_crossings(self) -> None:
@@ -149,7 +169,9 @@ class Traffic:
         """Let vehicles enter the crossings near them."""
         requests: dict[int, list[tuple[int, int]]] = {}
         for lane, queue in queues.items():
-            index = next((i for i in queue if self.vehicles[i].route[self.vehicles[i].leg] == lane), None)
+            index = next(
+                (i for i in queue if self.vehicles[i].route[self.vehicles[i].leg] == lane), None
+            )
             if index is None:
                 continue
             vehicle, node = self.vehicles[index], self.streets.lanes[lane].end
@@ -163,8 +185,11 @@ class Traffic:
         for node in sorted(requests):
             self._grant(self._crossings[node], requests[node], ego_lane, queues)
 
-    def _grant(self, crossing: _Crossing, requests: list[tuple[int, int]], ego_lane: int, queues: Queues) -> None:
-        """Let vehicles enter a crossing in the order of arrival, but vehicles on the lane of the ego vehicle first.
+    def _grant(
+        self, crossing: _Crossing, requests: list[tuple[int, int]], ego_lane: int, queues: Queues
+    ) -> None:
+        """Let vehicles enter a crossing in the order of arrival, but vehicles on the lane of the
+        ego vehicle first.
 
         Args:
             crossing: the crossing.
@@ -173,13 +198,19 @@ class Traffic:
             queues: the vehicles of each lane.
         """
         held: list[int] = []  # turns of vehicles that arrived earlier and still wait
-        for lane, index in sorted(requests, key=lambda item: (item[0] != ego_lane, crossing.waiting[item[0]], item[0])):
+        for lane, index in sorted(
+            requests, key=lambda item: (item[0] != ego_lane, crossing.waiting[item[0]], item[0])
+        ):
             vehicle = self.vehicles[index]
             turn = vehicle.route[vehicle.leg + 1]
             if not self._has_room_beyond(index, queues):
                 continue
             others = [self.vehicles[i] for i in crossing.inside]
-            crossed = [other.route[other.granted - 1] for other in others if other.route[other.granted - 2] != lane]
+            crossed = [
+                other.route[other.granted - 1]
+                for other in others
+                if other.route[other.granted - 2] != lane
+            ]
             if any(self._conflicts[turn, other] for other in crossed + held):
                 held.append(turn)
                 continue
@@ -189,7 +220,9 @@ class Traffic:
             self._exit_claims.setdefault(vehicle.route[vehicle.granted], []).append(index)
 
     def _has_room_beyond(self, index: int, queues: Queues) -> bool:
-        """Whether the lane after the crossing has room for the vehicle, and for vehicles on the crossing that will enter it."""
+        """Whether the lane after the crossing has room for the vehicle, and for vehicles on the
+        crossing that will enter it.
+        """
         vehicle = self.vehicles[index]
         exit_lane = vehicle.route[vehicle.leg + 2]
         claims = self._exit_claims.get(exit_lane, [])
@@ -199,7 +232,12 @@ class Traffic:
         if not queue:
             return needed < self.streets.lanes[exit_lane].length_m
         last = self.vehicles[queue[-1]]
-        free = last.along_m - last.starts[self._street_leg(last)] - last.length_m / 2 + 0.5 * last.speed_mps
+        free = (
+            last.along_m
+            - last.starts[self._street_leg(last)]
+            - last.length_m / 2
+            + 0.5 * last.speed_mps
+        )
         return free > needed
 
     def _acceleration(self, index: int, queues: Queues) -> float:
@@ -213,11 +251,15 @@ class Traffic:
         if vehicle.granted <= vehicle.leg:
             stop = vehicle.starts[vehicle.leg + 1] - vehicle.along_m - vehicle.length_m / 2
             if stop < LOOK_AHEAD_M:
-                accelerations.append(_follow(vehicle.speed_mps, desired_mps, stop + STANDSTILL_GAP_M - 0.3, 0.0))
+                accelerations.append(
+                    _follow(vehicle.speed_mps, desired_mps, stop + STANDSTILL_GAP_M - 0.3, 0.0)
+                )
         return float(np.clip(min(accelerations), -9.0, ACCELERATION))
 
     def _braking_before_turn(self, vehicle: Vehicle) -> float:
-        """Return the acceleration that reaches the speed limit of the next lane at its start, m/s^2."""
+        """Return the acceleration that reaches the speed limit of the next lane at its start,
+        m/s^2.
+        """
         limit = self._limits[vehicle.route[vehicle.leg + 1]]
         distance = max(vehicle.starts[vehicle.leg + 1] - vehicle.along_m, 0.1)
         if vehicle.speed_mps <= limit:
@@ -226,7 +268,9 @@ class Traffic:
         return -needed if needed > 0.6 * BRAKING else ACCELERATION
 
     def _leader(self, index: int, queues: Queues) -> tuple[float, float]:
-        """Return the gap to the next vehicle ahead, metres from bumper to bumper, and its speed, m/s."""
+        """Return the gap to the next vehicle ahead, metres from bumper to bumper, and its speed,
+        m/s.
+        """
         vehicle = self.vehicles[index]
         leg = self._street_leg(vehicle)
         nearest, speed = np.inf, 0.0
@@ -236,7 +280,9 @@ class Traffic:
                 continue
             for other in queues.get(lane, ()):
                 leader = self.vehicles[other]
-                position = vehicle.starts[ahead] + leader.along_m - leader.starts[self._street_leg(leader)]
+                position = (
+                    vehicle.starts[ahead] + leader.along_m - leader.starts[self._street_leg(leader)]
+                )
                 # The leader is ahead of this vehicle. Equal positions are ordered by index.
                 if other == index or (position, -other) <= (vehicle.along_m, -index):
                     continue
@@ -249,7 +295,10 @@ class Traffic:
 
 
 def _follow(speed: float, desired: float, gap: float, leader_speed: float) -> float:
-    """Return the acceleration of the intelligent driver model behind a leader, m/s^2. Speeds are in m/s, the gap in metres."""
+    """Return the acceleration of the intelligent driver model behind a leader, m/s^2.
+
+    Speeds are in m/s, the gap in metres.
+    """
     approach = speed * (speed - leader_speed) / (2 * np.sqrt(ACCELERATION * BRAKING))
     desired_gap = STANDSTILL_GAP_M + max(0.0, speed * HEADWAY_S + approach)
     return ACCELERATION * (1 - (speed / desired) ** 4 - (desired_gap / max(gap, 0.1)) ** 2)
@@ -275,14 +324,19 @@ def _find_conflicts(streets: Streets) -> NDArray[np.bool_]:
 
 
 def place_vehicles(
-    rng: np.random.Generator, streets: Streets, lengths_m: list[float], ego_lane: int, ego_along_m: float
+    rng: np.random.Generator,
+    streets: Streets,
+    lengths_m: list[float],
+    ego_lane: int,
+    ego_along_m: float,
 ) -> list[Vehicle]:
     """Place vehicles on the lanes with gaps between them.
 
     Args:
         rng: source of the random numbers.
         streets: the street network.
-        lengths_m: length of each vehicle, metres. The first is the ego vehicle, which starts at rest.
+        lengths_m: length of each vehicle, metres. The first is the ego vehicle, which starts at
+            rest.
         ego_lane: index of the first lane of the ego vehicle.
         ego_along_m: start of the ego vehicle along this lane, metres.
 
@@ -298,14 +352,23 @@ def place_vehicles(
         for _ in range(1000):
             lane = ego_lane if not vehicles else lanes[int(rng.integers(len(lanes)))]
             room = streets.lanes[lane].length_m
-            along = ego_along_m if not vehicles else float(rng.uniform(length, room - length / 2 - 1))
-            apart = all(abs(along - other) > (length + size) / 2 + 8.0 for other, size in occupied.get(lane, []))
+            along = (
+                ego_along_m if not vehicles else float(rng.uniform(length, room - length / 2 - 1))
+            )
+            apart = all(
+                abs(along - other) > (length + size) / 2 + 8.0
+                for other, size in occupied.get(lane, [])
+            )
             if apart:
                 break
         else:
             continue  # no free position was found
         occupied.setdefault(lane, []).append((along, length))
         to_stop_line = max(streets.lanes[lane].length_m - along - length / 2 - 1.0, 0.0)
-        speed = 0.0 if not vehicles else min(cruise, 4.0, float(np.sqrt(0.8 * BRAKING * to_stop_line)))
-        vehicles.append(Vehicle(length, 8.5 if not vehicles else cruise, turns, [lane], [0.0], along, speed))
+        speed = (
+            0.0 if not vehicles else min(cruise, 4.0, float(np.sqrt(0.8 * BRAKING * to_stop_line)))
+        )
+        vehicles.append(
+            Vehicle(length, 8.5 if not vehicles else cruise, turns, [lane], [0.0], along, speed)
+        )
     return vehicles

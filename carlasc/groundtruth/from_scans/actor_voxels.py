@@ -1,4 +1,6 @@
-"""The actor of each voxel of a frame from merged scans: moving actors by their bodies, static ones by the numbers of the data."""
+"""The actor of each voxel of a frame from merged scans: moving actors by their bodies, static ones
+by the numbers of the data.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from carlasc.storage.protocol import Sequence
 _CLASS_PARTS = 1 << 10  # in the upper 16 bits, smaller values may be a class
 _TURN_FRAMES = 3  # frames before and after, between which the turn rate of an actor is measured
 Numbered = tuple[NDArray[np.float32], NDArray[np.int64]]
-_NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = WeakKeyDictionary()  # the numbered points of scans
+# the numbered points of scans
+_NUMBERED: WeakKeyDictionary[ScanFeed, dict[int, Numbered]] = WeakKeyDictionary()
 
 
 def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
@@ -34,15 +37,21 @@ def with_numbers(actors: MovingActors, feed: ScanFeed) -> MovingActors:
     if len(numbered) < len(actors.tracks):
         upper = lower = 0
         for given in _numbers_of(feed.sequence):
-            highest, upper = max(highest, int(given.max(initial=0))), max(upper, int(given.max(initial=0)) >> 16)
+            highest, upper = (
+                max(highest, int(given.max(initial=0))),
+                max(upper, int(given.max(initial=0)) >> 16),
+            )
             lower = max(lower, int((given & 0xFFFF).max(initial=0)))
-        if upper < _CLASS_PARTS:  # new numbers are unique in the lower half too: SemanticKITTI's files keep it alone
+        # new numbers are unique in the lower half too: SemanticKITTI's files keep it alone
+        if upper < _CLASS_PARTS:
             highest = max(highest, upper << 16 | lower)
     return replace(actors, numbers=number_actors(actors.tracks, highest))
 
 
 def _numbers_of(sequence: Sequence) -> Iterator[NDArray[np.int64]]:
-    """Yield the numbers of actors in the data: of the points of each scan, and of the tracks of its boxes."""
+    """Yield the numbers of actors in the data: of the points of each scan, and of the tracks of its
+    boxes.
+    """
     fields = sequence.fields()
     for frame in sequence.frames("instances").tolist() if "instances" in fields else ():
         yield sequence.read("instances", frame).astype(np.int64)
@@ -78,24 +87,38 @@ def find_voxels(
     centers = transform_points(now.world_T_grid, centers_of(spec, bodies))
     for region, number in regions.actors.items():
         track = actors.tracks[number]
-        own = (regions.of_voxel[bodies] == region) & (movable[bodies] | (labels[bodies] == track.label))
+        own = (regions.of_voxel[bodies] == region) & (
+            movable[bodies] | (labels[bodies] == track.label)
+        )
         instance[bodies[own]] = actors.numbers[number]
         voxels.append(bodies[own])
-        velocities.append(rotate_vectors(now.grid_T_world, velocity_at(track, now.frame, centers[own], feed)))
+        velocities.append(
+            rotate_vectors(now.grid_T_world, velocity_at(track, now.frame, centers[own], feed))
+        )
     free = movable & (instance == 0)
     _number_points(spec, feed, actors, now, window, free, instance)
     _number_boxes(spec, feed, actors, now, free & (instance == 0), instance)
     return VoxelActors.of(spec, instance, np.concatenate(voxels), np.concatenate(velocities))
 
 
-def velocity_at(track: Track, frame: int, places: NDArray[np.float64], feed: ScanFeed) -> NDArray[np.float64]:
-    """Return the (N, 3) velocities, m/s, world, of (N, 3) positions on an actor, metres, world, which moves and turns about the vertical."""
+def velocity_at(
+    track: Track, frame: int, places: NDArray[np.float64], feed: ScanFeed
+) -> NDArray[np.float64]:
+    """Return the (N, 3) velocities, m/s, world, of (N, 3) positions on an actor, metres, world,
+    which moves and turns about the vertical.
+    """
     row, known = frame - track.first, feed.frames
     near = np.clip([frame - _TURN_FRAMES, frame + _TURN_FRAMES], known[0], known[-1]) - track.first
     before, after = np.clip(near, 0, len(track.world_T_actor) - 1).tolist()
     turn = multiply(track.world_T_actor[after], invert(track.world_T_actor[before]))
-    begin, end = np.interp([track.first + before, track.first + after], known, list(feed.times.values()))
-    rate = float(np.arctan2(turn[1, 0], turn[0, 0])) / (end - begin) if end > begin and track.rigid else 0.0
+    begin, end = np.interp(
+        [track.first + before, track.first + after], known, list(feed.times.values())
+    )
+    rate = (
+        float(np.arctan2(turn[1, 0], turn[0, 0])) / (end - begin)
+        if end > begin and track.rigid
+        else 0.0
+    )
     arm = places - track.world_T_actor[row, :3, 3]
     return track.velocity[row] + rate * np.column_stack([-arm[:, 1], arm[:, 0], np.zeros(len(arm))])
 
@@ -138,7 +161,9 @@ def _numbered(feed: ScanFeed, frame: int) -> Numbered:
     if scan.instances is None:
         return np.empty((0, 3), np.float32), np.empty(0, np.int64)
     own = (scan.instances > 0) & finite(scan.points)
-    return transform_points(feed.pose(frame), scan.points[own]).astype(np.float32), scan.instances[own].astype(np.int64)
+    return transform_points(feed.pose(frame), scan.points[own]).astype(np.float32), scan.instances[
+        own
+    ].astype(np.int64)
 
 
 def _number_boxes(
@@ -163,7 +188,9 @@ def _number_boxes(
         if int(boxes.tracks[row]) not in moving:
             box_T_grid = invert(boxes.sensor_T_box[row])
             slack = np.abs(box_T_grid[:3, :3]) @ half
-            inside = (np.abs(transform_points(box_T_grid, centers)) < boxes.sizes[row] / 2 + slack).all(axis=1)
+            inside = (
+                np.abs(transform_points(box_T_grid, centers)) < boxes.sizes[row] / 2 + slack
+            ).all(axis=1)
             instance[voxels[inside]] = boxes.tracks[row]
 
 
@@ -174,7 +201,8 @@ class BodyRegions:
     Attributes:
         of_voxel: (V,) uint16, region of each voxel; STATIC outside of all bodies.
         actors: number of the actor by region, for the regions that have voxels.
-        hidden: (H,) flat indices of voxels of faces that no scan saw. Rays beside the body pass through them, and do not count there.
+        hidden: (H,) flat indices of voxels of faces that no scan saw. Rays beside the body pass
+            through them, and do not count there.
         hidden_ends: (E,) the same for faces that are hidden also in the mirror image of the body.
     """
 
@@ -184,8 +212,11 @@ class BodyRegions:
     hidden_ends: NDArray[np.int64]
 
     @classmethod
-    def at(cls, merger: Merger, now: Instant, window: Collection[int], spec: GridSpec) -> BodyRegions:
-        """Return the regions of a frame: of the bodies of moving actors, and of moving points without a body.
+    def at(
+        cls, merger: Merger, now: Instant, window: Collection[int], spec: GridSpec
+    ) -> BodyRegions:
+        """Return the regions of a frame: of the bodies of moving actors, and of moving points
+        without a body.
 
         Args:
             merger: the moving actors, and the scans.
@@ -194,16 +225,24 @@ class BodyRegions:
             spec: the grid.
         """
         tracks = merger.actors.tracks.items() if merger.dynamic == "align" else ()
-        present = [(number, track, pose) for number, track in tracks if (pose := track.pose(now.frame)) is not None]
+        present = [
+            (number, track, pose)
+            for number, track in tracks
+            if (pose := track.pose(now.frame)) is not None
+        ]
         regions = cls.of_bodies(spec, now.world_T_grid, present)
         if merger.dynamic in ("align", "current") and now.frame in window:
             scan = merger.scan_of(now.frame)
             moving = scan.points[~merger.static(now.frame)]
-            return regions.with_points(spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving))
+            return regions.with_points(
+                spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving)
+            )
         return regions
 
     def with_points(self, spec: GridSpec, points: NDArray[np.floating]) -> BodyRegions:
-        """Return the regions with another one for the voxels of moving points without a body. Only the frame's own rays vote there.
+        """Return the regions with another one for the voxels of moving points without a body.
+
+        Only the frame's own rays vote there.
 
         Args:
             spec: the grid.
@@ -216,19 +255,37 @@ class BodyRegions:
         return replace(self, of_voxel=of_voxel)
 
     @classmethod
-    def of_bodies(cls, spec: GridSpec, world_T_grid: Transform, bodies: Series[tuple[int, Track, Transform]]) -> Self:
+    def of_bodies(
+        cls, spec: GridSpec, world_T_grid: Transform, bodies: Series[tuple[int, Track, Transform]]
+    ) -> Self:
         """Return the regions of bodies: (number, track, world_T_actor) of each actor.
 
         A body has all voxels that it touches. Where bodies overlap, the smaller body has the voxel.
         """
         of_voxel = np.zeros(spec.num_voxels, np.uint16)
-        hidden, hidden_ends = np.zeros(spec.num_voxels, np.bool_), np.zeros(spec.num_voxels, np.bool_)
+        hidden, hidden_ends = (
+            np.zeros(spec.num_voxels, np.bool_),
+            np.zeros(spec.num_voxels, np.bool_),
+        )
         size = spec.voxel_size
-        # x and y of the centres of the columns of cells, (C, 2), z of the centres in each, and half the extent of the cells.
-        columns = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())[:, :, 0, :2].reshape(-1, 2)
-        columns, heights = columns.astype(np.float64), spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2]
-        width = np.hypot(columns[:, 0], columns[:, 1]) * size[1] if spec.coordinates == "cylindrical" else size[1]
-        across, up = np.broadcast_to(np.maximum(size[0], width) / 2, len(columns)), float(size[2] / 2)
+        # x and y of the centres of the columns of cells, (C, 2), z of the centres in each, and half
+        # the extent of the cells.
+        columns = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())[
+            :, :, 0, :2
+        ].reshape(-1, 2)
+        columns, heights = (
+            columns.astype(np.float64),
+            spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2],
+        )
+        width = (
+            np.hypot(columns[:, 0], columns[:, 1]) * size[1]
+            if spec.coordinates == "cylindrical"
+            else size[1]
+        )
+        across, up = (
+            np.broadcast_to(np.maximum(size[0], width) / 2, len(columns)),
+            float(size[2] / 2),
+        )
         largest_first = sorted(bodies, key=lambda body: -float(np.prod(body[1].size)))
         for region, (_, track, pose) in enumerate(largest_first, 1):
             actor_T_grid = invert(pose) @ world_T_grid
@@ -236,8 +293,13 @@ class BodyRegions:
             middle = invert(actor_T_grid)[:2, 3]
             reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
             near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
-            cells = np.column_stack([np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))])
-            slack = np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1) + up * turned[:, 2]
+            cells = np.column_stack(
+                [np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))]
+            )
+            slack = (
+                np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1)
+                + up * turned[:, 2]
+            )
             body = transform_points(actor_T_grid, cells)
             inside = ((body > track.lower - slack) & (body < track.upper + slack)).all(axis=1)
             own = (near[:, None] * len(heights) + np.arange(len(heights))).reshape(-1)[inside]
@@ -252,7 +314,10 @@ class BodyRegions:
 
 
 def _on_hidden_face(
-    track: Track, cells: NDArray[np.float64], slack: NDArray[np.float64], faces: tuple[bool, bool, bool, bool]
+    track: Track,
+    cells: NDArray[np.float64],
+    slack: NDArray[np.float64],
+    faces: tuple[bool, bool, bool, bool],
 ) -> NDArray[np.bool_]:
     """Return (C,) bool: which cells touch an unseen face and no seen face of an actor.
 
@@ -263,7 +328,14 @@ def _on_hidden_face(
         faces: whether scans saw the rear, the front, the side of low y and the side of high y.
     """
     lower, upper = track.lower + BODY_MARGIN_M, track.upper - BODY_MARGIN_M
-    away = np.stack([cells[:, 0] - lower[0], upper[0] - cells[:, 0], cells[:, 1] - lower[1], upper[1] - cells[:, 1]])
+    away = np.stack(
+        [
+            cells[:, 0] - lower[0],
+            upper[0] - cells[:, 0],
+            cells[:, 1] - lower[1],
+            upper[1] - cells[:, 1],
+        ]
+    )
     touches = np.abs(away) <= np.stack([slack[:, 0], slack[:, 0], slack[:, 1], slack[:, 1]])
     seen = np.array(faces)[:, None]
     return (touches & ~seen).any(axis=0) & ~(touches & seen).any(axis=0)

@@ -1,4 +1,7 @@
-"""The scans that are merged into each frame. Each scan is read and prepared once for all frames that share it."""
+"""The scans that are merged into each frame.
+
+Each scan is read and prepared once for all frames that share it.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +42,21 @@ from carlasc.storage.protocol import Sequence
 from carlasc.storage.resuming import scans_digest
 from carlasc.storage.views import SequenceView
 
-_ACTOR_POINTS = 400  # greatest number of points of an actor in one scan, for its motion and its body
+_ACTOR_POINTS = (
+    400  # greatest number of points of an actor in one scan, for its motion and its body
+)
 _SAMPLES = 5  # number of scans that decide whether labels name the ground
-_OTHERWISE = 0.1  # greatest share of ground points with other classes: walls and kerbs give 2 to 4 %, labels that are often wrong 15 %
-_USED = ("labels", "flow", "instances", "origins", "probabilities")  # fields of a scan that are read for merging
+# greatest share of ground points with other classes: walls and kerbs give 2 to 4 %, labels that are
+# often wrong 15 %
+_OTHERWISE = 0.1
+# fields of a scan that are read for merging
+_USED = (
+    "labels",
+    "flow",
+    "instances",
+    "origins",
+    "probabilities",
+)
 _PARTS = 30  # with `window_m`, scans are at least this part of it apart
 
 
@@ -52,7 +66,8 @@ class ScanMotion:
 
     Attributes:
         frame: frame number.
-        segments: actors that may move, with at most `_ACTOR_POINTS` points each; `members` are complete.
+        segments: actors that may move, with at most `_ACTOR_POINTS` points each; `members` are
+            complete.
         static: static points of classes that may move.
     """
 
@@ -64,7 +79,8 @@ class ScanMotion:
 class WithoutScans(SequenceView):
     """A sequence with some hidden scans. The poses and times of these frames are still known.
 
-    A hidden frame is not among the frames of the fields of scans, and reads as a scan without points.
+    A hidden frame is not among the frames of the fields of scans, and reads as a scan without
+    points.
 
     Args:
         whole: the sequence.
@@ -78,7 +94,9 @@ class WithoutScans(SequenceView):
     def frames(self, field: str) -> NDArray[np.int64]:
         """Return the frames of a field, without hidden ones if it is a field of the scans."""
         frames = self.whole.frames(field)
-        return frames[~np.isin(frames, sorted(self.hidden))] if field in layout.SCAN_FIELDS else frames
+        return (
+            frames[~np.isin(frames, sorted(self.hidden))] if field in layout.SCAN_FIELDS else frames
+        )
 
     def read(self, field: str, frame: int) -> NDArray[Any]:
         """Read one field of one frame; no rows if the frame is hidden."""
@@ -91,8 +109,8 @@ class WithoutScans(SequenceView):
 class ScanFeed:
     """The scans of one sequence for merging, with a cache.
 
-    A feed pickles as the sequence and the options. Its copies in a process share one cache of scans. Another feed of the same sequence has
-    its own cache, because files may have changed.
+    A feed pickles as the sequence and the options. Its copies in a process share one cache of
+    scans. Another feed of the same sequence has its own cache, because files may have changed.
 
     Attributes:
         sequence: the sequence that the scans are read from.
@@ -106,8 +124,14 @@ class ScanFeed:
         self.sequence, self.options = sequence, options
         metadata = sequence.metadata
         self.classes = metadata.classes
-        self.min_range_m = options.min_range_m if options.min_range_m is not None else metadata.min_range_m or 0.0
-        self.max_range_m = options.max_range_m if options.max_range_m is not None else metadata.max_range_m or np.inf
+        self.min_range_m = (
+            options.min_range_m if options.min_range_m is not None else metadata.min_range_m or 0.0
+        )
+        self.max_range_m = (
+            options.max_range_m
+            if options.max_range_m is not None
+            else metadata.max_range_m or np.inf
+        )
         self._scans: OrderedDict[int, PreparedScan] = OrderedDict()
         self._merger: Merger | None = None
         self._lock = threading.RLock()  # an executor may be of threads
@@ -156,26 +180,39 @@ class ScanFeed:
         if not self.classes.ground:
             return False
         ground = sorted(self.classes.ground)
-        return not any(np.isin(self.sequence.read("labels", frame), ground).any() for frame in self._sampled)
+        return not any(
+            np.isin(self.sequence.read("labels", frame), ground).any() for frame in self._sampled
+        )
 
     @cached_property
     def names_ground(self) -> bool:
-        """Whether labels name the ground: in some scans, few points on the ground have other classes."""
-        scans = [self._voting_points(frame) for frame in self._sampled] if self.classes.ground else []
+        """Whether labels name the ground: in some scans, few points on the ground have other
+        classes.
+        """
+        scans = (
+            [self._voting_points(frame) for frame in self._sampled] if self.classes.ground else []
+        )
         found = [_labels(scan)[ground_points(scan.points)] for scan in scans]
-        others = sum(int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground)))) for labels in found)
+        others = sum(
+            int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground)))) for labels in found
+        )
         return self.has_labels and others <= _OTHERWISE * sum(map(len, found))
 
     @property
     def _sampled(self) -> list[int]:
         """Some frames with labels. Other frames may have none."""
         labelled = self.sequence.frames("labels")
-        chosen = np.unique(np.linspace(0, len(labelled) - 1, _SAMPLES).astype(int)) if len(labelled) else labelled
+        chosen = (
+            np.unique(np.linspace(0, len(labelled) - 1, _SAMPLES).astype(int))
+            if len(labelled)
+            else labelled
+        )
         return labelled[chosen].tolist()
 
     @cached_property
     def motion(self) -> tuple[str, ...]:
-        """The sources of motion: "boxes", "instances" or "flow", and "evidence"; empty if all points count as static.
+        """The sources of motion: "boxes", "instances" or "flow", and "evidence"; empty if all
+        points count as static.
 
         Raises:
             MissingDataError: the options ask for a field that the sequence does not have.
@@ -191,7 +228,8 @@ class ScanFeed:
             if name in fields and (name == "boxes" or "labels" in fields)
         ]
         if asked == "auto":
-            # Boxes may be missing, as outside of the view of a camera. Flow that was made from boxes has the same gaps.
+            # Boxes may be missing, as outside of the view of a camera. Flow that was made from
+            # boxes has the same gaps.
             whole = "flow" in usable and "boxes" not in usable
             return (*usable[:1], *(() if whole else ("evidence",)))
         if asked not in usable:
@@ -205,15 +243,22 @@ class ScanFeed:
 
     @property
     def needs_actors(self) -> bool:
-        """Whether the actors must be found before a frame can be made. Flow and classes show moving points without them."""
+        """Whether the actors must be found before a frame can be made.
+
+        Flow and classes show moving points without them.
+        """
         return self.options.dynamic == "align" if self.motion == ("flow",) else bool(self.motion)
 
     @property
     def reads(self) -> int:
-        """Number of scans that are read to find the actors; fields and evidence of motion take a pass each."""
+        """Number of scans that are read to find the actors; fields and evidence of motion take a
+        pass each.
+        """
         if not self.needs_actors:
             return 0
-        return len(self.frames) * (any(name != "evidence" for name in self.motion) + ("evidence" in self.motion))
+        return len(self.frames) * (
+            any(name != "evidence" for name in self.motion) + ("evidence" in self.motion)
+        )
 
     def window_of(self, frame: int) -> list[int]:
         """Return the frames whose scans are merged into a frame, including the frame itself."""
@@ -239,11 +284,14 @@ class ScanFeed:
         return [
             other
             for other in self.window_of(frame)
-            if np.linalg.norm(self.pose(other)[:3, 3] - here[:3, 3]) <= across + self.read(other).reach_m
+            if np.linalg.norm(self.pose(other)[:3, 3] - here[:3, 3])
+            <= across + self.read(other).reach_m
         ]
 
     def _by_distance(self, frame: int, others: NDArray[np.int64]) -> Iterator[int]:
-        """Yield the frames of `others` within `window_m` that are not too close to each other, in order of distance from `frame`."""
+        """Yield the frames of `others` within `window_m` that are not too close to each other, in
+        order of distance from `frame`.
+        """
         limit = self.options.window_m or np.inf
         driven, last_taken, previous = 0.0, 0.0, self.pose(frame)[:3, 3]
         for other in others:
@@ -261,7 +309,10 @@ class ScanFeed:
         return self.sequence.read_pose(frame)
 
     def merger(self, actors: MovingActors, frame: int) -> Merger:
-        """Return the merger of scans into a frame, with the actors of its window. Its caches are kept from frame to frame."""
+        """Return the merger of scans into a frame, with the actors of its window.
+
+        Its caches are kept from frame to frame.
+        """
         with self._lock:
             if self._merger is None:
                 self._merger = Merger(self.read, actors, self.classes, self.options.dynamic)
@@ -304,7 +355,9 @@ class ScanFeed:
             return self._scans[frame]
 
     def static_points(self, frame: int) -> NDArray[np.float32]:
-        """Return the (N, 3) points of a scan of classes that cannot move, metres, sensor frame; all points without labels."""
+        """Return the (N, 3) points of a scan of classes that cannot move, metres, sensor frame; all
+        points without labels.
+        """
         scan = self.sequence.scan(frame, ("labels", "origins"))
         static = self._in_range(scan)
         if scan.labels is not None:
@@ -312,7 +365,9 @@ class ScanFeed:
         return np.ascontiguousarray(scan.points[static], np.float32)
 
     def evidence_scan(self, frame: int, boxes: Sequence_[Track]) -> EvidenceScan:
-        """Return a scan for evidence of motion. Points of actors that the fields of the sequence show are marked.
+        """Return a scan for evidence of motion.
+
+        Points of actors that the fields of the sequence show are marked.
 
         Args:
             frame: frame number.
@@ -322,10 +377,16 @@ class ScanFeed:
         explained = np.zeros(len(scan), np.bool_)
         for segment in self._segments(frame, scan, boxes):
             explained[segment.members] = True
-        ground = np.isin(_labels(scan), sorted(self.classes.ground)) if self.names_ground or self.finds_ground else None
+        ground = (
+            np.isin(_labels(scan), sorted(self.classes.ground))
+            if self.names_ground or self.finds_ground
+            else None
+        )
         labels = _labels(scan) if self.has_labels else None
         origins = scan.others.get("origins")
-        return EvidenceScan(frame, scan.points, pose, self.time(frame), ground, labels, explained, origins)
+        return EvidenceScan(
+            frame, scan.points, pose, self.time(frame), ground, labels, explained, origins
+        )
 
     def segments(self, frame: int, boxes: Sequence_[Track]) -> ScanMotion:
         """Return the actors of a scan that the fields of the sequence show.
@@ -334,23 +395,36 @@ class ScanFeed:
             frame: frame number.
             boxes: the tracks of the sequence's boxes.
         """
-        scan, static, speed = self._voting_points(frame), StaticPoints.empty(frame), self.options.motion.min_speed_m_s
+        scan, static, speed = (
+            self._voting_points(frame),
+            StaticPoints.empty(frame),
+            self.options.motion.min_speed_m_s,
+        )
         if self.motion[:1] == ("flow",):
-            static = static_actor_points(frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed)
+            static = static_actor_points(
+                frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed
+            )
         found = self._segments(frame, scan, boxes)
-        return ScanMotion(frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in found), static)
+        return ScanMotion(
+            frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in found), static
+        )
 
     def _segments(self, frame: int, scan: Scan, boxes: Sequence_[Track]) -> list[Segment]:
         """Return the actors of a scan with all their points."""
         pose, ground, by = self.pose(frame), self.classes.ground, [*self.motion, ""][0]
         if by == "flow":
-            return segment_by_flow(frame, scan, pose, min_speed_m_s=self.options.motion.min_speed_m_s)
+            return segment_by_flow(
+                frame, scan, pose, min_speed_m_s=self.options.motion.min_speed_m_s
+            )
         if by == "instances":
             return segment_by_instances(frame, scan, pose, ground=ground)
         return segment_by_boxes(frame, scan, pose, boxes, ground=ground) if by == "boxes" else []
 
     def _voting_points(self, frame: int) -> Scan:
-        """Read the voting points of a scan: without unlabelled, too near and too far ones. Points with one origin follow each other."""
+        """Read the voting points of a scan: without unlabelled, too near and too far ones.
+
+        Points with one origin follow each other.
+        """
         scan = self.sequence.scan(frame, _USED)
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
@@ -368,16 +442,24 @@ class ScanFeed:
         return scan.select(order[voting[order]])
 
     def _in_range(self, scan: Scan) -> NDArray[np.bool_]:
-        """Return (N,) bool: which points are finite, and neither too near to the origins of their rays nor too far."""
+        """Return (N,) bool: which points are finite, and neither too near to the origins of their
+        rays nor too far.
+        """
         origins = scan.others.get("origins")
         with np.errstate(invalid="ignore", over="ignore"):
             distance = lengths(scan.points if origins is None else scan.points - origins)
             return (distance >= self.min_range_m) & (distance <= self.max_range_m)
 
-    def _with_ground(self, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger]) -> NDArray[np.uint32]:
-        """Return labels in which points without a class on the ground have a ground class, so that they vote as ground."""
+    def _with_ground(
+        self, points: NDArray[np.float32], labels: NDArray[np.unsignedinteger]
+    ) -> NDArray[np.uint32]:
+        """Return labels in which points without a class on the ground have a ground class, so that
+        they vote as ground.
+        """
         found = np.asarray(labels, np.uint32).copy()
-        found[ground_points(points) & (labels == self.classes.geometry_id)] = min(self.classes.ground)
+        found[ground_points(points) & (labels == self.classes.geometry_id)] = min(
+            self.classes.ground
+        )
         return found
 
 

@@ -36,10 +36,11 @@ from carlasc.motion.tracks import MovingActors
 _OWN_LOWER, _OWN_UPPER = np.array([-2.2, -0.75, -1.2]), np.array([2.2, 0.75, 0.0])
 _OWN_PROBABILITY = 0.01
 _RETURNED_PROBABILITY = 0.6  # of a voxel with a return of this scan that other scans saw free
-# Hits per metre of free path in a voxel with a return of the frame's own scan, below which this return is an outlier: with other returns around
-# it, and without.
+# Hits per metre of free path in a voxel with a return of the frame's own scan, below which this
+# return is an outlier: with other returns around it, and without.
 _OUTLIER_PER_M, _SINGLE_PER_M = 0.02, 0.05
-# A voxel of a body with a greater probability is not free, and one with a smaller probability is not occupied.
+# A voxel of a body with a greater probability is not free, and one with a smaller probability is
+# not occupied.
 _DOUBTFUL, _UNSURE = 0.05, 0.75
 _NO_VOXELS = np.empty(0, np.int64)
 
@@ -61,7 +62,9 @@ class MergedFrame:
     actors: VoxelActors | None = None
 
 
-def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int, window: list[int]) -> MergedFrame:
+def merge_frame(
+    plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int, window: list[int]
+) -> MergedFrame:
     """Make the grid of a frame from the scans of a window.
 
     Args:
@@ -71,7 +74,12 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
         frame: frame number.
         window: frames whose scans are merged; the frame itself need not be one of them.
     """
-    merger, now, options, classes = feed.merger(actors, frame), feed.instant(frame), feed.options, feed.classes
+    merger, now, options, classes = (
+        feed.merger(actors, frame),
+        feed.instant(frame),
+        feed.options,
+        feed.classes,
+    )
 
     merger.rays = options.rays if plan.rule == "ray" else "all"
 
@@ -93,7 +101,9 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
 
     # In these voxels, free space of rays beside a body or of other times does not count.
     contested = steps.contested()
-    doubtful = np.concatenate([regions.hidden, steps.unseen_now(contested[~seen_now[contested]], recent)])
+    doubtful = np.concatenate(
+        [regions.hidden, steps.unseen_now(contested[~seen_now[contested]], recent)]
+    )
     made.forget(doubtful[made.labels[doubtful] == 0])
 
     # Actors are completed by their mirror images, then by the surfaces of their tracks.
@@ -121,7 +131,10 @@ def merge_frame(plan: GridPlan, feed: ScanFeed, actors: MovingActors, frame: int
     if made.occupied is None or views is None:
         return MergedFrame(grid, votes, actors=who)
     inferred = np.concatenate([_NO_VOXELS, *(voxels for voxels, _ in completed)])
-    flags, shares = steps.flags(inferred, contested), _join_shares(votes, consensus, completed, classes)
+    flags, shares = (
+        steps.flags(inferred, contested),
+        _join_shares(votes, consensus, completed, classes),
+    )
     evidence = VoxelCertainty(made.occupied.reshape(size), shares, flags.reshape(size), views)
     return MergedFrame(grid, votes, evidence, who)
 
@@ -132,7 +145,9 @@ def _join_shares(
     completed: list[tuple[NDArray[np.int64], NDArray[Any]]],
     classes: ClassTable,
 ) -> NDArray[Any]:
-    """Return the shares of classes: from the consensus of scans, and for completed voxels from the votes that completed them."""
+    """Return the shares of classes: from the consensus of scans, and for completed voxels from the
+    votes that completed them.
+    """
     seen = class_shares(votes.occupied, classes) if consensus is None else consensus.shares
     later = [class_shares(hits, classes) for _, hits in completed]
     taken = np.concatenate([_NO_VOXELS, *(hits["voxel"] for hits in later)])
@@ -140,10 +155,17 @@ def _join_shares(
     return joined[np.argsort(joined["voxel"], kind="stable")]
 
 
-def _have_neighbours(voxels: NDArray[np.int64], others: NDArray[np.int64], spec: GridSpec) -> NDArray[np.bool_]:
-    """Return which of (N,) voxels, flat indices, have one of (M,) other voxels, increasing, among the 26 around them."""
+def _have_neighbours(
+    voxels: NDArray[np.int64], others: NDArray[np.int64], spec: GridSpec
+) -> NDArray[np.bool_]:
+    """Return which of (N,) voxels, flat indices, have one of (M,) other voxels, increasing, among
+    the 26 around them.
+    """
     around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    near = np.stack(np.unravel_index(voxels, spec.size), axis=-1)[:, None] + around[np.any(around != 0, axis=1)]
+    near = (
+        np.stack(np.unravel_index(voxels, spec.size), axis=-1)[:, None]
+        + around[np.any(around != 0, axis=1)]
+    )
     inside = ((near >= 0) & (near < spec.size)).all(axis=2)
     flat = np.ravel_multi_index(tuple(np.moveaxis(near, 2, 0)), spec.size, mode="clip")
     return (np.isin(flat, others) & inside).any(axis=1)
@@ -198,7 +220,9 @@ class _UnfinishedGrid:
         self.labels[voxels] = self.counts[voxels] = 0
         self.set_probability(voxels, UNKNOWN)
 
-    def set_probability(self, voxels: NDArray[np.integer], probability: NDArray[np.float32] | float) -> None:
+    def set_probability(
+        self, voxels: NDArray[np.integer], probability: NDArray[np.float32] | float
+    ) -> None:
         """Set the probability that voxels are occupied, if it is needed."""
         if self.occupied is not None:
             self.occupied[voxels] = probability
@@ -221,7 +245,9 @@ class _FrameSteps:
         return self.regions.of_voxel != STATIC
 
     def decide_seen(self, votes: Votes, consensus: ClassConsensus | None) -> _UnfinishedGrid:
-        """Return the grid from the votes for the static scene and in the bodies of actors, with the classes of the consensus."""
+        """Return the grid from the votes for the static scene and in the bodies of actors, with the
+        classes of the consensus.
+        """
         evidence = self.plan.needs_evidence
         labels, hits = votes.elect_occupied()
         if consensus is not None:
@@ -229,7 +255,9 @@ class _FrameSteps:
         free = votes.free.reshape(-1)
         bodies = np.flatnonzero(np.isin(self.regions.of_voxel, list(self.regions.actors)))
         doubtful = self._doubtful(self._evidence(votes, labels, hits, bodies))
-        found = self._evidence(votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels))
+        found = self._evidence(
+            votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels)
+        )
         labels[found.voxels] = self._decide(found)
         counts = np.add(hits, free, out=hits)
         made = _UnfinishedGrid(labels, counts)
@@ -240,13 +268,22 @@ class _FrameSteps:
         return made
 
     def _doubtful(self, evidence: _VoxelEvidence) -> NDArray[np.int64]:
-        """Return the voxels of bodies with an uncertain decision: free ones that may be occupied, and actors that may be free."""
+        """Return the voxels of bodies with an uncertain decision: free ones that may be occupied,
+        and actors that may be free.
+        """
         likely, is_free = self._probability(evidence), self._decide(evidence) == 0
-        unsure = np.where(is_free, likely > _DOUBTFUL, (likely < _UNSURE) & (evidence.matter == Matter.BODY))
+        unsure = np.where(
+            is_free, likely > _DOUBTFUL, (likely < _UNSURE) & (evidence.matter == Matter.BODY)
+        )
         return evidence.voxels[(evidence.counts > 0) & unsure]
 
-    def complete(self, made: _UnfinishedGrid, votes: Votes) -> tuple[NDArray[np.int64], NDArray[Any]]:
-        """Complete unknown voxels of bodies by votes; return these voxels and their votes. Voxels with free votes stay unknown."""
+    def complete(
+        self, made: _UnfinishedGrid, votes: Votes
+    ) -> tuple[NDArray[np.int64], NDArray[Any]]:
+        """Complete unknown voxels of bodies by votes; return these voxels and their votes.
+
+        Voxels with free votes stay unknown.
+        """
         found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
         found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
         unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
@@ -265,7 +302,9 @@ class _FrameSteps:
         if not self.plan.voting.keep_actors:
             return None
         merger = self.merger
-        return find_voxels(self.plan.spec, self.feed, merger.actors, self.now, self.regions, self.window, labels)
+        return find_voxels(
+            self.plan.spec, self.feed, merger.actors, self.now, self.regions, self.window, labels
+        )
 
     def flags(self, inferred: NDArray[np.int64], contested: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return (V,) uint8: the flags of each voxel."""
@@ -282,9 +321,14 @@ class _FrameSteps:
         return flags
 
     def vote(
-        self, observations: Iterable[Observation], ballot: Ballot | None = None, count_views: bool = False
+        self,
+        observations: Iterable[Observation],
+        ballot: Ballot | None = None,
+        count_views: bool = False,
     ) -> Ballot:
-        """Add the votes of observations, each in its region, to a ballot or to a new one, and return it."""
+        """Add the votes of observations, each in its region, to a ballot or to a new one, and
+        return it.
+        """
         ballot = ballot or Ballot(
             self.plan.spec,
             self.feed.classes,
@@ -310,32 +354,49 @@ class _FrameSteps:
         if self.feed.options.dynamic == "tube":
             return evidence.labels
         free_m = evidence.free * self.plan.voting.free_step_m
-        return np.where(is_occupied(evidence.hits, free_m, evidence.matter), evidence.labels, 0).astype(
-            evidence.labels.dtype
-        )
+        return np.where(
+            is_occupied(evidence.hits, free_m, evidence.matter), evidence.labels, 0
+        ).astype(evidence.labels.dtype)
 
     def _probability(self, evidence: _VoxelEvidence) -> NDArray[np.float32]:
         step = self.plan.voting.free_step_m
         return probability(
-            evidence.hits, evidence.free * step, evidence.matter, self.in_body[evidence.voxels], self.plan.spec, step
+            evidence.hits,
+            evidence.free * step,
+            evidence.matter,
+            self.in_body[evidence.voxels],
+            self.plan.spec,
+            step,
         )
 
     def contested(self) -> NDArray[np.int64]:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        return np.flatnonzero(self.vote(self.merger.passing(self.now, self.window)).hit & ~self.in_body)
+        return np.flatnonzero(
+            self.vote(self.merger.passing(self.now, self.window)).hit & ~self.in_body
+        )
 
     def unseen_now(self, voxels: NDArray[np.int64], recent: list[int]) -> NDArray[np.int64]:
         """Return the voxels of `voxels` in which recent scans have no moving points."""
-        return voxels[~self.vote(self.merger.moving(self.now, recent)).hit[voxels]] if len(voxels) else voxels
+        return (
+            voxels[~self.vote(self.merger.moving(self.now, recent)).hit[voxels]]
+            if len(voxels)
+            else voxels
+        )
 
     def keep_returns(self, made: _UnfinishedGrid, votes: Votes, consensus: ClassConsensus) -> None:
-        """Make voxels with returns of the frame's own scan occupied, unless the returns are outliers. Other scans do not count here."""
+        """Make voxels with returns of the frame's own scan occupied, unless the returns are
+        outliers. Other scans do not count here.
+        """
         if self.now.frame not in self.window:
             return
         spec, scan = self.plan.spec, self.feed.read(self.now.frame)
-        points = scan.points if self.merger.dynamic != "drop" else scan.points[self.merger.static(self.now.frame)]
+        points = (
+            scan.points
+            if self.merger.dynamic != "drop"
+            else scan.points[self.merger.static(self.now.frame)]
+        )
         returns = count_points(points, self.now.grid_T_world @ scan.world_T_sensor, spec)
         returned = np.flatnonzero(returns)
         lost = returned[(made.labels[returned] == 0) & (consensus.labels[returned] > 0)]
@@ -350,20 +411,27 @@ class _FrameSteps:
         made.set_probability(kept, _RETURNED_PROBABILITY)
 
     def driven(self, made: _UnfinishedGrid) -> NDArray[np.int64]:
-        """Return the occupied voxels on the ego path of other frames, without ground, bodies and returns of the frame's own scan."""
+        """Return the occupied voxels on the ego path of other frames, without ground, bodies and
+        returns of the frame's own scan.
+        """
         apart = float(self.plan.spec.voxel_size[[0, 2]].min()) / 2
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
         path = np.zeros(self.plan.spec.num_voxels, np.int32)
         for other in self.window:
             if other != self.now.frame:
-                count_points(body, self.now.grid_T_world @ self.feed.pose(other), self.plan.spec, path)
+                count_points(
+                    body, self.now.grid_T_world @ self.feed.pose(other), self.plan.spec, path
+                )
         voxels = np.flatnonzero((path > 0) & (made.labels > 0))
         solid = ~np.isin(made.labels[voxels], sorted(self.feed.classes.ground))
         there_now = self.in_body  # and where the frame's own scan has points
         if self.now.frame in self.window:
             scan = self.feed.read(self.now.frame)
             there_now = there_now | (
-                count_points(scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.plan.spec) > 0
+                count_points(
+                    scan.points, self.now.grid_T_world @ scan.world_T_sensor, self.plan.spec
+                )
+                > 0
             )
         return voxels[solid & ~there_now[voxels]]

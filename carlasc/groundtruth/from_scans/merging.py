@@ -1,8 +1,9 @@
 """Merging the scans of one sensor over time, without ghost trails of moving actors.
 
-Plain voting would remove moving actors, because free space of other scans has more votes in their voxels. So the static scene and each actor
-have separate votes. In the box of an actor, the motion of the actor moves the points and rays of all scans to the time of the frame, and then
-they vote. Free space of the static scene from other scans does not count there.
+Plain voting would remove moving actors, because free space of other scans has more votes in their
+voxels. So the static scene and each actor have separate votes. In the box of an actor, the motion
+of the actor moves the points and rays of all scans to the time of the frame, and then they vote.
+Free space of the static scene from other scans does not count there.
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ from carlasc.storage import layout
 STATIC = 0  # region of the voxels that belong to no actor
 _DEFORMABLE_S = 0.85  # the shape of a person is used for this time before and after
 _RECENT_S = 0.25  # scans within this time before and after a frame show the scene at the frame
-# Points so near to the body of an actor may belong to it, as paths have errors: metres along, across and up.
+# Points so near to the body of an actor may belong to it, as paths have errors: metres along,
+# across and up.
 _AROUND_M = np.array([0.3, 0.3, 0.1])
 _MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
-_POINT_M2 = 0.004  # area of a sphere around the sensor, over the number of points, in which one ray is enough
+# area of a sphere around the sensor, over the number of points, in which one ray is enough
+_POINT_M2 = 0.004
 _GOLDEN, _SILVER = 2654435769, 1779033703  # their multiples modulo 2 ** 32 are evenly spread
 
 
@@ -64,10 +67,13 @@ class PreparedScan:
         world_T_sensor: (4, 4).
         reach_m: distance of the farthest point, metres.
         seconds: time of the scan.
-        moving: (M,) indices of the points that move by their flow or their class, on a track or not.
+        moving: (M,) indices of the points that move by their flow or their class, on a track or
+            not.
         sure: (N,) float32, probability of each label from a network; None: 1.
-        ends: (N, 3) float32, the points relative to the origins of their rays, metres: `points` themselves if that is the sensor.
-        rays: the rays to the points, by origin: several for several sensors or a sensor that moves during the scan.
+        ends: (N, 3) float32, the points relative to the origins of their rays, metres: `points`
+            themselves if that is the sensor.
+        rays: the rays to the points, by origin: several for several sensors or a sensor that moves
+            during the scan.
     """
 
     frame: int
@@ -103,7 +109,8 @@ class PreparedScan:
             world_T_sensor: (4, 4) pose of the scan.
             seconds: time of the scan.
             moving: (M,) indices of the points that move; None: none.
-            origins: (N, 3) origins of the rays, metres, sensor frame; None: all at the sensor. Points with one origin follow each other.
+            origins: (N, 3) origins of the rays, metres, sensor frame; None: all at the sensor.
+                Points with one origin follow each other.
             probabilities: (N, 6) the field of the scan; None: labels are certain.
         """
         reach = float(lengths(points).max(initial=0.0))
@@ -113,41 +120,79 @@ class PreparedScan:
             likely = probabilities[:, 1] / np.float32(layout.CERTAIN)
             sure = np.where(probabilities[:, 0] == labels, likely, np.float32(1)).astype(np.float32)
         ends = points if origins is None or not origins.any() else points - origins
-        rays = tuple(RaysFromPlace.of(ends, part, origin) for part, origin in runs_of_origins(origins, len(points)))
-        return cls(frame, points, labels.astype(np.uint16), world_T_sensor, reach, seconds, moving, ends, rays, sure)
+        rays = tuple(
+            RaysFromPlace.of(ends, part, origin)
+            for part, origin in runs_of_origins(origins, len(points))
+        )
+        return cls(
+            frame,
+            points,
+            labels.astype(np.uint16),
+            world_T_sensor,
+            reach,
+            seconds,
+            moving,
+            ends,
+            rays,
+            sure,
+        )
 
     @cached_property
     def world_T_places(self) -> NDArray[np.float64]:
         """(4, 4) pose of the sensor, or (K, 4, 4) poses of the origins of rays."""
         places = np.stack([rays.sensor_T_place for rays in self.rays])
-        return self.world_T_sensor @ places if len(places) > 1 or places[0, :3, 3].any() else self.world_T_sensor
+        return (
+            self.world_T_sensor @ places
+            if len(places) > 1 or places[0, :3, 3].any()
+            else self.world_T_sensor
+        )
 
     @cached_property
     def enough(self) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
-        """(M,) indices of the rays that vote with `rays="enough"`, and their (M,) weights: near the sensor, one of up to four votes for all.
+        """(M,) indices of the rays that vote with `rays="enough"`, and their (M,) weights: near the
+        sensor, one of up to four votes for all.
 
-        The choice depends on the frame number and the index of the ray alone, so that scans of one place use different rays.
+        The choice depends on the frame number and the index of the ray alone, so that scans of one
+        place use different rays.
         """
-        crowd = len(self.ends) * _POINT_M2 / np.maximum(np.square(lengths(self.ends)), np.float32(1e-3))
+        crowd = (
+            len(self.ends) * _POINT_M2 / np.maximum(np.square(lengths(self.ends)), np.float32(1e-3))
+        )
         power = ((crowd >= 2).astype(np.uint32) + (crowd >= 4)).astype(np.uint32)
-        turn = np.arange(len(power), dtype=np.uint32) * np.uint32(_GOLDEN) + np.uint32(self.frame * _SILVER % 2**32)
+        turn = np.arange(len(power), dtype=np.uint32) * np.uint32(_GOLDEN) + np.uint32(
+            self.frame * _SILVER % 2**32
+        )
         chosen = np.flatnonzero(turn <= np.uint32(2**32 - 1) >> power)
         return chosen, np.left_shift(1, power[chosen]).astype(np.uint8)
 
-    def votes_of(self, labels: NDArray[np.uint16], hits: NDArray[np.bool_] | None) -> dict[str, Any]:
-        """Return arguments of `Observation` for the votes of the scan: all except poses and regions.
+    def votes_of(
+        self, labels: NDArray[np.uint16], hits: NDArray[np.bool_] | None
+    ) -> dict[str, Any]:
+        """Return arguments of `Observation` for the votes of the scan: all except poses and
+        regions.
 
         Args:
             labels: (N,) uint16, the classes of the points.
             hits: (N,) bool, points that vote for their class; None: all.
         """
-        ends = None if self.world_T_places.ndim == 2 else np.array([rays.part.stop for rays in self.rays])
-        return {"points": self.ends, "labels": labels, "hits": hits, "sure": self.sure, "ends": ends}
+        ends = (
+            None
+            if self.world_T_places.ndim == 2
+            else np.array([rays.part.stop for rays in self.rays])
+        )
+        return {
+            "points": self.ends,
+            "labels": labels,
+            "hits": hits,
+            "sure": self.sure,
+            "ends": ends,
+        }
 
     def through(
         self, world_T_box: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> Iterator[tuple[RaysFromPlace, Transform, NDArray[np.int32]]]:
-        """Yield the rays from each origin, (4, 4) box_T_place, and the indices of its rays that intersect a box.
+        """Yield the rays from each origin, (4, 4) box_T_place, and the indices of its rays that
+        intersect a box.
 
         Args:
             world_T_box: (4, 4) pose of the frame in which the box is axis-aligned.
@@ -170,7 +215,11 @@ class Merger:
     """
 
     def __init__(
-        self, scan_of: Callable[[int], PreparedScan], actors: MovingActors, classes: ClassTable, dynamic: Dynamic
+        self,
+        scan_of: Callable[[int], PreparedScan],
+        actors: MovingActors,
+        classes: ClassTable,
+        dynamic: Dynamic,
     ) -> None:
         self.scan_of, self.actors, self.classes, self.dynamic = scan_of, actors, classes, dynamic
         self.rays: Rays = "all"
@@ -187,11 +236,14 @@ class Merger:
                 del kept[other]
         self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
-    def observations(self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]) -> Iterator[Observation]:
-        """Yield the observations of a frame's grid: each scan of the static scene, then each actor's scans in its body.
+    def observations(
+        self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]
+    ) -> Iterator[Observation]:
+        """Yield the observations of a frame's grid: each scan of the static scene, then each
+        actor's scans in its body.
 
-        Static surfaces vote everywhere, so the road below an actor is kept. Free space from other times does not count in the bodies of
-        actors. The frame's own rays always count.
+        Static surfaces vote everywhere, so the road below an actor is kept. Free space from other
+        times does not count in the bodies of actors. The frame's own rays always count.
 
         Args:
             now: the frame.
@@ -212,26 +264,37 @@ class Merger:
         yield from self.in_bodies(now, window, bodies)
 
     def _enough(self, scan: PreparedScan, hits: NDArray[np.bool_] | None) -> dict[str, Any]:
-        """Return the votes of the rays that are enough: prepared once, for all frames that use them."""
+        """Return the votes of the rays that are enough: prepared once, for all frames that use
+        them.
+        """
         if scan.frame not in self._sampled:
             votes, (chosen, weights) = scan.votes_of(self.labels(scan.frame), hits), scan.enough
             ends = votes.pop("ends")
-            parts = {name: None if values is None else values[chosen] for name, values in votes.items()}
+            parts = {
+                name: None if values is None else values[chosen] for name, values in votes.items()
+            }
             parts["ends"] = None if ends is None else np.searchsorted(chosen, ends)
             self._sampled[scan.frame] = {**parts, "weights": weights}
         return self._sampled[scan.frame]
 
     def in_bodies(
-        self, now: Instant, window: Iterable[int], bodies: Mapping[int, int], *, mirror: bool = False
+        self,
+        now: Instant,
+        window: Iterable[int],
+        bodies: Mapping[int, int],
+        *,
+        mirror: bool = False,
     ) -> Iterator[Observation]:
-        """Yield the observation of each actor's body by other scans, with a voter for each origin of rays.
+        """Yield the observation of each actor's body by other scans, with a voter for each origin
+        of rays.
 
         Args:
             now: the frame.
             window: frames of the scans.
             bodies: number of the actor by region, for the actors that vote in their bodies.
-            mirror: yield mirror images instead. Vehicles are symmetric: their points and rays are reflected in the vertical plane through
-                the middle of the body, if that is known. Only mirror images use the frame's own scan.
+            mirror: yield mirror images instead. Vehicles are symmetric: their points and rays are
+                reflected in the vertical plane through the middle of the body, if that is known.
+                Only mirror images use the frame's own scan.
         """
         window = [other for other in window if mirror or other != now.frame]
         for region, number in bodies.items():
@@ -256,7 +319,10 @@ class Merger:
             )
 
     def passing(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the moving points of each other scan, at their positions in that scan. No ray votes for free space."""
+        """Yield the moving points of each other scan, at their positions in that scan.
+
+        No ray votes for free space.
+        """
         yield from self.moving(now, (other for other in window if other != now.frame))
 
     def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
@@ -268,26 +334,36 @@ class Merger:
                 self._moving[other] = scan.points[moving], self.labels(other)[moving]
             points, labels = self._moving[other]
             if len(points):
-                yield Observation(points, labels, now.grid_T_world @ scan.world_T_sensor, free_region=NOWHERE)
+                yield Observation(
+                    points, labels, now.grid_T_world @ scan.world_T_sensor, free_region=NOWHERE
+                )
 
     def recent(self, now: Instant, window: Iterable[int]) -> list[int]:
         """Return the frames of the scans within `_RECENT_S` of the frame."""
-        return [other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= _RECENT_S]
+        return [
+            other for other in window if abs(self.scan_of(other).seconds - now.seconds) <= _RECENT_S
+        ]
 
     def shells(self, now: Instant, bodies: Mapping[int, int]) -> Iterator[Observation]:
-        """Yield the surface of each vehicle, for the parts that no scan saw. No ray votes for free space."""
+        """Yield the surface of each vehicle, for the parts that no scan saw.
+
+        No ray votes for free space.
+        """
         for region, number in bodies.items():
             track = self.actors.tracks[number]
             pose = track.pose(now.frame)
             points = track.surface
             if len(points) and pose is not None:
                 labels = np.full(len(points), track.label, np.uint16)
-                yield Observation(points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE)
+                yield Observation(
+                    points, labels, now.grid_T_world @ pose, hit_region=region, free_region=NOWHERE
+                )
 
     def static(self, frame: int) -> NDArray[np.bool_]:
         """Return (N,) bool: the points of a scan that belong to no moving actor.
 
-        Points in or near the body of an actor are not static, except ground: fields and free space may miss some points of an actor.
+        Points in or near the body of an actor are not static, except ground: fields and free space
+        may miss some points of an actor.
         """
         if frame not in self._static:
             scan = self.scan_of(frame)
@@ -304,7 +380,10 @@ class Merger:
         return self._static[frame]
 
     def labels(self, frame: int) -> NDArray[np.uint16]:
-        """Return the (N,) classes of the points of a scan. All points of an actor have the most frequent class of its points in all scans."""
+        """Return the (N,) classes of the points of a scan.
+
+        All points of an actor have the most frequent class of its points in all scans.
+        """
         if frame not in self._labels:
             labels = self.scan_of(frame).labels.copy()
             for track in self.actors.tracks.values() if self.dynamic == "align" else ():
@@ -313,7 +392,9 @@ class Merger:
         return self._labels[frame]
 
     def _carry(self, number: int, other: int, now: Instant) -> tuple[Observation, ...]:
-        """Return the rays of a scan through the body of an actor, in the actor frame; none if the shape of the actor was different then."""
+        """Return the rays of a scan through the body of an actor, in the actor frame; none if the
+        shape of the actor was different then.
+        """
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
             return ()
@@ -330,7 +411,9 @@ class Merger:
 
 
 def _points_near(track: Track, scan: PreparedScan) -> NDArray[np.int64]:
-    """Return the indices of the points of a scan that are in the body of an actor, or within `_AROUND_M` of it."""
+    """Return the indices of the points of a scan that are in the body of an actor, or within
+    `_AROUND_M` of it.
+    """
     pose, found = track.pose(scan.frame), [np.empty(0, np.int64)]
     if pose is None:
         return found[0]

@@ -1,7 +1,9 @@
-"""The passes over the scans of a sequence, before the first grid is made: poses are refined, then actors are found.
+"""The passes over the scans of a sequence, before the first grid is made: poses are refined, then
+actors are found.
 
-Several workers read scans in batches. Segments are linked in order of time, and the track of an actor is estimated after its last
-observation. Memory does not grow with the length of a drive, except for the result.
+Several workers read scans in batches. Segments are linked in order of time, and the track of an
+actor is estimated after its last observation. Memory does not grow with the length of a drive,
+except for the result.
 """
 
 from __future__ import annotations
@@ -47,7 +49,11 @@ from carlasc.storage.sinks import SequenceWriter
 TRACKS, POSES = "tracks", "poses"
 """The names of the files with actors and with refined poses, in the folder of derived results."""
 
-_VERSIONS = {TRACKS: 5, POSES: 1}  # of the methods: a version changes only when the same input gives another result
+# of the methods: a version changes only when the same input gives another result
+_VERSIONS = {
+    TRACKS: 5,
+    POSES: 1,
+}
 _NOTED_M = 0.04  # if scans disagree by more and poses do not change, there is a note
 _BATCH = 200  # number of frames between estimates of finished tracks
 _ACTORS = 32  # number of actors whose tracks are estimated together
@@ -60,18 +66,27 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class _FindEvidence:
-    """Finds evidence of motion in the scans of a block, in a worker. It also reads the scans of some seconds before and after."""
+    """Finds evidence of motion in the scans of a block, in a worker.
+
+    It also reads the scans of some seconds before and after.
+    """
 
     feed: ScanFeed
     boxes: tuple[Track, ...]
 
     def __call__(self, block: tuple[int, ...]) -> list[FreeSpaceEvidence]:
         times = self.feed.times
-        near = [f for f, s in times.items() if times[block[0]] - HORIZON_S <= s <= times[block[-1]] + HORIZON_S]
+        near = [
+            f
+            for f, s in times.items()
+            if times[block[0]] - HORIZON_S <= s <= times[block[-1]] + HORIZON_S
+        ]
         scans = (self.feed.evidence_scan(frame, self.boxes) for frame in near)
         chosen = set(block)
         # labels that are often wrong must not split actors
-        found = find_evidence(scans, movable=self.feed.classes.movable if self.feed.names_ground else ())
+        found = find_evidence(
+            scans, movable=self.feed.classes.movable if self.feed.names_ground else ()
+        )
         return [evidence.thinned() for evidence in found if evidence.frame in chosen]
 
 
@@ -84,7 +99,9 @@ class _MakeTrack:
 
     def __call__(self, actor: tuple[Chain, bool | None, float]) -> Track:
         chain, rigid, confidence = actor
-        return make_track(chain, self.times, deformable=self.deformable, rigid=rigid, confidence=confidence)
+        return make_track(
+            chain, self.times, deformable=self.deformable, rigid=rigid, confidence=confidence
+        )
 
 
 @dataclass(frozen=True)
@@ -112,8 +129,12 @@ class _MotionPass:
     run: Run
     steps: Callable[[int], None] | None
 
-    def _each(self, function: Callable[[Item], Result], items: Sequence[Item]) -> closing[Generator[Result]]:
-        """Return the results of a function of each item, in a context that stops the work at its end."""
+    def _each(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> closing[Generator[Result]]:
+        """Return the results of a function of each item, in a context that stops the work at its
+        end.
+        """
         return closing(run_all(function, items, self.run))
 
     def _count(self, scans: int) -> None:
@@ -130,7 +151,9 @@ class _MotionPass:
             return tracks
         for begin in range(0, len(frames), _BATCH):
             ended: list[Chain] = []
-            with self._each(partial(self.feed.segments, boxes=()), frames[begin : begin + _BATCH]) as scans:
+            with self._each(
+                partial(self.feed.segments, boxes=()), frames[begin : begin + _BATCH]
+            ) as scans:
                 for scan in scans:
                     ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.static)
                     self._count(1)
@@ -149,7 +172,9 @@ class _MotionPass:
                     segments.setdefault(segment.instance, []).append(few)
                 self._count(1)
         follow = _FollowBox(self.feed.times)
-        with self._each(follow, [(track, segments.get(track.instance, [])) for track in boxes]) as tracks:
+        with self._each(
+            follow, [(track, segments.get(track.instance, [])) for track in boxes]
+        ) as tracks:
             return with_surfaces(list(tracks))
 
     def found(
@@ -171,17 +196,27 @@ class _MotionPass:
         moved: dict[int, NDArray[np.int64]] = {}
         own: list[NDArray[np.float64]] = []
         actors = follow_actors(
-            evidence(), moved, deformable=classes.deformable, first_instance=FIRST_FOUND, default_label=label, own=own
+            evidence(),
+            moved,
+            deformable=classes.deformable,
+            first_instance=FIRST_FOUND,
+            default_label=label,
+            own=own,
         )
         tracks: list[Track] = []
         while batch := list(islice(actors, _ACTORS)):
             # their paths are estimated again: integrated velocities would drift
-            chains = [([replace(s, velocity=None) for s in m.segments], m.rigid, m.confidence) for m in batch]
+            chains = [
+                ([replace(s, velocity=None) for s in m.segments], m.rigid, m.confidence)
+                for m in batch
+            ]
             tracks += self._estimate(chains)
         return tracks, _untracked(moved, tracks), own
 
     def _estimate(self, actors: Sequence[tuple[Chain, bool | None, float]]) -> list[Track]:
-        with self._each(_MakeTrack(self.feed.times, self.feed.classes.deformable), actors) as tracks:
+        with self._each(
+            _MakeTrack(self.feed.times, self.feed.classes.deformable), actors
+        ) as tracks:
             return list(tracks)
 
 
@@ -212,7 +247,9 @@ def find_actors(
     return MovingActors.of(tracks if boxes else complete_bodies(tracks), moving, own)
 
 
-def _untracked(moved: dict[int, NDArray[np.int64]], tracks: list[Track]) -> dict[int, NDArray[np.integer]]:
+def _untracked(
+    moved: dict[int, NDArray[np.int64]], tracks: list[Track]
+) -> dict[int, NDArray[np.integer]]:
     """Return the moved points of each frame that belong to no track."""
     tracked: dict[int, list[NDArray[np.integer]]] = {}
     for track in tracks:
@@ -220,27 +257,37 @@ def _untracked(moved: dict[int, NDArray[np.int64]], tracks: list[Track]) -> dict
             tracked.setdefault(frame, []).append(members)
     nothing = np.empty(0, np.int64)
     return {
-        frame: np.setdiff1d(points, np.concatenate([nothing, *tracked.get(frame, [])])).astype(np.int32)
+        frame: np.setdiff1d(points, np.concatenate([nothing, *tracked.get(frame, [])])).astype(
+            np.int32
+        )
         for frame, points in moved.items()
     }
 
 
 def _with_members(track: Track, segments: list[Segment]) -> Track:
     """Return the track of a box with the points in it, and the faces that they show."""
-    present = [(segment, pose) for segment in segments if (pose := track.pose(segment.frame)) is not None]
+    present = [
+        (segment, pose) for segment in segments if (pose := track.pose(segment.frame)) is not None
+    ]
     if not present:
         return track
     counts = np.array([len(segment.members) for segment, _ in present])
-    sensors = np.stack([transform_points(invert(pose), segment.origin) for segment, pose in present])
+    sensors = np.stack(
+        [transform_points(invert(pose), segment.origin) for segment, pose in present]
+    )
     members = {segment.frame: segment.members.astype(np.int32) for segment, _ in present}
     extent = seen_from(track.extent.lower, track.extent.upper, counts, sensors)
-    body = np.concatenate([transform_points(invert(pose), segment.points) for segment, pose in present])
+    body = np.concatenate(
+        [transform_points(invert(pose), segment.points) for segment, pose in present]
+    )
     surface = surface_of(body if extent.exemplary else body[:0])
     return replace(track, members=members, extent=extent, surface=surface)
 
 
 def _box_tracks(feed: ScanFeed) -> list[Track]:
-    """Return the tracks of the boxes of a sequence, if they show motion. Boxes without a scan have no time, and are left out.
+    """Return the tracks of the boxes of a sequence, if they show motion.
+
+    Boxes without a scan have no time, and are left out.
 
     Raises:
         FormatError: the class of a box is not in the table.
@@ -255,8 +302,12 @@ def _box_tracks(feed: ScanFeed) -> list[Track]:
     return tracks_from_boxes(boxes, poses, feed.times, deformable=feed.classes.deformable)
 
 
-def read_or_find_actors(feed: ScanFeed, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> MovingActors:
-    """Return the actors that an earlier run kept for the same scans and options; without any, find and keep them."""
+def read_or_find_actors(
+    feed: ScanFeed, writer: SequenceWriter, run: Run, steps: Callable[[int], None]
+) -> MovingActors:
+    """Return the actors that an earlier run kept for the same scans and options; without any, find
+    and keep them.
+    """
     about = {"motion": feed.motion, "min_speed_m_s": feed.options.motion.min_speed_m_s}
     key = _key_of(TRACKS, feed, **about)
     actors = read_derived(writer, TRACKS, key, MovingActors.from_bytes)
@@ -283,7 +334,11 @@ def refine_sequence(
         steps: called with the number of scans that were read since the last call.
     """
     frames, mode = feed.frames.tolist(), feed.options.poses.refine
-    key = "" if writer is None else _key_of(POSES, feed, refine=mode, movable=sorted(feed.classes.movable))
+    key = (
+        ""
+        if writer is None
+        else _key_of(POSES, feed, refine=mode, movable=sorted(feed.classes.movable))
+    )
     kept = None if writer is None else read_derived(writer, POSES, key, RefinedPoses.from_bytes)
     if kept is not None:
         if steps is not None:
@@ -313,13 +368,22 @@ class _ThinScan:
 
 def _key_of(name: str, feed: ScanFeed, **settings: Any) -> str:
     ranges = [feed.min_range_m, str(feed.max_range_m)]
-    return derived_key(feed.sequence, feed.frames, feed.digest, version=_VERSIONS[name], range_m=ranges, **settings)
+    return derived_key(
+        feed.sequence, feed.frames, feed.digest, version=_VERSIONS[name], range_m=ranges, **settings
+    )
 
 
-def with_refined_poses(sequence: StoredScans, frames: NDArray[np.int64], refined: RefinedPoses) -> StoredScans:
-    """Return a sequence with refined poses. Lines of frames without a scan get the correction of the last scan before them."""
+def with_refined_poses(
+    sequence: StoredScans, frames: NDArray[np.int64], refined: RefinedPoses
+) -> StoredScans:
+    """Return a sequence with refined poses.
+
+    Lines of frames without a scan get the correction of the last scan before them.
+    """
     given = sequence.poses
-    lines = np.array([sequence.line_of(frame, len(given), layout.POSES) for frame in frames.tolist()])
+    lines = np.array(
+        [sequence.line_of(frame, len(given), layout.POSES) for frame in frames.tolist()]
+    )
     row = np.clip(np.searchsorted(lines, np.arange(len(given)), side="right") - 1, 0, None)
     correction = multiply(refined.poses, invert(refined.given))
     poses = multiply(correction[row], given)
@@ -332,7 +396,11 @@ def pose_notes(refined: RefinedPoses, frames: NDArray[np.int64]) -> Iterator[str
     before, after = (value or 0.0 for value in refined.disagreements_m)
     left = refined.left(frames)
     if refined.refined.any():
-        but = f"; those of frames {', '.join(f'{a} to {b}' for a, b in left[:3])} were left alone" if left else ""
+        but = (
+            f"; those of frames {', '.join(f'{a} to {b}' for a, b in left[:3])} were left alone"
+            if left
+            else ""
+        )
         yield f"poses were refined: neighbouring scans disagreed by {100 * before:.1f} cm, now by {100 * after:.1f} cm{but}"
     if not refined.fits.all():
         rows = np.flatnonzero(~refined.fits)

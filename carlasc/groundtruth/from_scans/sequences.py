@@ -1,4 +1,6 @@
-"""Sequences whose grids are made from scans: the frames with their windows of scans, and the check of the trajectory."""
+"""Sequences whose grids are made from scans: the frames with their windows of scans, and the check
+of the trajectory.
+"""
 
 from __future__ import annotations
 
@@ -54,12 +56,16 @@ _MAX_SPEED_M_S, _MAX_TURN_RAD_S = 70.0, 5.0  # no vehicle moves or turns faster
 _RANGE_M = 100.0  # range of a sensor if carlasc.json does not give it
 _TENTH = 10
 _LOOKED_AT = 3  # number of scans in which ground below the grid is measured
-_BELOW = 0.2  # with a greater share of ground points below the grid, there is a note: on hills, some are
+_BELOW = (
+    0.2  # with a greater share of ground points below the grid, there is a note: on hills, some are
+)
 
 
 @dataclass(frozen=True)
 class ScanWindow:
-    """The part of a sequence that a worker needs for one frame: its scans, and the actors in the window of the frame."""
+    """The part of a sequence that a worker needs for one frame: its scans, and the actors in the
+    window of the frame.
+    """
 
     feed: ScanFeed
     actors: MovingActors
@@ -91,8 +97,12 @@ class ScanFrame(FrameInput):
         """Read the files of the frame, and count the votes of the scans in its window."""
         feed = self.inputs.feed
         fields = {name: feed.sequence.read(name, self.number) for name in self.fields()}
-        merged = merge_frame(plan, feed, self.inputs.actors, self.number, feed.reaching(self.number, plan.spec))
-        return FrameData(fields, merged.grid, merged.votes, merged.evidence, merged.actors, merged.votes.boxes)
+        merged = merge_frame(
+            plan, feed, self.inputs.actors, self.number, feed.reaching(self.number, plan.spec)
+        )
+        return FrameData(
+            fields, merged.grid, merged.votes, merged.evidence, merged.actors, merged.votes.boxes
+        )
 
     def thinned(self, plan: GridPlan) -> Grid:
         """Return the grid without every tenth of the scans of other frames."""
@@ -104,17 +114,24 @@ class ScanFrame(FrameInput):
         return merge_frame(plan, feed, self.inputs.actors, self.number, kept).grid
 
     def residuals(self) -> Mapping[int, Residual]:
-        """Return how well the observations of the moving actors in the frame align with the next ones, by number of the actor."""
+        """Return how well the observations of the moving actors in the frame align with the next
+        ones, by number of the actor.
+        """
         feed, frame, found = self.inputs.feed, self.number, {}
         last = frame + feed.options.window[1]
         for number, track in self.inputs.actors.tracks.items():
             later = min((other for other in track.members if frame < other <= last), default=None)
             here, there = track.pose(frame), None if later is None else track.pose(later)
-            own, others = track.members.get(frame, ()), () if later is None else track.members[later]
+            own, others = (
+                track.members.get(frame, ()),
+                () if later is None else track.members[later],
+            )
             if later is None or here is None or there is None or not len(own) or not len(others):
                 continue
             one, other = (
-                transform_points(feed.pose(f), feed.read(f).points[list(members)].astype(np.float64))
+                transform_points(
+                    feed.pose(f), feed.read(f).points[list(members)].astype(np.float64)
+                )
                 for f, members in ((frame, own), (later, others))
             )
             found[number] = Residual.between(one, other, here, there)
@@ -132,7 +149,9 @@ class ScanSequence(StoredSequence):
 
     @cached_property
     def estimates_poses(self) -> bool:
-        """Whether poses are estimated from the scans: because the options require it, or the sequence has none except those of an earlier run."""
+        """Whether poses are estimated from the scans: because the options require it, or the
+        sequence has none except those of an earlier run.
+        """
         sequence, grid = self.sequence, self.plan.grid
         if self.options.poses.source != "auto" or must_estimate(sequence, self.options):
             return must_estimate(sequence, self.options)
@@ -141,7 +160,8 @@ class ScanSequence(StoredSequence):
 
     @cached_property
     def posed(self) -> Sequence:
-        """The sequence with its own poses, or estimated ones, not refined; poses and times are checked.
+        """The sequence with its own poses, or estimated ones, not refined; poses and times are
+        checked.
 
         Raises:
             MissingDataError: there are no poses.
@@ -153,7 +173,10 @@ class ScanSequence(StoredSequence):
 
     @cached_property
     def feed(self) -> ScanFeed:
-        """The scans of the sequence, under refined poses after `refine`. It raises the same errors as `posed`."""
+        """The scans of the sequence, under refined poses after `refine`.
+
+        It raises the same errors as `posed`.
+        """
         return ScanFeed(self.posed, self.options)
 
     def _find_frames(self) -> tuple[FrameInput, ...]:
@@ -166,11 +189,15 @@ class ScanSequence(StoredSequence):
 
     @property
     def steps_before(self) -> int:
-        """Number of scans that the passes before the grids read: to refine poses, and to find actors."""
+        """Number of scans that the passes before the grids read: to refine poses, and to find
+        actors.
+        """
         return self.feed.reads + (len(self.feed.frames) if self.refines else 0)
 
     def prepare(self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> None:
-        """Refine the poses of the sequence, and find its actors, or read the results of an earlier run."""
+        """Refine the poses of the sequence, and find its actors, or read the results of an earlier
+        run.
+        """
         self.refine(writer, run, steps)
         if self.feed.needs_actors:
             self.actors = read_or_find_actors(self.feed, writer, run, steps)
@@ -183,12 +210,17 @@ class ScanSequence(StoredSequence):
         return self.options.poses.refine != "never" and len(self.feed.frames) >= MIN_SCANS
 
     def refine(self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]) -> None:
-        """Refine the poses, or read the result of an earlier run with `writer`. The feed then has the refined poses."""
+        """Refine the poses, or read the result of an earlier run with `writer`.
+
+        The feed then has the refined poses.
+        """
         if not self.refines:
             return
         self.refined = refine_sequence(self.feed, writer, run, steps)
         if self.refined.refined.any():
-            self.feed = self.feed.under(with_refined_poses(self.posed, self.feed.frames, self.refined))
+            self.feed = self.feed.under(
+                with_refined_poses(self.posed, self.feed.frames, self.refined)
+            )
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
         """Return the facts of each actor, by number; None if actors are not tracked."""
@@ -201,7 +233,10 @@ class ScanSequence(StoredSequence):
     def record(self) -> dict[str, Any]:
         """Return how scans are merged."""
         options = self.options
-        record: dict[str, Any] = {"observe": "scans", "motion": "+".join(self.feed.motion) or "none"}
+        record: dict[str, Any] = {
+            "observe": "scans",
+            "motion": "+".join(self.feed.motion) or "none",
+        }
         record |= {"dynamic": options.dynamic}
         if options.dynamic == "align":
             record |= {"complete": options.complete}
@@ -213,10 +248,14 @@ class ScanSequence(StoredSequence):
         record |= {"window": f"{options.window[0]}:{options.window[1]}", "stride": options.stride}
         record |= {} if options.window_m is None else {"window_m": options.window_m}
         limits = {"min_range_m": self.feed.min_range_m, "max_range_m": self.feed.max_range_m}
-        return record | {name: value for name, value in limits.items() if np.isfinite(value) and value > 0}
+        return record | {
+            name: value for name, value in limits.items() if np.isfinite(value) and value > 0
+        }
 
     def poses(self) -> NDArray[np.float64] | None:
-        """Return the poses to write beside the grids; None if poses were estimated although the sequence has its own."""
+        """Return the poses to write beside the grids; None if poses were estimated although the
+        sequence has its own.
+        """
         has_own = layout.POSES in self.sequence.documents()
         return None if has_own and self.estimates_poses else self.posed.poses
 
@@ -224,51 +263,71 @@ class ScanSequence(StoredSequence):
         """Return remarks on missing fields, and on the results."""
         where, notes = self.location, self.findings()
         if not self.feed.has_labels:
-            notes.append(f"{where}: the scans have no labels: grids contain geometry only, in one class")
+            notes.append(
+                f"{where}: the scans have no labels: grids contain geometry only, in one class"
+            )
         below = self._share_below()
         if below > _BELOW:
             notes.append(
-                f"{where}: {below:.0%} of the points on the ground are below the grid, which begins at {self.plan.spec.lower[2]:g} m"
+                f"{where}: {below:.0%} of the points on the ground are below the grid, which "
+                f"begins at {self.plan.spec.lower[2]:g} m"
             )
         if len(self.feed.frames) == 1:
-            notes.append(f"{where}: there is one scan only: nothing is merged, and what it did not see is unknown")
+            notes.append(
+                f"{where}: there is one scan only: nothing is merged, and what it did not see is "
+                f"unknown"
+            )
         return notes
 
     def findings(self) -> list[str]:
         """Return remarks on poses and on moving actors."""
         where, notes = self.location, list[str]()
         if self.estimates_poses and self.options.poses.source == "auto":
-            notes.append(f"{where}: there are no poses: they were estimated from the scans (kiss-icp)")
+            notes.append(
+                f"{where}: there are no poses: they were estimated from the scans (kiss-icp)"
+            )
         notes += (
-            [] if self.refined is None else [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
+            []
+            if self.refined is None
+            else [f"{where}: {line}" for line in pose_notes(self.refined, self.feed.frames)]
         )
         if self.feed.has_labels and not self.feed.motion and self.options.dynamic != "tube":
             notes.append(f"{where}: no field shows motion: all points were treated as static")
         found = sum(track.instance >= FIRST_FOUND for track in self.actors.tracks.values())
         left_out = sum(len(points) for points in self.actors.moving.values())
         if "evidence" in self.feed.motion and (found or left_out):
-            doubtful = sum(is_doubtful(actor["confidence"]) for actor in self.actors.summary if actor["moves"])
+            doubtful = sum(
+                is_doubtful(actor["confidence"]) for actor in self.actors.summary if actor["moves"]
+            )
             shown = [f"{found} actors that move ({doubtful} of them doubtful)"] if found else []
             shown += [f"{left_out} {'more ' if found else ''}points that moved"] if left_out else []
             out = ": these points were left out of other frames" if left_out else ""
             notes.append(
-                f"{where}: free space shows {' and '.join(shown)}, although no field of the data shows it{out}"
+                f"{where}: free space shows {' and '.join(shown)}, although no field of the data "
+                f"shows it{out}"
             )
         if self.actors.own:
             notes.append(
-                f"{where}: points near the sensor move with it: they are on the recording vehicle, and were left out"
+                f"{where}: points near the sensor move with it: they are on the recording "
+                f"vehicle, and were left out"
             )
         wrong = sum(max(actor["size_m"]) >= LONGEST_M for actor in self.actors.summary)
         if wrong:
             notes.append(
-                f"{where}: {wrong} actors are larger than any vehicle, so their numbers or boxes are wrong: their points were treated as static"
+                f"{where}: {wrong} actors are larger than any vehicle, so their numbers or boxes "
+                f"are wrong: their points were treated as static"
             )
         return notes
 
     def _share_below(self) -> float:
-        """Return the share of the ground points of some scans that are below the grid. Scans that cannot be read are skipped here."""
+        """Return the share of the ground points of some scans that are below the grid.
+
+        Scans that cannot be read are skipped here.
+        """
         feed, spec = self.feed, self.plan.spec
-        chosen = feed.frames[np.unique(np.linspace(0, len(feed.frames) - 1, _LOOKED_AT).astype(int))]
+        chosen = feed.frames[
+            np.unique(np.linspace(0, len(feed.frames) - 1, _LOOKED_AT).astype(int))
+        ]
         heights = [np.empty(0, np.float32)]
         for frame in chosen.tolist():
             try:
@@ -276,13 +335,19 @@ class ScanSequence(StoredSequence):
             except CarlascError:
                 continue
             points, labels, classes = scan.points, scan.labels, sorted(feed.classes.ground)
-            ground = ground_points(points) if labels is None or not classes else np.isin(labels, classes)
-            heights.append(points[ground & (np.hypot(points[:, 0], points[:, 1]) < abs(spec.upper[0])), 2])
+            ground = (
+                ground_points(points) if labels is None or not classes else np.isin(labels, classes)
+            )
+            heights.append(
+                points[ground & (np.hypot(points[:, 0], points[:, 1]) < abs(spec.upper[0])), 2]
+            )
         below = np.concatenate(heights) < spec.lower[2]
         return float(below.mean()) if len(below) else 0.0
 
 
-def scan_sequences(source: str | os.PathLike[str] | Source, plan: GridPlan, options: FromScans) -> list[SequenceInput]:
+def scan_sequences(
+    source: str | os.PathLike[str] | Source, plan: GridPlan, options: FromScans
+) -> list[SequenceInput]:
     """Find the sequences of a source that have scans.
 
     Raises:
@@ -291,7 +356,8 @@ def scan_sequences(source: str | os.PathLike[str] | Source, plan: GridPlan, opti
     sequences: dict[str, Sequence] = {}
     for sequence in as_source(source).sequences().values():
         parent = parent_path(sequence)
-        other = sequences.get(parent)  # scans may exist beside the grids of both coordinates: take the folder with more
+        # scans may exist beside the grids of both coordinates: take the folder with more
+        other = sequences.get(parent)
         if other is None or len(sequence.frames("points")) > len(other.frames("points")):
             sequences[parent] = sequence
     chosen = [sequence for sequence in sequences.values() if "points" in sequence.fields()]
@@ -301,7 +367,9 @@ def scan_sequences(source: str | os.PathLike[str] | Source, plan: GridPlan, opti
 
 
 def must_estimate(sequence: Sequence, options: FromScans) -> bool:
-    """Return whether poses are estimated from the scans: because the options require it, or the sequence has none and they allow it."""
+    """Return whether poses are estimated from the scans: because the options require it, or the
+    sequence has none and they allow it.
+    """
     source = options.poses.source
     return source == "kiss-icp" or (source == "auto" and layout.POSES not in sequence.documents())
 
@@ -319,22 +387,28 @@ def with_estimated_poses(sequence: Sequence) -> Sequence:
     scans = (sequence.read("points", int(frame))[:, :3] for frame in frames)
     times = sequence.times_of(frames)
     try:
-        poses = estimate_poses(scans, times=times, max_range_m=sequence.metadata.max_range_m or _RANGE_M)
+        poses = estimate_poses(
+            scans, times=times, max_range_m=sequence.metadata.max_range_m or _RANGE_M
+        )
     except ArgumentError as error:  # an argument there, data here
         raise FormatError(
-            sequence.location, expected=f"poses, or {error.expected}", found=error.found, advice=error.advice
+            sequence.location,
+            expected=f"poses, or {error.expected}",
+            found=error.found,
+            advice=error.advice,
         ) from error
     lines = np.clip(np.searchsorted(frames, np.arange(frames[-1] + 1), side="right") - 1, 0, None)
     return sequence.with_poses(poses[lines])
 
 
 def check_trajectory(sequence: Sequence, options: FromScans) -> None:
-    """Check that a sequence has rigid poses without jumps, and that its times, if it has any, increase.
+    """Check that a sequence has rigid poses without jumps, and that its times, if it has any,
+    increase.
 
     Raises:
         MissingDataError: it has no poses.
-        FormatError: the position of the sensor is unknown, or a pose is not rigid, or jumps without `options.poses.force`, or a time does
-            not increase; names the frame.
+        FormatError: the position of the sensor is unknown, or a pose is not rigid, or jumps without
+            `options.poses.force`, or a time does not increase; names the frame.
     """
     where = f"{sequence.location}/{layout.POSES}"
     if not sequence.metadata.has_rays:
@@ -342,7 +416,8 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
             sequence.location,
             expected="scans of a sensor whose place is known",
             found='"rays": false in carlasc.json',
-            advice="free space cannot be told from unknown space: take the grids that came with the data",
+            advice="free space cannot be told from unknown space: take the grids that came with "
+            "the data",
         )
     if options.poses.source == "file" and layout.POSES not in sequence.documents():
         raise MissingDataError(
@@ -367,7 +442,9 @@ def _check_speed(sequence: Sequence, frames: NDArray[np.int64], where: str) -> N
     jumps = np.flatnonzero((speed > _MAX_SPEED_M_S) | (turn > _MAX_TURN_RAD_S))
     if len(jumps):
         row = int(jumps[0])
-        found = f"a jump of {speed[row]:.0f} m/s and {turn[row]:.1f} rad/s at frame {frames[row + 1]}"
+        found = (
+            f"a jump of {speed[row]:.0f} m/s and {turn[row]:.1f} rad/s at frame {frames[row + 1]}"
+        )
         raise FormatError(
             where,
             expected=f"at most {_MAX_SPEED_M_S:g} m/s and {_MAX_TURN_RAD_S:g} rad/s",
@@ -386,6 +463,7 @@ def _check_times(sequence: Sequence, frames: NDArray[np.int64]) -> None:
         raise FormatError(
             f"{sequence.location}/{layout.TIMES}",
             expected="increasing times",
-            found=f"{times[row]:g} s and {times[row + 1]:g} s at frames {frames[row]} and {frames[row + 1]}",
+            found=f"{times[row]:g} s and {times[row + 1]:g} s at frames {frames[row]} and "
+            f"{frames[row + 1]}",
             advice="fix the file, or remove it: frames are then 0.1 s apart",
         )

@@ -1,7 +1,9 @@
-"""The cells of a growing map. Distant cells are kept on disk, so memory does not grow with the length of a drive.
+"""The cells of a growing map.
 
-Each scan has one vote per cell: for the most frequent class of its points in the cell. All sums are whole numbers, so that they do not depend
-on the order in which scans are added.
+Distant cells are kept on disk, so memory does not grow with the length of a drive.
+
+Each scan has one vote per cell: for the most frequent class of its points in the cell. All sums are
+whole numbers, so that they do not depend on the order in which scans are added.
 """
 
 from __future__ import annotations
@@ -17,18 +19,31 @@ from numpy.typing import NDArray
 from carlasc.storage.cloud_files import POINT_DTYPE
 
 Part = tuple[int, int, int]
-"""Cells that are kept together: a group (`STATIC`, or the number of an actor), and x and y of a tile."""
+"""Cells that are kept together: a group (`STATIC`, or the number of an actor), and x and y of a
+tile.
+"""
 
 STATIC = -1
 ROW_DTYPE = np.dtype(
-    [("key", "<i8"), ("seen", "<u4"), ("points", "<u4"), ("votes", "<i8"), ("x", "<i8"), ("y", "<i8"), ("z", "<i8")]
+    [
+        ("key", "<i8"),
+        ("seen", "<u4"),
+        ("points", "<u4"),
+        ("votes", "<i8"),
+        ("x", "<i8"),
+        ("y", "<i8"),
+        ("z", "<i8"),
+    ]
 )
-"""A cell and a class: scans, points, votes in 1 / `_VOTE`, and the sums of the positions of points in the cell, in 1 / `_STEPS` of it."""
+"""A cell and a class: scans, points, votes in 1 / `_VOTE`, and the sums of the positions of points
+in the cell, in 1 / `_STEPS` of it.
+"""
 
 _SIDE_BITS, _HEIGHT_BITS, _LABEL_BITS = 9, 24, 16  # of a key: x and y in the tile, z, and the class
 _SIDE, _MIDDLE = 1 << _SIDE_BITS, 1 << (_HEIGHT_BITS - 1)
 _STEPS, _VOTE = 1024, 65535
-_EDGE = 1 / 64  # least distance of points from the faces of a cell, so that float32 rounding keeps them inside
+# least distance of points from the faces of a cell, so that float32 rounding keeps them inside
+_EDGE = 1 / 64
 _MOST_ROWS = 4_000_000  # in memory: 200 MB
 
 
@@ -68,10 +83,14 @@ def rows_of_scan(
     for axis, name in enumerate("xyz"):
         rows[name] = np.add.reduceat(places[order, axis], begins)
 
-    # The most frequent class, the lowest of several: in each cell, the longest run of equal classes.
+    # The most frequent class, the lowest of several: in each cell, the longest run of equal
+    # classes.
     sorted_labels = labels[order].astype(np.int64)
     runs = np.flatnonzero(changed | np.append(True, np.diff(sorted_labels) != 0))
-    lengths, cell_of = np.diff(np.append(runs, len(order))), np.searchsorted(begins, runs, side="right") - 1
+    lengths, cell_of = (
+        np.diff(np.append(runs, len(order))),
+        np.searchsorted(begins, runs, side="right") - 1,
+    )
     best = np.lexsort((sorted_labels[runs], -lengths, cell_of))
     best = best[np.flatnonzero(np.diff(cell_of[best], prepend=-1))]
     certain = np.ones(len(order)) if sure is None else sure[order].astype(np.float64)
@@ -82,7 +101,9 @@ def rows_of_scan(
     tile = at[:, :2] >> _SIDE_BITS
     x, y = (at[:, :2] & (_SIDE - 1)).T
     z = np.clip(at[:, 2] + _MIDDLE, 0, 2 * _MIDDLE - 1)
-    rows["key"] = (((x << _SIDE_BITS | y) << _HEIGHT_BITS | z) << _LABEL_BITS) | sorted_labels[runs[best]]
+    rows["key"] = (((x << _SIDE_BITS | y) << _HEIGHT_BITS | z) << _LABEL_BITS) | sorted_labels[
+        runs[best]
+    ]
     return np.column_stack([groups[order[begins]], tile]), rows
 
 
@@ -90,7 +111,9 @@ def split(parts: NDArray[np.int64], rows: NDArray[Any]) -> list[tuple[Part, NDAr
     """Return the rows of each part, in order; rows of the same cell and class are summed."""
     order = np.lexsort((rows["key"], *parts.T[::-1]))
     parts, rows = parts[order], rows[order]
-    begins = np.flatnonzero((np.diff(parts, axis=0, prepend=np.iinfo(np.int64).min) != 0).any(axis=1))
+    begins = np.flatnonzero(
+        (np.diff(parts, axis=0, prepend=np.iinfo(np.int64).min) != 0).any(axis=1)
+    )
     places: list[Part] = [(int(p[0]), int(p[1]), int(p[2])) for p in parts[begins]]
     pieces = np.split(rows, begins)[1:]  # without the empty piece before the first part
     return [(place, _added([piece])) for place, piece in zip(places, pieces, strict=True)]
@@ -145,19 +168,27 @@ class GrowingCells:
         return _added([np.load(self._path(part)), *rows] if part in self._stored else rows)
 
     def finish(self) -> None:
-        """Elect the class of each cell. Afterwards `counts` has the number of points of each part, and `points` yields them."""
+        """Elect the class of each cell.
+
+        Afterwards `counts` has the number of points of each part, and `points` yields them.
+        """
         for part in sorted({*self._rows, *self._stored}):
             points = self._elect(part, self._whole(part, self._rows.pop(part, [])))
             self.counts[part] = len(points)
             np.save(self._path(part), points)
 
     def _elect(self, part: Part, rows: NDArray[Any]) -> NDArray[Any]:
-        """Return one point per cell: the mean of its points, with the class with most votes, the lowest of several."""
+        """Return one point per cell: the mean of its points, with the class with most votes, the
+        lowest of several.
+        """
         cells = rows["key"] >> _LABEL_BITS
         begins = np.flatnonzero(np.diff(cells, prepend=-1))
         best = np.lexsort((rows["key"], -rows["votes"], cells))
         best = best[np.flatnonzero(np.diff(cells[best], prepend=-1))]
-        points, count = np.zeros(len(begins), POINT_DTYPE), np.add.reduceat(rows["points"].astype(np.int64), begins)
+        points, count = (
+            np.zeros(len(begins), POINT_DTYPE),
+            np.add.reduceat(rows["points"].astype(np.int64), begins),
+        )
         for name, index in zip("xyz", _indices(part, cells[begins]).T, strict=True):
             inside = (np.add.reduceat(rows[name], begins) / count + 0.5) / _STEPS
             points[name] = (index + np.clip(inside, _EDGE, 1 - _EDGE)) * self.cell_m
@@ -183,4 +214,6 @@ def _indices(part: Part, cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def cells_of(points: NDArray[Any], cell_m: float) -> NDArray[np.int64]:
     """Return (N, 3) indices of the cells of points of a map, (N,) `POINT_DTYPE`."""
-    return np.stack([np.floor(points[axis].astype(np.float64) / cell_m) for axis in "xyz"], axis=1).astype(np.int64)
+    return np.stack(
+        [np.floor(points[axis].astype(np.float64) / cell_m) for axis in "xyz"], axis=1
+    ).astype(np.int64)

@@ -22,7 +22,12 @@ from carlasc.storage.files import write_output, writing
 OCTOMAP = ".bt"
 ACTORS = "actors.json"
 _ALIGNED = 1e-3  # greatest offset of a grid from the cells of a tree, as a share of a cell
-_NEEDS = (("skimage.measure", "mesh"), ("trimesh", "mesh"), ("scipy.ndimage", "mesh"), ("laspy", "scans"))
+_NEEDS = (
+    ("skimage.measure", "mesh"),
+    ("trimesh", "mesh"),
+    ("scipy.ndimage", "mesh"),
+    ("laspy", "scans"),
+)
 
 
 @dataclass(frozen=True)
@@ -52,17 +57,23 @@ class MapCells:
         if np.ptp(self.size) > _ALIGNED * edge:
             found = " x ".join(f"{value:g}" for value in self.size)
             advice = "make the grid with `res`, as --res 0.2"
-            raise ArgumentError("out", expected="cubic voxels for OctoMap", found=f"{found} m", advice=advice)
+            raise ArgumentError(
+                "out", expected="cubic voxels for OctoMap", found=f"{found} m", advice=advice
+            )
         if np.abs(self.lower / edge - first).max() > _ALIGNED:
             expected = f"voxels that begin at multiples of {edge:g} m for OctoMap"
             found = ", ".join(f"{value:g}" for value in self.lower)
-            raise ArgumentError("out", expected=expected, found=found, advice="make the grid with other bounds")
+            raise ArgumentError(
+                "out", expected=expected, found=found, advice="make the grid with other bounds"
+            )
         write_octomap(path, self.index + first.astype(np.int64), self.labels > 0, edge)
 
 
 @dataclass(frozen=True)
 class MapFiles:
-    """The paths of a map: points or tree, mesh, distances, and the folder of actors; None: not written."""
+    """The paths of a map: points or tree, mesh, distances, and the folder of actors; None: not
+    written.
+    """
 
     out: Path | None
     mesh: Path | None
@@ -81,23 +92,41 @@ class MapFiles:
         paths = {name: Path(path) for name, path in given.items() if path is not None}
         for name, path in paths.items():
             if path.suffix.lower() not in endings[name]:
-                raise ArgumentError(name, expected=f"a file that ends in {', '.join(endings[name])}", found=str(path))
+                raise ArgumentError(
+                    name,
+                    expected=f"a file that ends in {', '.join(endings[name])}",
+                    found=str(path),
+                )
         if not paths:
-            raise ArgumentError("out", expected="a file to write, or `mesh` or `distance`", found="none of them")
+            raise ArgumentError(
+                "out", expected="a file to write, or `mesh` or `distance`", found="none of them"
+            )
         if len(set(paths.values())) < len(paths):
-            raise ArgumentError("mesh", expected="files of different names", found=", ".join(map(str, paths.values())))
+            raise ArgumentError(
+                "mesh",
+                expected="files of different names",
+                found=", ".join(map(str, paths.values())),
+            )
         if distance is not None and grid is None:
             advice = "scans alone do not tell free space from unknown space: make a grid with `carlasc regrid`"
-            raise ArgumentError("distance", expected="the `grid` whose voxels it is of", found="none", advice=advice)
-        if actors and (grid is not None or "out" not in paths or paths["out"].suffix.lower() == OCTOMAP):
-            raise ArgumentError("actors", expected="a file of points of a drive in `out`", found=str(grid or out))
+            raise ArgumentError(
+                "distance", expected="the `grid` whose voxels it is of", found="none", advice=advice
+            )
+        if actors and (
+            grid is not None or "out" not in paths or paths["out"].suffix.lower() == OCTOMAP
+        ):
+            raise ArgumentError(
+                "actors", expected="a file of points of a drive in `out`", found=str(grid or out)
+            )
         folder = paths["out"].with_name(f"{paths['out'].stem}_actors") if actors else None
         return cls(paths.get("out"), paths.get("mesh"), paths.get("distance"), folder)
 
     @property
     def all(self) -> list[Path]:
         """All files, and the folder."""
-        return [path for path in (self.out, self.mesh, self.distance, self.actors) if path is not None]
+        return [
+            path for path in (self.out, self.mesh, self.distance, self.actors) if path is not None
+        ]
 
     def check(self, overwrite: bool) -> None:
         """Check, before hours of work, that no file is replaced and that packages are installed."""
@@ -108,19 +137,27 @@ class MapFiles:
                 advice = f"give `overwrite=True`, or {advice[5:]}" if is_ours else advice
                 raise ConflictError(path, expected="nothing", found=found, advice=advice)
         is_las = self.out is not None and self.out.suffix.lower() == ".las"
-        for (module, extra), needed in zip(_NEEDS, (self.mesh, self.mesh, self.distance, is_las), strict=True):
+        for (module, extra), needed in zip(
+            _NEEDS, (self.mesh, self.mesh, self.distance, is_las), strict=True
+        ):
             if needed:
                 import_extra(module, extra)
 
     def folder(self) -> tempfile.TemporaryDirectory[str]:
-        """Return a folder beside the map for cells that do not fit into memory; it is removed at the end, also after Ctrl-C."""
+        """Return a folder beside the map for cells that do not fit into memory; it is removed at
+        the end, also after Ctrl-C.
+        """
         place = self.all[0].parent
         with writing(place):
             place.mkdir(parents=True, exist_ok=True)
-            return tempfile.TemporaryDirectory(dir=place, prefix=f".{self.all[0].name}.", suffix=".part")
+            return tempfile.TemporaryDirectory(
+                dir=place, prefix=f".{self.all[0].name}.", suffix=".part"
+            )
 
     def write(self, points: PointPieces, cells: Callable[[], MapCells]) -> None:
-        """Write the points, or the tree, and the mesh; `cells` returns the cells of the tree and the mesh."""
+        """Write the points, or the tree, and the mesh; `cells` returns the cells of the tree and
+        the mesh.
+        """
         is_tree = self.out is not None and self.out.suffix.lower() == OCTOMAP
         if self.out is not None and not is_tree:
             write_points(self.out, points)
@@ -131,13 +168,17 @@ class MapFiles:
             known.write_octomap(self.out)
         if self.mesh is not None:
             occupied = known.labels > 0
-            surface = SurfaceMesh.of(known.index[occupied], known.labels[occupied], known.lower, known.size)
+            surface = SurfaceMesh.of(
+                known.index[occupied], known.labels[occupied], known.lower, known.size
+            )
             surface.write(self.mesh, points.classes)
 
 
 MESH_ENDINGS = (".ply", ".glb")
 _BLOCK = 128  # number of cells along x and y that are meshed at once
-_STEPS = 1024  # positions of vertices are rounded to such parts of a cell, so that blocks share them
+_STEPS = (
+    1024  # positions of vertices are rounded to such parts of a cell, so that blocks share them
+)
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # glTF: y is up
 
 
@@ -146,8 +187,10 @@ class SurfaceMesh:
     """The surface of occupied cells.
 
     Attributes:
-        vertices: (V, 3) float64, metres, between the middles of occupied cells and of free ones beside them.
-        faces: (F, 3) int64 vertices of each triangle, anticlockwise as seen from outside, in right-handed axes.
+        vertices: (V, 3) float64, metres, between the middles of occupied cells and of free ones
+            beside them.
+        faces: (F, 3) int64 vertices of each triangle, anticlockwise as seen from outside, in
+            right-handed axes.
         labels: (V,) class of each vertex, from its occupied cell.
     """
 
@@ -186,7 +229,9 @@ class SurfaceMesh:
             faces.append(triangles + count)
             classes.append(own)
             count += len(found)
-        whole, first, place = np.unique(np.concatenate(nodes), axis=0, return_index=True, return_inverse=True)
+        whole, first, place = np.unique(
+            np.concatenate(nodes), axis=0, return_index=True, return_inverse=True
+        )
         return cls(
             lower + (whole / _STEPS + 0.5) * size,
             place.reshape(-1)[np.concatenate(faces)],
@@ -194,7 +239,8 @@ class SurfaceMesh:
         )
 
     def write(self, path: str | os.PathLike[str], classes: ClassTable) -> None:
-        """Write the mesh with a colour for each vertex; the ending of the file, one of `MESH_ENDINGS`, says its format. In .glb, y is up.
+        """Write the mesh with a colour for each vertex; the ending of the file, one of
+        `MESH_ENDINGS`, says its format. In .glb, y is up.
 
         Raises:
             DependencyError: trimesh is not installed.
@@ -214,41 +260,56 @@ class SurfaceMesh:
 def _blocks(
     cells: NDArray[np.int64], labels: NDArray[np.integer]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint16]]]:
-    """Yield the first cell of each block, and the classes of its cells with a border of one cell, 0 where free.
+    """Yield the first cell of each block, and the classes of its cells with a border of one cell, 0
+    where free.
 
     Blocks share their outermost cells, so that every cube between eight cells is in one block.
     """
-    owner = np.concatenate([cells[:, :2] - shift for shift in ([0, 0], [1, 0], [0, 1], [1, 1])]) // _BLOCK
+    owner = (
+        np.concatenate([cells[:, :2] - shift for shift in ([0, 0], [1, 0], [0, 1], [1, 1])])
+        // _BLOCK
+    )
     blocks, block = np.unique(owner, axis=0, return_inverse=True)
     order, row = np.argsort(block.reshape(-1), kind="stable"), np.tile(np.arange(len(cells)), 4)
     ends = np.searchsorted(block.reshape(-1)[order], np.arange(len(blocks) + 1))
     for number, (x, y) in enumerate(blocks.tolist()):
         own = np.unique(row[order[ends[number] : ends[number + 1]]])
         corner = np.array([x * _BLOCK, y * _BLOCK, int(cells[own, 2].min()) - 1])
-        volume = np.zeros((_BLOCK + 1, _BLOCK + 1, int(cells[own, 2].max()) + 2 - corner[2]), np.uint16)
+        volume = np.zeros(
+            (_BLOCK + 1, _BLOCK + 1, int(cells[own, 2].max()) + 2 - corner[2]), np.uint16
+        )
         volume[tuple((cells[own] - corner).T)] = labels[own]
         yield corner, volume
 
 
-def _march(volume: NDArray[np.uint16]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the positions of the vertices in 1 / `_STEPS` of a cell, the triangles, and the classes of the vertices."""
+def _march(
+    volume: NDArray[np.uint16],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the positions of the vertices in 1 / `_STEPS` of a cell, the triangles, and the
+    classes of the vertices.
+    """
     measure = import_extra("skimage.measure", "mesh")
     if not volume.any():
         return np.empty((0, 3), np.int64), np.empty((0, 3), np.int64), np.empty(0, np.int64)
-    found, triangles, _, _ = measure.marching_cubes((volume > 0).astype(np.float32), 0.5, gradient_direction="ascent")
+    found, triangles, _, _ = measure.marching_cubes(
+        (volume > 0).astype(np.float32), 0.5, gradient_direction="ascent"
+    )
     ends = np.stack([np.floor(found), np.ceil(found)]).astype(np.int64)
     labels = np.zeros(len(found), np.int64)
-    for corner in np.ndindex(2, 2, 2):  # one corner is occupied: most vertices are on edges of a cube
+    # one corner is occupied: most vertices are on edges of a cube
+    for corner in np.ndindex(2, 2, 2):
         near = volume[tuple(ends[side, :, axis] for axis, side in enumerate(corner))]
         labels = np.maximum(labels, near)
     return np.rint(_STEPS * found).astype(np.int64), triangles.astype(np.int64), labels
 
 
 def write_distances(path: str | os.PathLike[str], grid: Grid) -> None:
-    """Write the distance of each voxel from the surface: arrays `distance`, `lower`, `upper` and `voxel_size` in a .npz file.
+    """Write the distance of each voxel from the surface: arrays `distance`, `lower`, `upper` and
+    `voxel_size` in a .npz file.
 
-    `distance`, (X, Y, Z) float32, metres between middles of voxels: to the nearest occupied voxel; in occupied voxels, minus the distance to
-    the nearest other voxel; NaN in unknown voxels. A grid without occupied voxels has infinite distances.
+    `distance`, (X, Y, Z) float32, metres between middles of voxels: to the nearest occupied voxel;
+    in occupied voxels, minus the distance to the nearest other voxel; NaN in unknown voxels. A grid
+    without occupied voxels has infinite distances.
 
     Raises:
         DependencyError: SciPy is not installed.
@@ -263,6 +324,10 @@ def write_distances(path: str | os.PathLike[str], grid: Grid) -> None:
         distance = transform(~occupied, sampling=size) - transform(occupied, sampling=size)
     distance[~grid.known] = np.nan
     np.savez_compressed(
-        buffer, distance=distance.astype(np.float32), lower=spec.lower, upper=spec.upper, voxel_size=size
+        buffer,
+        distance=distance.astype(np.float32),
+        lower=spec.lower,
+        upper=spec.upper,
+        voxel_size=size,
     )
     write_output(Path(path), buffer.getvalue())

@@ -1,4 +1,6 @@
-"""`carlasc.map`: a map of the static points of a drive, or of a grid, and the bodies of the actors of a drive."""
+"""`carlasc.map`: a map of the static points of a drive, or of a grid, and the bodies of the actors
+of a drive.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,14 @@ from carlasc.groundtruth.from_scans.merging import Merger
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
 from carlasc.groundtruth.inputs import GridPlan, choose_frames
-from carlasc.groundtruth.maps.growing_cells import STATIC, GrowingCells, Part, cells_of, rows_of_scan, split
+from carlasc.groundtruth.maps.growing_cells import (
+    STATIC,
+    GrowingCells,
+    Part,
+    cells_of,
+    rows_of_scan,
+    split,
+)
 from carlasc.groundtruth.maps.map_files import ACTORS, MapCells, MapFiles, write_distances
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion import HORIZON_S, Track
@@ -77,24 +86,31 @@ def map(
     overwrite: bool = False,
     run: Run = Run(),  # noqa: B008 (frozen)
 ) -> MapResult:
-    """Write a map of a drive: the static points of its scans in one frame, one point per cell, without moving points.
+    """Write a map of a drive: the static points of its scans in one frame, one point per cell,
+    without moving points.
 
-    The frame is that of the drive's poses, in right-handed axes: x ahead, y to the left, z up, at the first scan. Each point is the mean of
-    the points in its cell. Its class has the most votes, one vote per scan; `seen` is the number of scans; `confidence` is the share of the
-    votes for the class with one more vote against it: 0.5 for a cell that one scan saw. Moving points are found as in `regrid`. With `grid`,
-    the map is a grid of one frame instead, in the frame of its sensor.
+    The frame is that of the drive's poses, in right-handed axes: x ahead, y to the left, z up, at
+    the first scan. Each point is the mean of the points in its cell. Its class has the most votes,
+    one vote per scan; `seen` is the number of scans; `confidence` is the share of the votes for the
+    class with one more vote against it: 0.5 for a cell that one scan saw. Moving points are found
+    as in `regrid`. With `grid`, the map is a grid of one frame instead, in the frame of its sensor.
 
     Args:
         source: a data set with one sequence: anything that `carlasc.open` takes, or a source.
-        out: the file of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). None: only the files `mesh` and `distance`.
+        out: the file of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). None: only
+            the files `mesh` and `distance`.
         cell_m: size of a cell, metres; a grid has its own cells.
-        frames: range of frame numbers; None for all. Moving actors are searched for in a few more seconds. With `grid`, one frame.
+        frames: range of frame numbers; None for all. Moving actors are searched for in a few more
+            seconds. With `grid`, one frame.
         grid: name of the grid that is the map.
-        actors: also write the body of each moving actor, in its own frame, to the folder `<out>_actors`, and their poses to `actors.json`.
+        actors: also write the body of each moving actor, in its own frame, to the folder
+            `<out>_actors`, and their poses to `actors.json`.
         mesh: file of the surface of the occupied cells, with the colours of classes: .ply or .glb.
-        distance: .npz file of each voxel's distance from the surface, with `grid`: see `docs/commands/map.md`.
+        distance: .npz file of each voxel's distance from the surface, with `grid`: see
+            `docs/commands/map.md`.
         motion: how moving points are found.
-        poses: where poses come from. Missing poses are estimated from the scans, unless `PoseOptions("file")` is given.
+        poses: where poses come from. Missing poses are estimated from the scans, unless
+            `PoseOptions("file")` is given.
         overwrite: replace files that exist.
         run: how the work is spread. Steps of progress are scans.
 
@@ -102,21 +118,31 @@ def map(
         The files that were written.
 
     Raises:
-        ArgumentError: an ending that is not known, cells that OctoMap cannot hold, or an argument that does not fit.
+        ArgumentError: an ending that is not known, cells that OctoMap cannot hold, or an argument
+            that does not fit.
         MissingDataError: there is no scan, no pose, no such grid, or nothing static.
         ConflictError: a file exists.
         FormatError: a scan, poses or times are not valid.
-        DependencyError: a file needs a package that is not installed, or poses have to be estimated, and kiss-icp is not installed.
+        DependencyError: a file needs a package that is not installed, or poses have to be
+            estimated, and kiss-icp is not installed.
         StorageError: a file cannot be written.
     """
     began = time.perf_counter()
     if not (math.isfinite(cell_m) and cell_m >= _LEAST_CELL_M):
-        raise ArgumentError("cell_m", expected=f"{_LEAST_CELL_M:g} metres or more", found=str(cell_m))
+        raise ArgumentError(
+            "cell_m", expected=f"{_LEAST_CELL_M:g} metres or more", found=str(cell_m)
+        )
     if run.part.count > 1:
         raise ArgumentError("part", expected="none, as a map is one file", found=str(run.part))
     files = MapFiles.of(out, mesh, distance, actors, grid)
     files.check(overwrite)
-    opened, wanted, count, bodies, notes = as_source(source), FrameRange.of(frames), 1, 0, tuple[str, ...]()
+    opened, wanted, count, bodies, notes = (
+        as_source(source),
+        FrameRange.of(frames),
+        1,
+        0,
+        tuple[str, ...](),
+    )
     if grid is not None:
         points = write_grid(opened, grid, wanted, files)
     else:
@@ -127,7 +153,14 @@ def map(
             points, count, notes = drive.write(files), len(drive.frames), drive.notes()
             if files.actors is not None and files.out is not None:
                 bodies = drive.write_actors(files.actors, files.out.suffix.lower())
-    return MapResult(tuple(str(path) for path in files.all), points, count, bodies, notes, time.perf_counter() - began)
+    return MapResult(
+        tuple(str(path) for path in files.all),
+        points,
+        count,
+        bodies,
+        notes,
+        time.perf_counter() - began,
+    )
 
 
 _BLOCK = 10  # number of scans that a worker sums
@@ -148,11 +181,20 @@ class DriveMap:
     cells: GrowingCells
 
     @classmethod
-    def of(cls, source: Source, frames: FrameRange, options: FromScans, cells: GrowingCells) -> Self:
-        """Find the one sequence of a source. Scans far from the chosen frames are hidden: their motion does not matter."""
+    def of(
+        cls, source: Source, frames: FrameRange, options: FromScans, cells: GrowingCells
+    ) -> Self:
+        """Find the one sequence of a source.
+
+        Scans far from the chosen frames are hidden: their motion does not matter.
+        """
         plan = GridPlan(GridSpec.published(), "map", options, Voting(), frames)
         sequence = only(
-            [one.sequence for one in scan_sequences(source, plan, options) if isinstance(one, ScanSequence)]
+            [
+                one.sequence
+                for one in scan_sequences(source, plan, options)
+                if isinstance(one, ScanSequence)
+            ]
         )
         known = sequence.frames("points")
         chosen = choose_frames(frames, known, sequence.location)
@@ -162,7 +204,9 @@ class DriveMap:
         return cls(ScanSequence(view, plan, options), chosen, cells)
 
     def fill(self, run: Run, actors: bool) -> None:
-        """Refine poses, find moving actors, and add the static points of each scan; with `actors`, add the points of actors too."""
+        """Refine poses, find moving actors, and add the static points of each scan; with `actors`,
+        add the points of actors too.
+        """
         inputs = self.inputs
         progress = StepCounter(run.progress, inputs.steps_before + len(self.frames))
         progress(0)
@@ -170,9 +214,14 @@ class DriveMap:
             inputs.refine(None, pool, progress)
             if inputs.feed.needs_actors:
                 inputs.actors = find_actors(inputs.feed, pool, progress)
-            blocks = [tuple(self.frames[first : first + _BLOCK]) for first in range(0, len(self.frames), _BLOCK)]
+            blocks = [
+                tuple(self.frames[first : first + _BLOCK])
+                for first in range(0, len(self.frames), _BLOCK)
+            ]
             items = ((block, inputs.actors.between(block[0], block[-1])) for block in blocks)
-            with closing(run_all(_AddScans(inputs.feed, self.cells.cell_m, actors), items, pool)) as added:
+            with closing(
+                run_all(_AddScans(inputs.feed, self.cells.cell_m, actors), items, pool)
+            ) as added:
                 for block, pieces in zip(blocks, added, strict=True):
                     self.cells.add(pieces)
                     progress(len(block))
@@ -187,7 +236,9 @@ class DriveMap:
         name = self.inputs.sequence.name or self.inputs.path or "a drive"
         points = self._pieces(STATIC, f"map of {name}, metres, x ahead, y left, z up")
         if not points.count:
-            raise MissingDataError(self.inputs.location, expected="points of something static", found="none")
+            raise MissingDataError(
+                self.inputs.location, expected="points of something static", found="none"
+            )
         files.write(points, self._whole)
         return points.count
 
@@ -198,14 +249,20 @@ class DriveMap:
 
     def _pieces(self, group: int, about: str) -> PointPieces:
         count = sum(number for part, number in self.cells.counts.items() if part[0] == group)
-        return PointPieces(count, lambda: self.cells.points(group), self.inputs.metadata.classes, about)
+        return PointPieces(
+            count, lambda: self.cells.points(group), self.inputs.metadata.classes, about
+        )
 
     def write_actors(self, folder: Path, ending: str) -> int:
-        """Write the body of each actor, in its own frame, and its poses; return the number of actors."""
+        """Write the body of each actor, in its own frame, and its poses; return the number of
+        actors.
+        """
         table, made = list[dict[str, Any]](), self.cells.folder / folder.name
         made.mkdir()
         for number in sorted({part[0] for part in self.cells.counts} - {STATIC}):
-            about = self._about(number, self.inputs.actors.tracks[number]) | {"file": f"{number:04}{ending}"}
+            about = self._about(number, self.inputs.actors.tracks[number]) | {
+                "file": f"{number:04}{ending}"
+            }
             text = f"actor {number}, {about['class']}, metres, x forward, y left, z up"
             write_points(made / about["file"], self._pieces(number, text))
             table.append(about)
@@ -234,7 +291,9 @@ class DriveMap:
         """Return remarks on the results, one line each."""
         where, notes, metadata = self.inputs.location, self.inputs.findings(), self.inputs.metadata
         if not self.inputs.feed.has_labels:
-            notes.append(f"{where}: the scans have no labels: the map contains geometry only, in one class")
+            notes.append(
+                f"{where}: the scans have no labels: the map contains geometry only, in one class"
+            )
         elif metadata.predicted:
             notes.append(f"{where}: classes are those of labels that were {metadata.predicted}")
         return tuple(notes)
@@ -248,7 +307,9 @@ class _AddScans:
     cell_m: float
     actors: bool
 
-    def __call__(self, block: tuple[tuple[int, ...], MovingActors]) -> list[tuple[Part, NDArray[Any]]]:
+    def __call__(
+        self, block: tuple[tuple[int, ...], MovingActors]
+    ) -> list[tuple[Part, NDArray[Any]]]:
         frames, actors = block
         merger = Merger(self.feed.read, actors, self.feed.classes, "align")
         found = [rows for frame in frames for rows in self._rows(merger, frame)]
@@ -256,13 +317,17 @@ class _AddScans:
         return split(np.concatenate(parts), np.concatenate(rows))
 
     def _rows(self, merger: Merger, frame: int) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-        """Yield the cells of the static points of a scan, then, if `actors` is set, those of each actor."""
+        """Yield the cells of the static points of a scan, then, if `actors` is set, those of each
+        actor.
+        """
         feed, scan = self.feed, self.feed.read(frame)
         labels, static = merger.labels(frame), merger.static(frame)
         if feed.finds_ground:  # ground that was found had a class for the votes only
             labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
-        chosen: list[tuple[int, NDArray[Any], NDArray[np.float64]]] = [(STATIC, np.flatnonzero(static), world[static])]
+        chosen: list[tuple[int, NDArray[Any], NDArray[np.float64]]] = [
+            (STATIC, np.flatnonzero(static), world[static])
+        ]
         for number, track in merger.actors.tracks.items() if self.actors else ():
             members, pose = track.members.get(frame), track.pose(frame)
             if members is not None and pose is not None:
@@ -270,7 +335,9 @@ class _AddScans:
         for group, points, places in chosen:
             right = places * (1, -1, 1) if feed.sequence.metadata.axes == "left" else places
             sure = None if scan.sure is None else scan.sure[points]
-            yield rows_of_scan(right, labels[points], sure, np.full(len(points), group), self.cell_m)
+            yield rows_of_scan(
+                right, labels[points], sure, np.full(len(points), group), self.cell_m
+            )
 
 
 def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -> int:
@@ -283,15 +350,21 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
     having = [one for one in source.sequences().values() if name in one.grids]
     if not having:
         names = sorted({grid for one in source.sequences().values() for grid in one.grids})
-        raise MissingDataError(source.location, expected=f"the grid {name}", found=", ".join(names) or "no grid")
+        raise MissingDataError(
+            source.location, expected=f"the grid {name}", found=", ".join(names) or "no grid"
+        )
     sequence = only(having)
     where = f"{sequence.location}/{name}"
     chosen = choose_frames(frames, sequence.frames(f"{name}/labels"), where)
     if len(chosen) > 1:
-        raise ArgumentError("frames", expected="one frame of the grid", found=f"{len(chosen)}, from {chosen[0]}")
+        raise ArgumentError(
+            "frames", expected="one frame of the grid", found=f"{len(chosen)}, from {chosen[0]}"
+        )
     given = sequence.grid(name, chosen[0])
     if given.spec.coordinates != "cartesian":
-        raise ArgumentError("grid", expected="a Cartesian grid", found=f"{name}, a {given.spec.coordinates} one")
+        raise ArgumentError(
+            "grid", expected="a Cartesian grid", found=f"{name}, a {given.spec.coordinates} one"
+        )
     grid = mirror_voxels(given) if sequence.metadata.axes == "left" else given
     lower, size = np.array(grid.spec.lower), grid.spec.voxel_size.astype(np.float64)
     index, labels = np.argwhere(grid.known), grid.labels[grid.known]
@@ -304,7 +377,9 @@ def write_grid(source: Source, name: str, frames: FrameRange, files: MapFiles) -
     points["label"] = grid.labels[occupied]
     points["seen"] = 1 if grid.counts is None else grid.counts[occupied]
     points["confidence"] = points["seen"] / (points["seen"] + 1.0)
-    pieces = PointPieces(len(points), lambda: iter([points]), sequence.metadata.classes, f"voxels of {where}")
+    pieces = PointPieces(
+        len(points), lambda: iter([points]), sequence.metadata.classes, f"voxels of {where}"
+    )
     files.write(pieces, lambda: MapCells(index, labels, lower, size))
     if files.distance is not None:
         write_distances(files.distance, given)

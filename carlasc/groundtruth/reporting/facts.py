@@ -1,4 +1,5 @@
-"""The facts of a report: of each frame, and of each moving actor, such as how well its observations align.
+"""The facts of a report: of each frame, and of each moving actor, such as how well its observations
+align.
 
 A frame is measured while it is made, or from its files if it exists already.
 """
@@ -19,7 +20,11 @@ from carlasc.core.grids import Grid, GridSpec, VoxelFlag
 from carlasc.motion.refinement import RefinedPoses
 from carlasc.storage import layout
 
-_MOST_POINTS, _MOST_ASKED = 600, 50  # of one observation: points that are used, and points whose distance is measured
+# of one observation: points that are used, and points whose distance is measured
+_MOST_POINTS, _MOST_ASKED = (
+    600,
+    50,
+)
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,8 @@ class Residual:
     """How well an observation of an actor aligns with the next one.
 
     Attributes:
-        moving_m: sum of the distances from points of one to the nearest points of the other, with the motion removed, metres.
+        moving_m: sum of the distances from points of one to the nearest points of the other, with
+            the motion removed, metres.
         static_m: the same without removing the motion.
         count: number of these points.
     """
@@ -54,7 +60,10 @@ class Residual:
         """
         one, other = thin(one, _MOST_POINTS), thin(other, _MOST_POINTS)
         static = _distances(one, other)
-        moving = _distances(transform_points(invert(world_T_actor), one), transform_points(invert(world_T_next), other))
+        moving = _distances(
+            transform_points(invert(world_T_actor), one),
+            transform_points(invert(world_T_next), other),
+        )
         return cls(float(moving.sum()), float(static.sum()), len(moving))
 
 
@@ -73,9 +82,11 @@ class ActorTrack:
         size_m: length, width and height of its body, metres.
         seen_m: length, width and height of its visible part, metres.
         faces: number of its visible sides: front, rear, left and right.
-        residual_m: how well neighbouring observations align with the motion removed: mean distance from a point of one to the nearest
-            point of the one before or after, metres; None if none were compared. It is at least the distance between neighbouring points.
-        residual_static_m: the same without removing the motion. With a correct motion, `residual_m` is smaller.
+        residual_m: how well neighbouring observations align with the motion removed: mean distance
+            from a point of one to the nearest point of the one before or after, metres; None if
+            none were compared. It is at least the distance between neighbouring points.
+        residual_static_m: the same without removing the motion. With a correct motion, `residual_m`
+            is smaller.
         confidence: probability that it is real, from 0 to 1; 1 for an actor of the data.
     """
 
@@ -94,7 +105,9 @@ class ActorTrack:
     confidence: float
 
     @classmethod
-    def of(cls, summary: Mapping[str, Any], residuals: Sequence[Residual], classes: ClassTable) -> ActorTrack:
+    def of(
+        cls, summary: Mapping[str, Any], residuals: Sequence[Residual], classes: ClassTable
+    ) -> ActorTrack:
         """Return the actor that a summary of the tracks describes."""
         length, width, height = summary["size_m"]
         seen_length, seen_width, seen_height = summary["seen_m"]
@@ -111,13 +124,17 @@ class ActorTrack:
             seen_m=(seen_length, seen_width, seen_height),
             faces=summary["faces"],
             residual_m=round(sum(r.moving_m for r in residuals) / count, 4) if count else None,
-            residual_static_m=round(sum(r.static_m for r in residuals) / count, 4) if count else None,
+            residual_static_m=round(sum(r.static_m for r in residuals) / count, 4)
+            if count
+            else None,
             confidence=summary["confidence"],
         )
 
 
 def actors_of(
-    summaries: Sequence[Mapping[str, Any]], residuals: Iterable[Mapping[int, Residual]], classes: ClassTable
+    summaries: Sequence[Mapping[str, Any]],
+    residuals: Iterable[Mapping[int, Residual]],
+    classes: ClassTable,
 ) -> tuple[ActorTrack, ...]:
     """Return the moving actors, in order of their first observation.
 
@@ -130,12 +147,18 @@ def actors_of(
     for frame in residuals:
         for number, residual in frame.items():
             by_actor.setdefault(number, []).append(residual)
-    actors = [ActorTrack.of(s, by_actor.get(i, []), classes) for i, s in enumerate(summaries) if s["moves"]]
+    actors = [
+        ActorTrack.of(s, by_actor.get(i, []), classes)
+        for i, s in enumerate(summaries)
+        if s["moves"]
+    ]
     return tuple(sorted(actors, key=lambda actor: (actor.first, actor.label, actor.instance)))
 
 
 def _distances(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the distances from some points of each observation to the nearest point of the other, metres."""
+    """Return the distances from some points of each observation to the nearest point of the other,
+    metres.
+    """
     found = []
     for asked, others in ((one, other), (other, one)):
         squares = np.square(thin(asked, _MOST_ASKED)[:, None] - others[None]).sum(axis=2)
@@ -174,11 +197,14 @@ class PoseFacts:
     """How well neighbouring scans agree, and how their poses were refined.
 
     Attributes:
-        before_m: mean distance of scans from the surfaces of their neighbours, under the given poses, in metres; None if it is unknown.
+        before_m: mean distance of scans from the surfaces of their neighbours, under the given
+            poses, in metres; None if it is unknown.
         after_m: the same under the poses that were used.
-        changed_m: (x, y, z) root mean square change of the motion from each scan to the next one, in metres on the axes of the sensor.
+        changed_m: (x, y, z) root mean square change of the motion from each scan to the next one,
+            in metres on the axes of the sensor.
         changed_rad: (roll, pitch, yaw) the same for the rotation, in radians.
-        height_drift_m: greatest change of the difference between given and used height within 100 scans, in metres.
+        height_drift_m: greatest change of the difference between given and used height within 100
+            scans, in metres.
         left: first and last frame of the stretches that keep the given motion.
     """
 
@@ -196,7 +222,9 @@ class PoseFacts:
         off = refined.given[:, 2, 3] - refined.poses[:, 2, 3]
         windows = np.lib.stride_tricks.sliding_window_view(off, min(_DRIFT, len(off)))
         drift = float(np.ptp(windows, axis=1).max())
-        return cls(*refined.disagreements_m, (x, y, z), (roll, pitch, yaw), drift, refined.left(frames))
+        return cls(
+            *refined.disagreements_m, (x, y, z), (roll, pitch, yaw), drift, refined.left(frames)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,9 +238,12 @@ class FrameFacts:
         classes: (K,) int64 known voxels of each class, free space first.
         votes: (POWERS,) int64 histogram of the votes of known voxels, by powers of two.
         votes_sum: sum of these votes; 0 if the grid has no counts.
-        changes: how the grid changes if a tenth of the scans is left out; None if this was not measured.
-        residuals: how well the observations of moving actors align with the next ones, by number of the actor.
-        inferred: number of known voxels that were inferred, not seen; None if the grid does not say.
+        changes: how the grid changes if a tenth of the scans is left out; None if this was not
+            measured.
+        residuals: how well the observations of moving actors align with the next ones, by number of
+            the actor.
+        inferred: number of known voxels that were inferred, not seen; None if the grid does not
+            say.
     """
 
     frame: int
@@ -258,32 +289,54 @@ class FrameFacts:
             seen = np.asarray(counts).reshape(-1)
             labels, seen = labels[seen > 0], seen[seen > 0]
             powers = np.clip(np.frexp(seen.astype(np.float32))[1] - 1, 0, POWERS - 1)
-            votes, votes_sum = np.bincount(powers, minlength=POWERS), float(seen.sum(dtype=np.float64))
-        classes.check(labels, f"{grid}: frame {frame}")  # counting a label of 2**32 - 1 would take 32 GB
+            votes, votes_sum = (
+                np.bincount(powers, minlength=POWERS),
+                float(seen.sum(dtype=np.float64)),
+            )
+        # counting a label of 2**32 - 1 would take 32 GB
+        classes.check(labels, f"{grid}: frame {frame}")
         by_class = np.bincount(labels, minlength=classes.num_channels)
         inferred = _inferred(arrays.get(f"{grid}/flags"), counts)
-        return cls(frame, digests, len(labels), by_class, votes, votes_sum, changes, residuals or {}, inferred)
+        return cls(
+            frame,
+            digests,
+            len(labels),
+            by_class,
+            votes,
+            votes_sum,
+            changes,
+            residuals or {},
+            inferred,
+        )
 
 
 def _inferred(flags: NDArray[Any] | None, counts: NDArray[Any] | None) -> int | None:
-    """Return the number of known voxels that were inferred, not seen; None if the grid does not say."""
+    """Return the number of known voxels that were inferred, not seen; None if the grid does not
+    say.
+    """
     if flags is None:
         return None
     inferred = (np.asarray(flags).reshape(-1) & int(VoxelFlag.INFERRED)) > 0
-    return int(np.count_nonzero(inferred if counts is None else inferred & (np.asarray(counts).reshape(-1) > 0)))
+    return int(
+        np.count_nonzero(
+            inferred if counts is None else inferred & (np.asarray(counts).reshape(-1) > 0)
+        )
+    )
 
 
 def sample_frames(numbers: Sequence[int]) -> frozenset[int]:
     """Return the frames that are made again without a tenth of the scans.
 
-    The choice depends on the frame numbers, so that runs over parts of a sequence choose the same frames. A short range has one such frame.
+    The choice depends on the frame numbers, so that runs over parts of a sequence choose the same
+    frames. A short range has one such frame.
     """
     chosen = frozenset(n for n in numbers if n % _SAMPLED == _SAMPLED // 2)
     return chosen or frozenset(numbers[len(numbers) // 2 :][:1])
 
 
 def digest_of(field: str, array: NDArray[Any]) -> bytes:
-    """Return the digest (BLAKE2b, 16 bytes) of a field of a frame: the digest of its published file, for all stores.
+    """Return the digest (BLAKE2b, 16 bytes) of a field of a frame: the digest of its published
+    file, for all stores.
 
     Votes are compressed in their file, so their digest is that of their rows.
 
@@ -292,7 +345,9 @@ def digest_of(field: str, array: NDArray[Any]) -> bytes:
     """
     entry = layout.field_named(field)
     data = (
-        np.ascontiguousarray(array).tobytes() if entry.kind in ("votes", "velocities") else entry.encode(array, field)
+        np.ascontiguousarray(array).tobytes()
+        if entry.kind in ("votes", "velocities")
+        else entry.encode(array, field)
     )
     return digest_of_bytes(data)
 

@@ -16,7 +16,13 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.plain import from_plain
 from carlasc.errors import FormatError, carlasc_version, reading
-from carlasc.groundtruth.reporting.facts import ActorTrack, FrameFacts, PoseFacts, actors_of, digest_of_bytes
+from carlasc.groundtruth.reporting.facts import (
+    ActorTrack,
+    FrameFacts,
+    PoseFacts,
+    actors_of,
+    digest_of_bytes,
+)
 from carlasc.storage.files import parse_json, to_json
 
 REPORT_FORMAT = 1
@@ -35,10 +41,13 @@ class Coverage:
     Attributes:
         voxels: number of voxels.
         known: number of known voxels, which have at least one vote.
-        classes: number of known voxels of each class that occurs, by name; free space is the class with id 0.
+        classes: number of known voxels of each class that occurs, by name; free space is the class
+            with id 0.
         occupied: number of known voxels that are not free.
-        mean_votes: mean number of votes of a known voxel, the nearest to its number of views that a grid keeps; None without counts.
-        votes: number of known voxels with 1 vote, 2 to 3, 4 to 7, and so on, up to the last bin that is not empty.
+        mean_votes: mean number of votes of a known voxel, the nearest to its number of views that a
+            grid keeps; None without counts.
+        votes: number of known voxels with 1 vote, 2 to 3, 4 to 7, and so on, up to the last bin
+            that is not empty.
     """
 
     voxels: int
@@ -85,7 +94,8 @@ class Digests:
 
     Attributes:
         all: 32 hexadecimal digits for the field as a whole.
-        frames: 8 digits for each frame of the report, in their order; "--------" for a frame without the field.
+        frames: 8 digits for each frame of the report, in their order; "--------" for a frame
+            without the field.
     """
 
     all: str
@@ -99,7 +109,8 @@ class Digests:
 
 @dataclass(frozen=True)
 class FileDigest:
-    """The digest of a text file and its size. poses.txt and times.txt may get more lines later, so the size belongs to the digest.
+    """The digest of a text file and its size. poses.txt and times.txt may get more lines later, so
+    the size belongs to the digest.
 
     Attributes:
         size: size of the file, in bytes.
@@ -157,11 +168,14 @@ class Report:
         frames: numbers of the frames that the report covers, sorted.
         settings: content of params.json.
         coverage: known and occupied voxels, and their votes.
-        convergence: how grids change if scans are left out; None for grids that are not made from scans.
+        convergence: how grids change if scans are left out; None for grids that are not made from
+            scans.
         actors: moving actors that were tracked; None if actors were not tracked.
         poses: how well scans agree, and how their poses were refined; None if refinement is off.
-        inferred_share: share of the known voxels that were inferred, not seen; None if the grid does not say.
-        holdout: held-out scores, as `carlasc.inspection.HeldOutScores.to_dict` returns them; None if they were not measured.
+        inferred_share: share of the known voxels that were inferred, not seen; None if the grid
+            does not say.
+        holdout: held-out scores, as `carlasc.inspection.HeldOutScores.to_dict` returns them; None
+            if they were not measured.
         digests: digests of each field beside the grid and of the grid, by name.
         documents: digest of each text file that belongs to the grid, by name.
         versions: versions of carlasc, NumPy, Numba and Python that made the report.
@@ -214,10 +228,14 @@ class Report:
             frames=frames,
             settings=dict(settings),
             coverage=_coverage(rows, settings, classes),
-            convergence=Convergence(len(changes), sum(c.known for c in changes), sum(c.changed for c in changes))
+            convergence=Convergence(
+                len(changes), sum(c.known for c in changes), sum(c.changed for c in changes)
+            )
             if changes
             else None,
-            actors=None if actors is None else actors_of(actors, (row.residuals for row in rows), classes),
+            actors=None
+            if actors is None
+            else actors_of(actors, (row.residuals for row in rows), classes),
             poses=poses,
             inferred_share=_inferred(rows),
             holdout=holdout,
@@ -245,7 +263,11 @@ class Report:
             },
             "convergence": None
             if convergence is None
-            else {"left_out": LEFT_OUT, **asdict(convergence), "changed_share": convergence.changed_share},
+            else {
+                "left_out": LEFT_OUT,
+                **asdict(convergence),
+                "changed_share": convergence.changed_share,
+            },
             "actors": None if self.actors is None else [_plain(actor) for actor in self.actors],
             "poses": None if self.poses is None else asdict(self.poses),
             "inferred_share": self.inferred_share,
@@ -261,7 +283,8 @@ class Report:
         """Return the report that `to_dict` describes; `where` is the file named in errors.
 
         Raises:
-            FormatError: the values are not those of a report, or a newer version of carlasc wrote them.
+            FormatError: the values are not those of a report, or a newer version of carlasc wrote
+                them.
         """
         version = values.get("format")
         if version != REPORT_FORMAT:
@@ -274,7 +297,10 @@ class Report:
             )
         with reading(where, "a report", "make it again with `remake=True`"):
             GridSpec.from_params(values["settings"], where)
-            inputs, outputs = (from_plain(values[part], Mapping[str, Digests], part) for part in ("inputs", "outputs"))
+            inputs, outputs = (
+                from_plain(values[part], Mapping[str, Digests], part)
+                for part in ("inputs", "outputs")
+            )
             return cls(
                 grid=from_plain(values["grid"], str, "grid"),
                 frames=_frames(values["frames"]),
@@ -310,14 +336,19 @@ def short(digest: bytes) -> str:
 
 
 def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: ClassTable) -> Coverage:
-    by_class: NDArray[np.int64] = sum((row.classes for row in rows), start=np.zeros(classes.num_channels, np.int64))
+    by_class: NDArray[np.int64] = sum(
+        (row.classes for row in rows), start=np.zeros(classes.num_channels, np.int64)
+    )
     votes = sum((row.votes for row in rows), start=np.zeros(1, np.int64))
     known, total = sum(row.known for row in rows), sum(row.votes_sum for row in rows)
     voxels = len(rows) * int(np.prod(settings["grid_size"], dtype=np.int64))
     return Coverage(
         voxels=voxels,
         known=known,
-        classes={classes.names.get(i, str(i)): int(by_class[i]) for i in np.flatnonzero(by_class).tolist()},
+        classes={
+            classes.names.get(i, str(i)): int(by_class[i])
+            for i in np.flatnonzero(by_class).tolist()
+        },
         occupied=known - int(by_class[0]),
         mean_votes=round(total / known, 4) if known and total else None,
         votes=tuple(np.trim_zeros(votes, "b").tolist()),
@@ -326,7 +357,10 @@ def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: Clas
 
 def _inferred(rows: list[FrameFacts]) -> float | None:
     """Return the share of the known voxels that were inferred; None if a frame does not say."""
-    counts, known = [row.inferred for row in rows if row.inferred is not None], sum(row.known for row in rows)
+    counts, known = (
+        [row.inferred for row in rows if row.inferred is not None],
+        sum(row.known for row in rows),
+    )
     return sum(counts) / known if known and len(counts) == len(rows) else None
 
 
@@ -353,7 +387,10 @@ def _versions() -> dict[str, str]:
 
 def _spans(frames: tuple[int, ...]) -> list[tuple[int, int]]:
     """Return half-open ranges of consecutive frame numbers."""
-    runs = [[frame for _, frame in run] for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0])]
+    runs = [
+        [frame for _, frame in run]
+        for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0])
+    ]
     return [(run[0], run[-1] + 1) for run in runs]
 
 
@@ -363,9 +400,18 @@ def _frames(spans: Any) -> tuple[int, ...]:
     Raises:
         ValueError: the ranges are not valid, or have too many frames.
     """
-    ranges = [range(start, stop) for start, stop in from_plain(spans, tuple[tuple[int, int], ...], "frames")]
-    if not all(0 <= span.start <= span.stop for span in ranges) or sum(map(len, ranges)) > _MOST_FRAMES:
-        raise ValueError(f"{len(ranges)} ranges of frames with negative numbers, or of more than {_MOST_FRAMES} frames")
+    ranges = [
+        range(start, stop)
+        for start, stop in from_plain(spans, tuple[tuple[int, int], ...], "frames")
+    ]
+    if (
+        not all(0 <= span.start <= span.stop for span in ranges)
+        or sum(map(len, ranges)) > _MOST_FRAMES
+    ):
+        raise ValueError(
+            f"{len(ranges)} ranges of frames with negative numbers, or of more than "
+            f"{_MOST_FRAMES} frames"
+        )
     return tuple(frame for span in ranges for frame in span)
 
 

@@ -1,8 +1,9 @@
-"""The ballot: observations (points, labels and the pose of a sensor), their votes in the voxels of a grid, and the grid.
+"""The ballot: observations (points, labels and the pose of a sensor), their votes in the voxels of
+a grid, and the grid.
 
-Every labelled point votes for its class in its voxel, and free samples on its ray vote for free space (class 0) in their voxels. A voxel
-takes the class with most votes, ties go to the lowest id, and a voxel without votes is unknown: see the format page,
-`docs/format.md#votes`.
+Every labelled point votes for its class in its voxel, and free samples on its ray vote for free
+space (class 0) in their voxels. A voxel takes the class with most votes, ties go to the lowest id,
+and a voxel without votes is unknown: see the format page, `docs/format.md#votes`.
 """
 
 from __future__ import annotations
@@ -30,30 +31,42 @@ _FEW = 8  # voxels are few if they are so many times fewer than all
 NOWHERE = 65534
 """A region without voxels: rays with it do not vote."""
 OCCUPIED_DTYPE = np.dtype(
-    [("voxel", np.int32), ("label", np.uint16), ("votes", np.int64), ("voters", np.int32), ("sure", np.float32)]
+    [
+        ("voxel", np.int32),
+        ("label", np.uint16),
+        ("votes", np.int64),
+        ("voters", np.int32),
+        ("sure", np.float32),
+    ]
 )
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One voter: the scan of one sensor at one instant. Its points vote for their classes, its rays for free space.
+    """One voter: the scan of one sensor at one instant.
 
-    A sensor that moves during the scan, or several sensors, are one observation with K voters: one for each origin of rays.
+    Its points vote for their classes, its rays for free space.
+
+    A sensor that moves during the scan, or several sensors, are one observation with K voters: one
+    for each origin of rays.
 
     Attributes:
-        points: (N, 3) float32, metres, in the sensor's frame; for K voters, in their order. The rounding to float32 is part of the rule: see
-            the format page, `docs/format.md#votes`.
+        points: (N, 3) float32, metres, in the sensor's frame; for K voters, in their order. The
+            rounding to float32 is part of the rule: see the format page, `docs/format.md#votes`.
         labels: (N,) unsigned integer class ids. Points labelled 0 and their rays do not vote.
         grid_T_sensor: (4, 4) float64, from the sensor's frame to the grid's; or (K, 4, 4).
-        hits: (N,) bool, points that vote for their class; for the other points only the rays vote. None: all points.
+        hits: (N,) bool, points that vote for their class; for the other points only the rays vote.
+            None: all points.
         hit_region: region of the grid in which the points vote; None for the whole grid.
         free_region: region of the grid in which the rays vote; None for the whole grid.
         sure: (N,) float32, probability of the class of each point; None: 1.
         ends: (K,) int64, index after the last point of each voter; None: one voter.
-        weights: (N,) uint8, number of votes of each ray, unless there is one vote per voxel; None: 1.
+        weights: (N,) uint8, number of votes of each ray, unless there is one vote per voxel; None:
+            1.
 
     Raises:
-        FormatError: points and labels differ in length, have another shape or type, or the transform is not rigid.
+        FormatError: points and labels differ in length, have another shape or type, or the
+            transform is not rigid.
     """
 
     points: NDArray[np.float32]
@@ -74,14 +87,26 @@ class Observation:
             expected = f"shape ({len(self.points)},), one per point"
             raise FormatError("observation labels", expected=expected, found=str(self.labels.shape))
         if self.labels.dtype.kind != "u":
-            raise FormatError("observation labels", expected="unsigned integers", found=str(self.labels.dtype))
+            raise FormatError(
+                "observation labels", expected="unsigned integers", found=str(self.labels.dtype)
+            )
         if self.hits is not None and self.hits.shape != self.labels.shape:
-            raise FormatError("observation hits", expected=f"shape ({len(self.points)},)", found=str(self.hits.shape))
+            raise FormatError(
+                "observation hits",
+                expected=f"shape ({len(self.points)},)",
+                found=str(self.hits.shape),
+            )
         check_rigid(self.grid_T_sensor, "observation grid_T_sensor")
         poses, ends = np.shape(self.grid_T_sensor)[:-2], self.ends
         voters = () if ends is None else ends.shape
-        if poses != voters or (ends is not None and ([0, *ends][-1] != len(self) or (np.diff(ends) < 0).any())):
-            raise FormatError("observation ends", expected=f"shape {poses}, rising to {len(self)}", found=str(ends))
+        if poses != voters or (
+            ends is not None and ([0, *ends][-1] != len(self) or (np.diff(ends) < 0).any())
+        ):
+            raise FormatError(
+                "observation ends",
+                expected=f"shape {poses}, rising to {len(self)}",
+                found=str(ends),
+            )
 
     def __len__(self) -> int:
         return len(self.points)
@@ -96,14 +121,17 @@ def count_votes(
     free_step_m: float = 1.5,
     keep_boxes: bool = False,
 ) -> Votes:
-    """Count the votes of observations. They are read one at a time, so memory does not grow with their number.
+    """Count the votes of observations.
+
+    They are read one at a time, so memory does not grow with their number.
 
     Args:
         observations: the voters, all in one grid frame.
         spec: geometry of the grid.
         classes: class table of the labels.
-        rule: "sensor": at most one vote per observation, voxel and class, as in the published files; "sample" and "ray": every sample
-            counts (they decide differently: see `carlasc.groundtruth.voting.certainty`).
+        rule: "sensor": at most one vote per observation, voxel and class, as in the published
+            files; "sample" and "ray": every sample counts (they decide differently: see
+            `carlasc.groundtruth.voting.certainty`).
         free_step_m: distance between two free samples on a ray, in metres.
         keep_boxes: also keep the box around the points in each voxel of a Cartesian grid.
 
@@ -126,18 +154,23 @@ def check_rule(rule: str, free_step_m: float) -> None:
     if rule not in get_args(VoteRule):
         raise ArgumentError("rule", expected="sensor, sample or ray", found=repr(rule))
     if not (math.isfinite(free_step_m) and free_step_m > 0):
-        raise ArgumentError("free_step_m", expected="a positive number of metres", found=str(free_step_m))
+        raise ArgumentError(
+            "free_step_m", expected="a positive number of metres", found=str(free_step_m)
+        )
 
 
 class Ballot:
-    """Counts votes: `add` takes one observation after the other, and `votes` can be read at any time.
+    """Counts votes: `add` takes one observation after the other, and `votes` can be read at any
+    time.
 
-    A ballot is used by one thread at a time; different ballots are independent, and `add` releases the GIL.
+    A ballot is used by one thread at a time; different ballots are independent, and `add` releases
+    the GIL.
 
     Args:
         spec: geometry of the grid.
         classes: class table of the labels.
-        rule: "sensor": at most one vote per observation, voxel and class; "sample" and "ray": every sample counts.
+        rule: "sensor": at most one vote per observation, voxel and class; "sample" and "ray": every
+            sample counts.
         free_step_m: distance between two free samples on a ray, in metres.
         count_views: also count how many observations saw each voxel; not with "sensor".
         regions: (V,) uint16, region of each voxel, for observations that vote in one region only.
@@ -163,8 +196,15 @@ class Ballot:
 
         check_rule(rule, free_step_m)
         if regions is not None and regions.shape != (spec.num_voxels,):
-            raise ArgumentError("regions", expected=f"shape ({spec.num_voxels},)", found=str(regions.shape))
-        self.spec, self.classes, self.rule, self.free_step_m = spec, classes, rule, float(free_step_m)
+            raise ArgumentError(
+                "regions", expected=f"shape ({spec.num_voxels},)", found=str(regions.shape)
+            )
+        self.spec, self.classes, self.rule, self.free_step_m = (
+            spec,
+            classes,
+            rule,
+            float(free_step_m),
+        )
         self.num_observations = 0
         once = rule == "sensor"
         viewed = spec.num_voxels + 1 if count_views else 0
@@ -177,7 +217,9 @@ class Ballot:
             heads=np.full(spec.num_voxels, kernel.NONE, np.int32),
             candidates=np.empty(0, kernel.CANDIDATE_DTYPE),
             used=np.zeros(1, np.int64),
-            regions=np.empty(0, np.uint16) if regions is None else np.append(regions, np.uint16(kernel.OUTSIDE)),
+            regions=np.empty(0, np.uint16)
+            if regions is None
+            else np.append(regions, np.uint16(kernel.OUTSIDE)),
             views=np.zeros(viewed, np.uint16),
             viewers=np.full(viewed, kernel.NONE, np.int32),
         )
@@ -186,27 +228,43 @@ class Ballot:
         """Add the votes of one observation.
 
         Raises:
-            FormatError: a label is not below the class table's number of channels; no vote was added.
+            FormatError: a label is not below the class table's number of channels; no vote was
+                added.
             ArgumentError: it votes in a region, and the ballot has none.
         """
         from carlasc.groundtruth.voting import filled, kernel
 
         self.classes.check(observation.labels, "observation labels")
         hit_region = kernel.ANYWHERE if observation.hit_region is None else observation.hit_region
-        free_region = kernel.ANYWHERE if observation.free_region is None else observation.free_region
-        if not len(self._tally.regions) and (hit_region, free_region) != (kernel.ANYWHERE, kernel.ANYWHERE):
+        free_region = (
+            kernel.ANYWHERE if observation.free_region is None else observation.free_region
+        )
+        if not len(self._tally.regions) and (hit_region, free_region) != (
+            kernel.ANYWHERE,
+            kernel.ANYWHERE,
+        ):
             raise ArgumentError(
-                "observation", expected="no region, as the ballot has none", found="one that votes in a region"
+                "observation",
+                expected="no region, as the ballot has none",
+                found="one that votes in a region",
             )
         ends = np.array([len(observation)]) if observation.ends is None else observation.ends
         self._make_room(len(observation))
         cast = kernel.Voters(
             np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
             np.require(observation.labels, np.uint16, ["C", "A", "W"]),
-            _ALL if observation.hits is None else np.require(observation.hits, np.bool_, ["C", "A", "W"]),
-            _ALL_SURE if observation.sure is None else np.require(observation.sure, np.float32, ["C", "A", "W"]),
-            _ALL_ONE if observation.weights is None else np.require(observation.weights, np.uint8, ["C", "A", "W"]),
-            np.ascontiguousarray(observation.grid_T_sensor, np.float64).reshape(-1, 16)[:, :12].copy(),
+            _ALL
+            if observation.hits is None
+            else np.require(observation.hits, np.bool_, ["C", "A", "W"]),
+            _ALL_SURE
+            if observation.sure is None
+            else np.require(observation.sure, np.float32, ["C", "A", "W"]),
+            _ALL_ONE
+            if observation.weights is None
+            else np.require(observation.weights, np.uint8, ["C", "A", "W"]),
+            np.ascontiguousarray(observation.grid_T_sensor, np.float64)
+            .reshape(-1, 16)[:, :12]
+            .copy(),
             ends,
         )
         kernel.vote(
@@ -224,7 +282,9 @@ class Ballot:
         self.num_observations += len(ends)
 
     def _apart(self, region: int) -> NDArray[np.int64]:
-        """Return the voxels outside of a region, if they are few and each sample counts; otherwise none."""
+        """Return the voxels outside of a region, if they are few and each sample counts; otherwise
+        none.
+        """
         if region < 0 or region == NOWHERE or self._tally.once:
             return _NONE
         if region not in self._outside:
@@ -235,7 +295,10 @@ class Ballot:
 
     @property
     def views(self) -> NDArray[np.uint16]:
-        """(X, Y, Z) uint16: number of observations that saw each voxel; a copy. Only with `count_views`."""
+        """(X, Y, Z) uint16: number of observations that saw each voxel; a copy.
+
+        Only with `count_views`.
+        """
         return self._tally.views[:-1].reshape(self.spec.size).copy()
 
     @property
@@ -246,7 +309,9 @@ class Ballot:
         return self._tally.heads != kernel.NONE
 
     def seen(self, voxels: NDArray[np.integer] | slice = slice(None)) -> NDArray[np.bool_]:
-        """Return (N,) bool: which of (N,) voxels, flat indices, have votes; by default of all voxels."""
+        """Return (N,) bool: which of (N,) voxels, flat indices, have votes; by default of all
+        voxels.
+        """
         from carlasc.groundtruth.voting import kernel
 
         seen: NDArray[np.bool_] = self._tally.heads[voxels] != kernel.NONE
@@ -257,7 +322,8 @@ class Ballot:
         """Return the votes so far.
 
         Args:
-            copy: whether the result is independent of later observations. Without a copy, add no more of them.
+            copy: whether the result is independent of later observations. Without a copy, add no
+                more of them.
         """
         from carlasc.groundtruth.voting import kernel
 
@@ -269,7 +335,9 @@ class Ballot:
         return Votes(self.spec, self.classes, free.copy() if copy else free, occupied, boxes)
 
     def _make_room(self, points: int) -> None:
-        """Make room for one more candidate per point, which is the most that an observation can add."""
+        """Make room for one more candidate per point, which is the most that an observation can
+        add.
+        """
         used, candidates = int(self._tally.used[0]), self._tally.candidates
         if used + points > len(candidates):
             grown = np.empty(2 * (used + points), candidates.dtype)
@@ -285,10 +353,12 @@ class Votes:
         spec: the grid.
         classes: class table of the labels.
         free: (X, Y, Z) unsigned integer, votes for free space.
-        occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0), `votes` (int64, never 0) and `voters`
-            (int32), the number of their observations, and `sure` (float32), the sum of their probabilities; one row per voxel and class, sorted
-            by voxel, then by label.
-        boxes: (V, 6) uint8, the box around the points of each voxel: see `carlasc.groundtruth.voting.filled`; None unless they are kept.
+        occupied: (M,) structured: `voxel` (int32, flat C-order index), `label` (uint16, never 0),
+            `votes` (int64, never 0) and `voters` (int32), the number of their observations, and
+            `sure` (float32), the sum of their probabilities; one row per voxel and class, sorted by
+            voxel, then by label.
+        boxes: (V, 6) uint8, the box around the points of each voxel: see
+            `carlasc.groundtruth.voting.filled`; None unless they are kept.
     """
 
     spec: GridSpec
@@ -298,16 +368,22 @@ class Votes:
     boxes: NDArray[np.uint8] | None = None
 
     def to_grid(self) -> Grid:
-        """Return the grid: the class with most votes in each voxel, which may be free space, and the sum of its votes. Ties go to the lowest id."""
+        """Return the grid: the class with most votes in each voxel, which may be free space, and
+        the sum of its votes. Ties go to the lowest id.
+        """
         labels, counts = self._elect(self.free.reshape(-1).copy())
         return Grid(self.spec, labels.reshape(self.spec.size), counts.reshape(self.spec.size))
 
     def elect_occupied(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the (V,) classes with most votes, without free space, and the (V,) sums of the votes without free space; 0 without any."""
+        """Return the (V,) classes with most votes, without free space, and the (V,) sums of the
+        votes without free space; 0 without any.
+        """
         return self._elect(np.zeros(self.spec.num_voxels, self.free.dtype))
 
     def _elect(self, counts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the (V,) classes with most votes, ties to the lowest id, and the (V,) sums of votes. `counts` has the votes of class 0."""
+        """Return the (V,) classes with most votes, ties to the lowest id, and the (V,) sums of
+        votes. `counts` has the votes of class 0.
+        """
         from carlasc.groundtruth.voting import kernel
 
         labels = np.zeros(len(counts), self.classes.dtype)
@@ -320,12 +396,14 @@ class Votes:
         return counts.astype(np.int64).reshape(self.spec.size)
 
     def to_sparse(self) -> NDArray[Any]:
-        """Return the votes as the layout stores them: non-zero ones only, sorted by voxel, then by label; free space is label 0.
+        """Return the votes as the layout stores them: non-zero ones only, sorted by voxel, then by
+        label; free space is label 0.
 
         Numbers of votes above the maximum of the layout are stored as the maximum.
 
         Returns:
-            (M,) `field_files.VOTES_DTYPE`, or `field_files.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
+            (M,) `field_files.VOTES_DTYPE`, or `field_files.WIDE_VOTES_DTYPE` if class ids do not
+            fit 8 bits.
         """
         from carlasc.groundtruth.voting import kernel
 

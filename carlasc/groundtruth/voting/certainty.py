@@ -1,11 +1,14 @@
-"""Certainty: the rule "ray", which decides from hits and free paths whether a voxel is occupied, and the probability of it.
+"""Certainty: the rule "ray", which decides from hits and free paths whether a voxel is occupied,
+and the probability of it.
 
-A ray that ends in a voxel is a hit. A ray that passes through adds its free path. The number of hits per metre of free path is a property of
-the matter in the voxel (the decay rate of Schaefer, Luft and Burgard, 2017). It does not depend on the number of channels of a LiDAR, its turn
-rate, or the number of merged scans. A wall stops every ray; most rays that graze a road pass through the voxels of its surface.
+A ray that ends in a voxel is a hit. A ray that passes through adds its free path. The number of
+hits per metre of free path is a property of the matter in the voxel (the decay rate of Schaefer,
+Luft and Burgard, 2017). It does not depend on the number of channels of a LiDAR, its turn rate, or
+the number of merged scans. A wall stops every ray; most rays that graze a road pass through the
+voxels of its surface.
 
-The probability that a voxel is occupied is a logistic function of the logarithm of this ratio. It is calibrated on simulated drives in
-which many other sensors see the same instant.
+The probability that a voxel is occupied is a logistic function of the logarithm of this ratio. It
+is calibrated on simulated drives in which many other sensors see the same instant.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.storage import field_files, layout
 
-# Hits per metre of free path above which a voxel is occupied. Chosen on simulated drives: see docs/studies/movers.md.
+# Hits per metre of free path above which a voxel is occupied. Chosen on simulated drives: see
+# docs/studies/movers.md.
 GROUND_PER_M = 0.05  # roads, pavements and other ground, which most rays graze
 SOLID_PER_M = 0.15  # other static objects, and actors within their bodies
 MOVABLE_PER_M = 0.5  # movable classes, which may come or leave during the window
@@ -41,7 +45,8 @@ class Matter(IntEnum):
 
 _PER_M = np.array([GROUND_PER_M, SOLID_PER_M, MOVABLE_PER_M, SOLID_PER_M, SOLID_PER_M])
 
-# Offset and slope of the logistic functions, for voxels of 0.4 m and of 0.2 m; for other sizes, linear in the logarithm of the size.
+# Offset and slope of the logistic functions, for voxels of 0.4 m and of 0.2 m; for other sizes,
+# linear in the logarithm of the size.
 _HIT = np.array(
     [
         [(-1.2, 1.34), (1.4, 0.72)],
@@ -51,14 +56,17 @@ _HIT = np.array(
         [(0.45, 0.32), (1.2, 0.5)],
     ]
 )
-_FREE = np.array([-4.0, -0.7])  # of the logarithm of the number of free samples, in voxels without hits
+# of the logarithm of the number of free samples, in voxels without hits
+_FREE = np.array([-4.0, -0.7])
 _FREE_IN_BODY = np.array([-1.7, -0.4])
 _SMALLEST_M, _LARGEST_M = 0.1, 0.8  # smaller and larger sizes count as these
 UNKNOWN = 0.5
 _BLOCK = 1 << 14  # voxels whose arrays fit into the L2 cache
 
 
-def matter_of(labels: NDArray[np.integer], in_body: NDArray[np.bool_], classes: ClassTable) -> NDArray[np.int8]:
+def matter_of(
+    labels: NDArray[np.integer], in_body: NDArray[np.bool_], classes: ClassTable
+) -> NDArray[np.int8]:
     """Return the kind of matter in each voxel.
 
     Args:
@@ -74,8 +82,11 @@ def matter_of(labels: NDArray[np.integer], in_body: NDArray[np.bool_], classes: 
     return matter
 
 
-def is_occupied(hits: NDArray[np.integer], free_m: NDArray[np.floating], matter: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Return (V,) bool: which voxels have more hits per metre of free path than the threshold of their matter.
+def is_occupied(
+    hits: NDArray[np.integer], free_m: NDArray[np.floating], matter: NDArray[np.int8]
+) -> NDArray[np.bool_]:
+    """Return (V,) bool: which voxels have more hits per metre of free path than the threshold of
+    their matter.
 
     Args:
         hits: (V,) number of points in each voxel.
@@ -93,7 +104,8 @@ def probability(
     spec: GridSpec,
     step_m: float,
 ) -> NDArray[np.float32]:
-    """Return (V,) the calibrated probability that each voxel is occupied; `UNKNOWN` without hits and free path.
+    """Return (V,) the calibrated probability that each voxel is occupied; `UNKNOWN` without hits
+    and free path.
 
     Args:
         hits: (V,) number of points in each voxel.
@@ -106,7 +118,9 @@ def probability(
     posterior = np.empty(len(hits), np.float32)
     for begin in range(0, len(hits), _BLOCK):
         part = slice(begin, begin + _BLOCK)
-        posterior[part] = _probability(hits[part], free_m[part], matter[part], in_body[part], spec, step_m)
+        posterior[part] = _probability(
+            hits[part], free_m[part], matter[part], in_body[part], spec, step_m
+        )
     return posterior
 
 
@@ -120,7 +134,9 @@ def _probability(
 ) -> NDArray[np.floating]:
     finer = math.log2(0.4 / min(max(float(np.cbrt(_volume(spec))), _SMALLEST_M), _LARGEST_M))
     samples = np.log(np.maximum(free_m / step_m, 1.0))
-    score = np.where(in_body, _FREE_IN_BODY[0] + _FREE_IN_BODY[1] * samples, _FREE[0] + _FREE[1] * samples)
+    score = np.where(
+        in_body, _FREE_IN_BODY[0] + _FREE_IN_BODY[1] * samples, _FREE[0] + _FREE[1] * samples
+    )
     hit = hits > 0
     offset, slope = (_HIT[:, 0] + finer * (_HIT[:, 1] - _HIT[:, 0]))[matter[hit]].T
     ratio = np.log((hits[hit] + 0.5) / (_PER_M[matter[hit]] * free_m[hit] + 0.5))
@@ -137,12 +153,15 @@ def _volume(spec: GridSpec) -> float:
 
 @dataclass(frozen=True, eq=False)
 class VoxelCertainty:
-    """The certainty of each voxel of a grid. The attributes are the fields of the grid: see `docs/format.md#evidence`.
+    """The certainty of each voxel of a grid.
+
+    The attributes are the fields of the grid: see `docs/format.md#evidence`.
 
     Attributes:
         occupied: (X, Y, Z) floating, probability that the voxel is occupied; 0.5 if it is unknown.
-        classes: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel, then by label: the probability of each class
-            if the voxel is occupied, in 1/65535, in the column `votes`; only non-zero ones.
+        classes: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel,
+            then by label: the probability of each class if the voxel is occupied, in 1/65535, in
+            the column `votes`; only non-zero ones.
         flags: (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`.
         views: (X, Y, Z) uint16, number of scans that saw the voxel.
 
@@ -158,21 +177,27 @@ class VoxelCertainty:
     def __post_init__(self) -> None:
         for name, array in (("flags", self.flags), ("views", self.views)):
             if array.shape != self.occupied.shape:
-                raise FormatError(f"evidence {name}", expected=f"shape {self.occupied.shape}", found=str(array.shape))
+                raise FormatError(
+                    f"evidence {name}",
+                    expected=f"shape {self.occupied.shape}",
+                    found=str(array.shape),
+                )
 
 
 def class_shares(votes: NDArray[Any], classes: ClassTable) -> NDArray[Any]:
-    """Return the probability of each class of the voxels with votes, if they are occupied: its share of the votes.
+    """Return the probability of each class of the voxels with votes, if they are occupied: its
+    share of the votes.
 
     Shares are rounded down, so the sum of a voxel is at most 1.
 
     Args:
-        votes: (M,) structured, with `voxel`, `label` (never 0) and `votes`, as in `Votes.occupied`, in any order. Rows of the same voxel
-            and class are summed.
+        votes: (M,) structured, with `voxel`, `label` (never 0) and `votes`, as in `Votes.occupied`,
+            in any order. Rows of the same voxel and class are summed.
         classes: class table of the labels.
 
     Returns:
-        (N,) `VoxelCertainty.classes`: `field_files.VOTES_DTYPE`, or `field_files.WIDE_VOTES_DTYPE` if class ids do not fit 8 bits.
+        (N,) `VoxelCertainty.classes`: `field_files.VOTES_DTYPE`, or `field_files.WIDE_VOTES_DTYPE`
+        if class ids do not fit 8 bits.
     """
     pairs, place = np.unique(
         votes["voxel"].astype(np.int64) * classes.num_channels + votes["label"], return_inverse=True
@@ -181,7 +206,8 @@ def class_shares(votes: NDArray[Any], classes: ClassTable) -> NDArray[Any]:
     of_pair = np.bincount(place, votes["votes"], len(pairs))
     of_voxel = np.bincount(voxel, of_pair)
     shares = np.zeros(
-        len(pairs), field_files.VOTES_DTYPE if classes.dtype == np.uint8 else field_files.WIDE_VOTES_DTYPE
+        len(pairs),
+        field_files.VOTES_DTYPE if classes.dtype == np.uint8 else field_files.WIDE_VOTES_DTYPE,
     )
     shares["voxel"], shares["label"] = voxel, label
     shares["votes"] = np.floor(of_pair / of_voxel[voxel] * layout.CERTAIN)

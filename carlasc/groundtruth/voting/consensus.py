@@ -1,9 +1,11 @@
-"""Consensus: the class of each voxel from scans with wrong labels, whose errors are estimated where scans disagree.
+"""Consensus: the class of each voxel from scans with wrong labels, whose errors are estimated where
+scans disagree.
 
-In a voxel with twenty scans, the majority decides. Many voxels have one or two hits, and a single wrong label decides them. Dawid and Skene
-(1979) estimate the confusion of classes from voters that judge the same object. Here, scans that see the same voxel give the confusion. Where few
-scans vote, the classes of the neighbours give a prior. Both have an effect only as far as labels are wrong: if all scans agree, each voxel
-keeps the class with most votes.
+In a voxel with twenty scans, the majority decides. Many voxels have one or two hits, and a single
+wrong label decides them. Dawid and Skene (1979) estimate the confusion of classes from voters that
+judge the same object. Here, scans that see the same voxel give the confusion. Where few scans vote,
+the classes of the neighbours give a prior. Both have an effect only as far as labels are wrong: if
+all scans agree, each voxel keeps the class with most votes.
 """
 
 from __future__ import annotations
@@ -59,8 +61,9 @@ class ClassConsensus:
 
     Attributes:
         labels: (V,) class of each voxel; 0 without votes.
-        shares: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel, then by label: the probability of each class if the
-            voxel is occupied, as `VoxelCertainty.classes` has them.
+        shares: (M,) `field_files.VOTES_DTYPE` or `field_files.WIDE_VOTES_DTYPE`, sorted by voxel,
+            then by label: the probability of each class if the voxel is occupied, as
+            `VoxelCertainty.classes` has them.
         wrong: estimated share of wrong votes.
     """
 
@@ -73,7 +76,8 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     """Return the class of each voxel from the votes of all scans.
 
     Args:
-        votes: (M,) structured, as `Votes.occupied`: `voxel`, `label`, `votes`, `voters` and `sure`, sorted by voxel, then by label.
+        votes: (M,) structured, as `Votes.occupied`: `voxel`, `label`, `votes`, `voters` and `sure`,
+            sorted by voxel, then by label.
         spec: the grid.
         classes: class table of the labels.
     """
@@ -87,15 +91,20 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
     voxels = votes["voxel"][begins[:-1]]
     rows = np.full(spec.num_voxels, -1, np.int32)
     rows[voxels] = np.arange(len(voxels))
-    # Errors of the points of one scan are correlated, so each scan has one vote, which is split among its classes.
-    scans = np.maximum.reduceat(votes["voters"], begins[:-1]) / np.add.reduceat(votes["votes"], begins[:-1])
+    # Errors of the points of one scan are correlated, so each scan has one vote, which is split
+    # among its classes.
+    scans = np.maximum.reduceat(votes["voters"], begins[:-1]) / np.add.reduceat(
+        votes["votes"], begins[:-1]
+    )
     weight = votes["sure"] * np.repeat(scans, np.diff(begins))
     cast = _Cast(voxels, begins, own, weight, rows, np.array(spec.size))
 
     confusion, frequency = np.zeros((len(present), len(present))), np.zeros(len(present))
     _compare(cast, confusion, frequency)
     compared = float(confusion.sum())
-    wrong = max(1 - float(np.trace(confusion)) / compared, _LEAST_WRONG) if compared else _LEAST_WRONG
+    wrong = (
+        max(1 - float(np.trace(confusion)) / compared, _LEAST_WRONG) if compared else _LEAST_WRONG
+    )
     usual = np.full_like(confusion, wrong / max(len(present) - 1, 1))
     np.fill_diagonal(usual, 1 - wrong)
     confusion += _SMOOTHING * usual
@@ -122,16 +131,22 @@ def agree(votes: NDArray[Any], spec: GridSpec, classes: ClassTable) -> ClassCons
 def _needed(confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (K,) the number of votes for one class alone with which neighbours are not needed."""
     gain = np.log(np.diag(confusion)) - np.log(confusion)  # (other class, voted class)
-    odds = np.log(_SURE / (1 - _SURE)) + np.log((frequency[:, None] + _LEAST_PRIOR) / (frequency + _LEAST_PRIOR))
+    odds = np.log(_SURE / (1 - _SURE)) + np.log(
+        (frequency[:, None] + _LEAST_PRIOR) / (frequency + _LEAST_PRIOR)
+    )
     needed = np.where(
-        gain > 0, odds / np.maximum(gain, 1e-9), np.where(np.eye(len(gain), dtype=np.bool_), -np.inf, np.inf)
+        gain > 0,
+        odds / np.maximum(gain, 1e-9),
+        np.where(np.eye(len(gain), dtype=np.bool_), -np.inf, np.inf),
     )
     return np.asarray(needed.max(axis=0), np.float64)
 
 
 @jit
 def _neighbour(cast: _Cast, i: int, x: int, y: int, z: int) -> int:
-    """Return the index of the voxel at an offset of x, y and z voxels from voxel i; -1 if it is outside of the grid or has no votes."""
+    """Return the index of the voxel at an offset of x, y and z voxels from voxel i; -1 if it is
+    outside of the grid or has no votes.
+    """
     voxel, size = cast.voxels[i], cast.size
     a = voxel // (size[1] * size[2]) + x
     b = voxel // size[2] % size[1] + y
@@ -143,7 +158,9 @@ def _neighbour(cast: _Cast, i: int, x: int, y: int, z: int) -> int:
 
 @cached
 def _compare(cast: _Cast, confusion: NDArray[np.float64], frequency: NDArray[np.float64]) -> None:
-    """Count votes in voxels among neighbours of their class: `confusion[a, b]`: votes for b in voxels of a. `frequency` counts all voxels."""
+    """Count votes in voxels among neighbours of their class: `confusion[a, b]`: votes for b in
+    voxels of a. `frequency` counts all voxels.
+    """
     voxels, begins, own, weight = cast.voxels, cast.begins, cast.own, cast.weight
     most = np.empty(len(voxels), np.int64)
     for i in range(len(voxels)):
@@ -175,7 +192,8 @@ def _find_shares(
     place: NDArray[np.int64],
     shares: NDArray[np.float32],
 ) -> None:
-    """Find the shares of classes: the probabilities from the votes, and from neighbours if these are uncertain, then the mixture.
+    """Find the shares of classes: the probabilities from the votes, and from neighbours if these
+    are uncertain, then the mixture.
 
     Args:
         cast: the votes.
@@ -185,7 +203,8 @@ def _find_shares(
         shares: (D, K) output.
     """
     kinds, few = len(frequency), np.log(confusion)
-    # Many votes for two classes are of two objects in the voxel, so their confusion is made symmetric.
+    # Many votes for two classes are of two objects in the voxel, so their confusion is made
+    # symmetric.
     many = (few + few.T) / 2
     doubtful, unsure = np.empty(len(shares), np.int64), 0
     for i in range(len(cast.voxels)):
@@ -242,7 +261,10 @@ def _neighbour_prior(
     shares: NDArray[np.float32],
     prior: NDArray[np.float64],
 ) -> None:
-    """Write the prior of each class from the neighbours of a voxel. Near neighbours, and those with many votes, have more weight."""
+    """Write the prior of each class from the neighbours of a voxel.
+
+    Near neighbours, and those with many votes, have more weight.
+    """
     begins, own, weight = cast.begins, cast.own, cast.weight
     total = 0.1
     prior[:] = 0.1 * frequency
@@ -270,7 +292,9 @@ def _mix_shares(
     likeliest: NDArray[np.float64],
     left: NDArray[np.float64],
 ) -> None:
-    """Replace the class probabilities of a voxel by the shares of classes that fit its votes: a voxel may hold two objects."""
+    """Replace the class probabilities of a voxel by the shares of classes that fit its votes: a
+    voxel may hold two objects.
+    """
     begins, own, weight = cast.begins, cast.own, cast.weight
     total = weight[begins[i] : begins[i + 1]].sum()
     likeliest[:] = shares

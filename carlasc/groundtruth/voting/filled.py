@@ -1,4 +1,7 @@
-"""The box around the points in each voxel. A pole, a roof or a kerb hides the space behind this box, not behind its whole voxels."""
+"""The box around the points in each voxel.
+
+A pole, a roof or a kerb hides the space behind this box, not behind its whole voxels.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +16,26 @@ STEPS = 256  # number of steps of a box along an edge of a voxel
 
 
 def no_boxes(num_voxels: int) -> NDArray[np.uint8]:
-    """Return (V, 6) uint8: the boxes of voxels without points, in which first x, y, z are greater than last x, y, z."""
+    """Return (V, 6) uint8: the boxes of voxels without points, in which first x, y, z are greater
+    than last x, y, z.
+    """
     return np.tile(np.array([255, 255, 255, 0, 0, 0], np.uint8), (num_voxels, 1))
 
 
 @cached
-def widen_boxes(cast: Voters, cells: Cells, region: int, regions: NDArray[np.uint16], boxes: NDArray[np.uint8]) -> None:
-    """Widen the boxes of Cartesian voxels by the points of an observation that vote for their classes.
+def widen_boxes(
+    cast: Voters, cells: Cells, region: int, regions: NDArray[np.uint16], boxes: NDArray[np.uint8]
+) -> None:
+    """Widen the boxes of Cartesian voxels by the points of an observation that vote for their
+    classes.
 
     Args:
         cast: the observation.
         cells: the cells of the grid.
         region: region in which points vote, or ANYWHERE.
         regions: (V + 1,) region of each voxel; empty if the grid has none.
-        boxes: (V, 6) uint8; widened: first and last x, y, z in 1/256 of a voxel, from its lower corner.
+        boxes: (V, 6) uint8; widened: first and last x, y, z in 1/256 of a voxel, from its lower
+            corner.
     """
     points, labels, hits, _, _, poses, ends = cast
     scaled, begin = np.empty(3), 0

@@ -1,8 +1,9 @@
-"""The compiled loops of voting: they add the votes of one observation, and collect the counted votes.
+"""The compiled loops of voting: they add the votes of one observation, and collect the counted
+votes.
 
-Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the voxels of their samples. Where rounding
-could change the voxel, the exact rule finds it. Votes for free space are stored densely, votes for other classes as a linked list of candidates
-per voxel.
+Rays are processed in blocks. The vectorised code of rays.py clips them to the grid and finds the
+voxels of their samples. Where rounding could change the voxel, the exact rule finds it. Votes for
+free space are stored densely, votes for other classes as a linked list of candidates per voxel.
 """
 
 from __future__ import annotations
@@ -53,7 +54,9 @@ CANDIDATE_DTYPE = np.dtype(
     ],
     align=True,
 )
-"""A candidate class of a voxel: its votes, its last voter, its number of voters, the summed doubt of its votes, and the next candidate."""
+"""A candidate class of a voxel: its votes, its last voter, its number of voters, the summed doubt
+of its votes, and the next candidate.
+"""
 
 
 class Tally(NamedTuple):
@@ -62,13 +65,17 @@ class Tally(NamedTuple):
     Attributes:
         once: whether an observation has at most one vote per voxel and class, free space included.
         free: (V + 1,) votes for free space; the last element counts samples outside the grid.
-        passed: (V + 1,) uint8, 1 for voxels that the current observation saw free; all 0 between observations. Empty if every sample counts.
+        passed: (V + 1,) uint8, 1 for voxels that the current observation saw free; all 0 between
+            observations. Empty if every sample counts.
         heads: (V,) int32, index of the first candidate of each voxel, or NONE.
         candidates: (C,) CANDIDATE_DTYPE, the candidates of all voxels.
         used: (1,) int64, number of candidates in use.
-        regions: (V + 1,) uint16, region of each voxel, and OUTSIDE for the last element; empty if the grid has no regions.
-        views: (V + 1,) uint16, number of observations that saw each voxel; empty if they are not counted.
-        viewers: (V + 1,) int32, the last observation that saw each voxel, or NONE; empty if views are not counted.
+        regions: (V + 1,) uint16, region of each voxel, and OUTSIDE for the last element; empty if
+            the grid has no regions.
+        views: (V + 1,) uint16, number of observations that saw each voxel; empty if they are not
+            counted.
+        viewers: (V + 1,) int32, the last observation that saw each voxel, or NONE; empty if views
+            are not counted.
     """
 
     once: bool
@@ -86,11 +93,13 @@ class Voters(NamedTuple):
     """The voters of one observation: its points, labels and poses.
 
     Attributes:
-        points: (3 N,) float32, metres, x, y, z of each point from the origin of its ray, on the axes of the sensor.
+        points: (3 N,) float32, metres, x, y, z of each point from the origin of its ray, on the
+            axes of the sensor.
         labels: (N,) uint16; points labelled 0 and their rays do not vote.
         hits: (N,) bool, points that vote for their class; empty: all.
         sure: (N,) float32, probability of these classes; empty: 1.
-        weights: (N,) uint8, votes of each point and of each sample of its ray; empty: 1, as with `Tally.once`.
+        weights: (N,) uint8, votes of each point and of each sample of its ray; empty: 1, as with
+            `Tally.once`.
         poses: (K, 12) grid_T_place of the origins of rays; each one is a voter.
         ends: (K,) index after the last point of each origin.
     """
@@ -127,14 +136,18 @@ def vote_occupied(
     region: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of the points of a block for their classes, in the voxels of a region; `hits` chooses points, unless it is empty."""
+    """Add the votes of the points of a block for their classes, in the voxels of a region; `hits`
+    chooses points, unless it is empty.
+    """
     entry, last, label = 0, NONE, np.uint16(0)
     for i in range(len(labels)):
         if rays.state[i] == DROPPED or (len(hits) and not hits[i]):
             continue
         voxel = voxels[i]
         if voxel == DOUBTFUL or rays.state[i] == UNSURE:
-            _, voxel = sample_voxel(points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells)
+            _, voxel = sample_voxel(
+                points[3 * i], points[3 * i + 1], points[3 * i + 2], 0.0, 0.0, pose, cells
+            )
         if voxel < len(tally.heads) and (region == ANYWHERE or tally.regions[voxel] == region):
             weight = int(weights[i]) if len(weights) else 1
             if voxel != last or labels[i] != label:
@@ -189,7 +202,8 @@ def vote_free(
 ) -> None:
     """Add the votes of the free samples of a block, which lie between the sensor and the points.
 
-    If each sample counts, those in the region `counted` are added; otherwise all are marked in `passed`. Views count in `region`.
+    If each sample counts, those in the region `counted` are added; otherwise all are marked in
+    `passed`. Views count in `region`.
     """
     voxels = np.empty(CHUNK, np.int32)
     for i in range(len(labels)):
@@ -202,7 +216,8 @@ def vote_free(
         x, y, z, dx, dy, dz = rays.x[i], rays.y[i], rays.z[i], rays.dx[i], rays.dy[i], rays.dz[i]
         step, last = rays.first[i], rays.last[i]
         while step <= last:
-            # These loops are inline: in a function, Numba would count a reference to the array at every call.
+            # These loops are inline: in a function, Numba would count a reference to the array at
+            # every call.
             lowest = np.int32(0)
             if view.cylindrical:
                 for j in range(CHUNK):
@@ -219,7 +234,9 @@ def vote_free(
                 for j in range(number):
                     if voxels[j] == DOUBTFUL:
                         point = points[3 * i], points[3 * i + 1], points[3 * i + 2]
-                        voxels[j] = sample_voxel(point[0], point[1], point[2], step + j, free_step_m, pose, cells)[1]
+                        voxels[j] = sample_voxel(
+                            point[0], point[1], point[2], step + j, free_step_m, pose, cells
+                        )[1]
             if tally.once:
                 for j in range(number):
                     tally.passed[np.uint32(voxels[j])] = 1
@@ -248,17 +265,22 @@ def vote_free_by_rule(
     region: int,
     tally: Tally,
 ) -> None:
-    """Add the votes of the free samples of one ray by the exact rule, clipped to the grid with a wide margin."""
+    """Add the votes of the free samples of one ray by the exact rule, clipped to the grid with a
+    wide margin.
+    """
     x, y, z = point
     norm, ux, uy, uz = unit_ray(x, y, z)
     starts = transform(view.pose, x, y, z)
     units = transform(view.pose, ux, uy, uz)
-    # Bound on the rounding error, in cells or metres. It grows with the distance and is below MARGIN within `reach`.
+    # Bound on the rounding error, in cells or metres. It grows with the distance and is below
+    # MARGIN within `reach`.
     slack = 1.0 + MARGIN * norm / view.reach if view.reach > 0.0 else math.inf
     step, last = 1.0, math.inf
     for axis in range(3):
         stride = (units[axis] - view.pose[4 * axis + 3]) * free_step_m
-        step, last = narrow(step, last, starts[axis], stride, view.low[axis] - slack, view.high[axis] + slack)
+        step, last = narrow(
+            step, last, starts[axis], stride, view.low[axis] - slack, view.high[axis] + slack
+        )
     step = np.floor(step)
     kept = step < 2.0**52  # above it, step + 1 may be equal to step
     while kept and step <= last + 1.0:
@@ -290,7 +312,8 @@ def vote(
         voter: number of the first voter.
         hit_region: region in which points vote, or ANYWHERE.
         free_region: region in which rays vote, ANYWHERE, or NOT_AT_ALL.
-        apart: (A,) voxels outside of `free_region`, if they are few: their votes are counted and then restored, which is faster. Or empty.
+        apart: (A,) voxels outside of `free_region`, if they are few: their votes are counted and
+            then restored, which is faster. Or empty.
         tally: the votes so far, with room for N more candidates.
     """
     points, labels, hits, sure, weights, poses, ends = cast
@@ -307,10 +330,25 @@ def vote(
             place_points(rays, view, found[: end - begin])
             own, likely, count = hits[begin:end], sure[begin:end], weights[begin:end]
             now = voter + place
-            vote_occupied(corner, block, own, likely, count, rays, found, pose, cells, now, hit_region, tally)
+            vote_occupied(
+                corner, block, own, likely, count, rays, found, pose, cells, now, hit_region, tally
+            )
             if free_region != NOT_AT_ALL:
                 counted = ANYWHERE if len(apart) else free_region
-                vote_free(corner, block, count, rays, pose, view, cells, free_step_m, now, free_region, counted, tally)
+                vote_free(
+                    corner,
+                    block,
+                    count,
+                    rays,
+                    pose,
+                    view,
+                    cells,
+                    free_step_m,
+                    now,
+                    free_region,
+                    counted,
+                    tally,
+                )
             begin = end
         if tally.once:
             count_passed(free_region, tally)
@@ -357,10 +395,12 @@ def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[An
 
 @cached
 def elect(rows: NDArray[Any], labels: NDArray[Any], counts: NDArray[Any]) -> None:
-    """Find the class with most votes in each voxel, where ties go to the lowest id, and the sum of its votes.
+    """Find the class with most votes in each voxel, where ties go to the lowest id, and the sum of
+    its votes.
 
     Args:
-        rows: (M,) `voxel`, `label`, `votes` of the classes other than 0, sorted by voxel, then by label.
+        rows: (M,) `voxel`, `label`, `votes` of the classes other than 0, sorted by voxel, then by
+            label.
         labels: (V,) zeros; output, the classes.
         counts: (V,) votes of class 0; output, the sums.
     """
@@ -384,13 +424,18 @@ def interleave(free: NDArray[Any], rows: NDArray[Any], votes: NDArray[Any], most
     Args:
         free: (V,) votes of class 0.
         rows: (M,) `voxel`, `label`, `votes` of the other classes, in this order.
-        votes: output, `voxel`, `label`, `votes`, with a row for each element of `free` that is not 0 and for each of `rows`.
+        votes: output, `voxel`, `label`, `votes`, with a row for each element of `free` that is not
+            0 and for each of `rows`.
         most: numbers of votes above it are written as `most`.
     """
     row, end = 0, 0
     for voxel in range(len(free)):
         if free[voxel]:
-            votes[end].voxel, votes[end].label, votes[end].votes = voxel, 0, min(np.int64(free[voxel]), most)
+            votes[end].voxel, votes[end].label, votes[end].votes = (
+                voxel,
+                0,
+                min(np.int64(free[voxel]), most),
+            )
             end += 1
         while row < len(rows) and rows[row].voxel == voxel:
             votes[end].voxel, votes[end].label = voxel, rows[row].label

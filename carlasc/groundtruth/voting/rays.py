@@ -1,12 +1,16 @@
-"""The exact rule that places the samples of a ray in voxels, and its fast twin, which always gives the same voxel.
+"""The exact rule that places the samples of a ray in voxels, and its fast twin, which always gives
+the same voxel.
 
-`sample_voxel` is the rule, bit for bit, one sample at a time (see the format page, `docs/format.md#votes`): norm and unit ray are float32, as
-the points are; distances, differences and the transform are float64; the cell is that of `carlasc.core.cells.find_voxel`.
+`sample_voxel` is the rule, bit for bit, one sample at a time (see the format page,
+`docs/format.md#votes`): norm and unit ray are float32, as the points are; distances, differences
+and the transform are float64; the cell is that of `carlasc.core.cells.find_voxel`.
 
-The twin finds the voxels of many samples at once, in vectorised code. Rays are clipped to the box of the grid. Samples are computed in working
-coordinates: cells from the lower corner of the grid (for a cylindrical grid: metres in x and y, cells in z). There a sample is
-`start - step * stride`, which differs from the rule by rounding only, by far less than `MARGIN` cells. A sample that is farther than this from
-the edges of its cell is in the same voxel as by the rule. The few others, some in a million, are DOUBTFUL, and the rule finds their voxels.
+The twin finds the voxels of many samples at once, in vectorised code. Rays are clipped to the box
+of the grid. Samples are computed in working coordinates: cells from the lower corner of the grid
+(for a cylindrical grid: metres in x and y, cells in z). There a sample is `start - step * stride`,
+which differs from the rule by rounding only, by far less than `MARGIN` cells. A sample that is
+farther than this from the edges of its cell is in the same voxel as by the rule. The few others,
+some in a million, are DOUBTFUL, and the rule finds their voxels.
 """
 
 from __future__ import annotations
@@ -38,8 +42,10 @@ UNSURE = 2.0  # the rule must find its samples: they are too far away, or one is
 
 CHUNK = 8  # number of samples of a ray that are processed at once: the width of a vector register
 MARGIN = 1e-7  # cells
-_ROUNDING = 2.0**-48  # bound on the relative error of a coordinate: 16 times the error of its dozen operations
-_NEAR_AXIS = 256.0  # azimuths are exact to the margin down to 1 / 256 of the radius at which cells are as wide as deep
+# bound on the relative error of a coordinate: 16 times the error of its dozen operations
+_ROUNDING = 2.0**-48
+# azimuths are exact to the margin down to 1 / 256 of the radius at which cells are as wide as deep
+_NEAR_AXIS = 256.0
 
 
 @inlined
@@ -51,7 +57,10 @@ def unit_ray(x: Real, y: Real, z: Real) -> tuple[Real, Real, Real, Real]:
 
 @inlined
 def before_sensor(x: Real, ux: Real) -> bool:
-    """Return whether a sample is kept: its x over the x of the unit ray is positive. Rays with x = 0 have no samples."""
+    """Return whether a sample is kept: its x over the x of the unit ray is positive.
+
+    Rays with x = 0 have no samples.
+    """
     return bool(x / ux > 0.0 and ux != 0.0)
 
 
@@ -59,7 +68,9 @@ def before_sensor(x: Real, ux: Real) -> bool:
 def sample_voxel(
     x: Real, y: Real, z: Real, step: float, free_step_m: float, pose: Pose, cells: Cells
 ) -> tuple[bool, int]:
-    """Return whether the sample `step` steps back from a point (0: the point itself) is kept, and its voxel."""
+    """Return whether the sample `step` steps back from a point (0: the point itself) is kept, and
+    its voxel.
+    """
     _, ux, uy, uz = unit_ray(x, y, z)
     back = step * free_step_m
     sx, sy, sz = np.float64(x) - ux * back, np.float64(y) - uy * back, np.float64(z) - uz * back
@@ -75,14 +86,16 @@ class GridView(NamedTuple):
     Attributes:
         cylindrical: whether the grid is cylindrical.
         pose: work_T_sensor: a scaled grid_T_sensor.
-        low: lower corner of the box that rays are clipped to, which is the grid enlarged by a margin.
+        low: lower corner of the box that rays are clipped to, which is the grid enlarged by a
+            margin.
         high: its upper corner.
         top: number of cells per axis.
         scale: cells per metre of radius, and per radian of azimuth.
         offset: cells from zero to the lower bound, of radius and azimuth.
         turn: cells of azimuth in a full circle.
         axis: smallest radius at which azimuths are exact to the margin, metres.
-        sure: greatest distance from the middle of a cell, in cells, at which a sample is certainly inside.
+        sure: greatest distance from the middle of a cell, in cells, at which a sample is certainly
+            inside.
         reach: distance of the farthest point for which these errors hold, metres.
     """
 
@@ -104,18 +117,30 @@ def view_from(pose: Pose, cells: Cells) -> GridView:
     """Return the view of a grid from a sensor at `pose` (grid_T_sensor)."""
     lower, upper, voxel, curved = cells.lower, cells.upper, cells.voxel_size, cells.cylindrical
     nx, ny, nz = float(cells.size[0]), float(cells.size[1]), float(cells.size[2])
-    # The published size of a cell is a float32 difference divided by n, so n cells may not end exactly at the upper bound.
-    ex, ey, ez = (upper[0] - lower[0]) / voxel[0], (upper[1] - lower[1]) / voxel[1], (upper[2] - lower[2]) / voxel[2]
-    margin = MARGIN + max(abs(ex - nx), abs(ey - ny), abs(ez - nz)) + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
+    # The published size of a cell is a float32 difference divided by n, so n cells may not end
+    # exactly at the upper bound.
+    ex, ey, ez = (
+        (upper[0] - lower[0]) / voxel[0],
+        (upper[1] - lower[1]) / voxel[1],
+        (upper[2] - lower[2]) / voxel[2],
+    )
+    margin = (
+        MARGIN
+        + max(abs(ex - nx), abs(ey - ny), abs(ez - nz))
+        + (AZIMUTH_ERROR / voxel[1] if curved else 0.0)
+    )
     low, high = (-MARGIN / 2, -MARGIN / 2), (max(ex, nx) + MARGIN / 2, max(ey, ny) + MARGIN / 2)
     sx, sy, sz = 1 / voxel[0], 1 / voxel[1], 1 / voxel[2]
     origin, finest = (lower[0], lower[1]), min(voxel[0], voxel[1], voxel[2])
     if curved:
         low, high = (-upper[0] - MARGIN, -upper[0] - MARGIN), (upper[0] + MARGIN, upper[0] + MARGIN)
         sx, sy, origin, finest = 1.0, 1.0, (0.0, 0.0), min(voxel[0], voxel[2])
-    # Rounding may take at most a quarter of the margin. This limits the distance of a point, and its nearness to the axis.
+    # Rounding may take at most a quarter of the margin. This limits the distance of a point, and
+    # its nearness to the axis.
     allowed = MARGIN / 4 * finest / (_NEAR_AXIS if curved else 1.0)
-    known = max(abs(pose[3]), abs(pose[7]), abs(pose[11])) + max(abs(lower[0]), abs(lower[1]), abs(lower[2]))
+    known = max(abs(pose[3]), abs(pose[7]), abs(pose[11])) + max(
+        abs(lower[0]), abs(lower[1]), abs(lower[2])
+    )
     known += max(abs(upper[0]), abs(upper[1]), abs(upper[2]))
     return GridView(
         curved,
@@ -161,15 +186,26 @@ class RayBlock(NamedTuple):
 @jit
 def empty_rays(n: int) -> RayBlock:
     """Return memory for a block of `n` rays."""
-    x, y, z, dx, dy, dz = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    x, y, z, dx, dy, dz = (
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+    )
     return RayBlock(x, y, z, dx, dy, dz, np.empty(n), np.empty(n), np.empty(n))
 
 
 @inlined
-def narrow(first: Real, last: Real, start: float, stride: Real, low: Real, high: Real) -> tuple[Real, Real]:
-    """Return the steps from `first` to `last` at which `start - step * stride` is between `low` and `high`.
+def narrow(
+    first: Real, last: Real, start: float, stride: Real, low: Real, high: Real
+) -> tuple[Real, Real]:
+    """Return the steps from `first` to `last` at which `start - step * stride` is between `low` and
+    `high`.
 
-    The range is empty if there is no such step. A coordinate that stays on a bound (0 / 0) does not change the range.
+    The range is empty if there is no such step. A coordinate that stays on a bound (0 / 0) does not
+    change the range.
     """
     inverse = 1.0 / stride
     a, b = (start - low) * inverse, (start - high) * inverse
@@ -179,9 +215,15 @@ def narrow(first: Real, last: Real, start: float, stride: Real, low: Real, high:
 
 @jit
 def clip(
-    points: NDArray[np.float32], labels: NDArray[np.uint16], free_step_m: float, view: GridView, rays: RayBlock
+    points: NDArray[np.float32],
+    labels: NDArray[np.uint16],
+    free_step_m: float,
+    view: GridView,
+    rays: RayBlock,
 ) -> None:
-    """Transform points (3 n,) with labels (n,) to working coordinates, and find the free samples inside the grid's box."""
+    """Transform points (3 n,) with labels (n,) to working coordinates, and find the free samples
+    inside the grid's box.
+    """
     low, high = view.low, view.high
     for i in range(len(labels)):
         x, y, z = points[3 * i], points[3 * i + 1], points[3 * i + 2]
@@ -191,7 +233,8 @@ def clip(
         px, py, pz = transform(view.pose, ux, uy, uz)
         dx, dy, dz = (px - ox) * free_step_m, (py - oy) * free_step_m, (pz - oz) * free_step_m
 
-        # Samples up to this step are in front of the sensor; this is uncertain for a sample that is almost at the sensor.
+        # Samples up to this step are in front of the sensor; this is uncertain for a sample that is
+        # almost at the sensor.
         length = (np.float64(x) / np.float64(ux)) / free_step_m
         whole = np.floor(length)
         slack = length * 1e-14 + 1e-12
@@ -210,7 +253,9 @@ def clip(
 
 @jit
 def place_points(rays: RayBlock, view: GridView, voxels: NDArray[np.int32]) -> None:
-    """Find the voxels of the points of a block: their index, the number of voxels for points outside the grid, or DOUBTFUL."""
+    """Find the voxels of the points of a block: their index, the number of voxels for points
+    outside the grid, or DOUBTFUL.
+    """
     if view.cylindrical:
         for i in range(len(voxels)):
             voxels[i] = place_cylindrical(rays.x[i], rays.y[i], rays.z[i], view)
@@ -221,13 +266,17 @@ def place_points(rays: RayBlock, view: GridView, voxels: NDArray[np.int32]) -> N
 
 @fused
 def place_cartesian(u: float, v: float, w: float, view: GridView) -> np.int32:
-    """Return the voxel of a sample given in cells: its index, the number of voxels for a sample outside the grid, or DOUBTFUL."""
+    """Return the voxel of a sample given in cells: its index, the number of voxels for a sample
+    outside the grid, or DOUBTFUL.
+    """
     return voxel_of(u, v, w, 0.0, view)
 
 
 @fused
 def place_cylindrical(x: float, y: float, w: float, view: GridView) -> np.int32:
-    """Return the voxel of a sample given in metres in x and y, and cells in z, as `place_cartesian` does."""
+    """Return the voxel of a sample given in metres in x and y, and cells in z, as `place_cartesian`
+    does.
+    """
     radius = np.sqrt(x * x + y * y)
     v = fast_azimuth(x, y) * view.scale[1] - view.offset[1]
     off = from_middle(v)
@@ -238,12 +287,21 @@ def place_cylindrical(x: float, y: float, w: float, view: GridView) -> np.int32:
 
 @fused
 def voxel_of(u: float, v: float, w: float, off: float, view: GridView) -> np.int32:
-    """Return the voxel of a sample given in cells; DOUBTFUL also if `off`, a distance from the middle of a cell, is too large."""
+    """Return the voxel of a sample given in cells; DOUBTFUL also if `off`, a distance from the
+    middle of a cell, is too large.
+    """
     i, j, k = np.floor(u), np.floor(v), np.floor(w)
     a, b, c = from_middle(u), from_middle(v), from_middle(w)
     a = a if a > b else b
     c = c if c > off else off
-    inside = (i >= 0.0) & (j >= 0.0) & (k >= 0.0) & (i < view.top[0]) & (j < view.top[1]) & (k < view.top[2])
+    inside = (
+        (i >= 0.0)
+        & (j >= 0.0)
+        & (k >= 0.0)
+        & (i < view.top[0])
+        & (j < view.top[1])
+        & (k < view.top[2])
+    )
     index = (i * view.top[1] + j) * view.top[2] + k
     index = index if inside else view.top[0] * view.top[1] * view.top[2]
     return np.int32(index if (a <= view.sure) & (c <= view.sure) else np.float64(DOUBTFUL))

@@ -1,4 +1,6 @@
-"""`audit`: compares grids with the scans that they belong to, and reports what is wrong with the grids."""
+"""`audit`: compares grids with the scans that they belong to, and reports what is wrong with the
+grids.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,14 @@ from carlasc.inspection.auditing.counting import OCCUPIED, FrameCounter
 from carlasc.inspection.auditing.geometry import judge_geometry
 from carlasc.inspection.auditing.judging import judge_contents
 from carlasc.inspection.auditing.matching import MatchedGrids, match_grids
-from carlasc.inspection.auditing.verdicts import AuditFailure, AuditResult, Stretches, Sums, Verdict, add
+from carlasc.inspection.auditing.verdicts import (
+    AuditFailure,
+    AuditResult,
+    Stretches,
+    Sums,
+    Verdict,
+    add,
+)
 from carlasc.metrics.pairs import Place
 from carlasc.motion.options import MotionOptions
 from carlasc.motion.tracks import MovingActors
@@ -42,9 +51,15 @@ _DRAWN = 50  # largest number of stretches to draw from: with more, neighbours a
 _SHOWN = 4  # number of frames in pictures
 _REACH = 30  # frames before and after a stretch in which actors matter
 _BLOCK = 400  # frames for which actors are found together
-_SUMS, _WORST, _KEY = "audit", "worst", "key"  # name of the files of sums, and of other entries in them
+# name of the files of sums, and of other entries in them
+_SUMS, _WORST, _KEY = (
+    "audit",
+    "worst",
+    "key",
+)
 
-_Row = tuple[str, int, int, int]  # a wrong frame: path, frame of the grid, frame of the scan, wrong voxels
+# a wrong frame: path, frame of the grid, frame of the scan, wrong voxels
+_Row = tuple[str, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -57,18 +72,36 @@ class _Stretch:
     scans: str  # digest
 
     def key(self) -> str:
-        """Return the name of the sums, which differs for other grids, other scans or another window."""
+        """Return the name of the sums, which differs for other grids, other scans or another
+        window.
+        """
         one, content = self.counter.matched, sha256()
         for number, _ in self.frames:
             with suppress(CarlascError, OSError):  # which is reported when the frame is counted
                 labels, _, known = one.read(number)
-                content.update(labels.tobytes() + (b"" if known is None else np.packbits(known).tobytes()))
-        about = [_VERSION, one.path, str(one.spec), one.spec.lower, one.spec.upper, self.frames, self.counter.window]
-        return sha256(json.dumps([about, self.scans, content.hexdigest()], default=str).encode()).hexdigest()
+                content.update(
+                    labels.tobytes() + (b"" if known is None else np.packbits(known).tobytes())
+                )
+        about = [
+            _VERSION,
+            one.path,
+            str(one.spec),
+            one.spec.lower,
+            one.spec.upper,
+            self.frames,
+            self.counter.window,
+        ]
+        return sha256(
+            json.dumps([about, self.scans, content.hexdigest()], default=str).encode()
+        ).hexdigest()
 
     def read(self) -> Sums | None:
         """Return the sums of another run or part."""
-        return None if self.writer is None else read_derived(self.writer, _SUMS, self.key(), _sums_from)
+        return (
+            None
+            if self.writer is None
+            else read_derived(self.writer, _SUMS, self.key(), _sums_from)
+        )
 
     def count(self) -> tuple[Sums, list[AuditFailure]]:
         """Count the frames, unless another run did; return those that cannot be read."""
@@ -97,7 +130,10 @@ class _Stretch:
 
 
 def _sums_from(data: bytes, where: str) -> tuple[Sums, str]:
-    with reading(where, "sums of an audit"), np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+    with (
+        reading(where, "sums of an audit"),
+        np.load(io.BytesIO(data), allow_pickle=False) as arrays,
+    ):
         return {name: arrays[name] for name in arrays.files if name != _KEY}, str(arrays[_KEY])
 
 
@@ -116,14 +152,18 @@ def audit(
     Nothing is written, except to `keep`. A frame that cannot be read is listed in `failures`.
 
     Args:
-        grids: anything that `evaluate` reads: a data set, the folder of a grid, or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or
-            CarlaOcc.
-        scans: a recording in CarlaSC's layout, with scans; poses, labels, boxes, instances and flow are used if they exist.
+        grids: anything that `evaluate` reads: a data set, the folder of a grid, or files of
+            SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc.
+        scans: a recording in CarlaSC's layout, with scans; poses, labels, boxes, instances and flow
+            are used if they exist.
         grid: name of the grids; None takes `evaluation`, or the only grid of a sequence.
-        made_from: first and last scan, relative to its frame, that a grid was made from; None if that is not known.
+        made_from: first and last scan, relative to its frame, that a grid was made from; None if
+            that is not known.
         frames: frames of the grids; None for all.
-        keep: folder for intermediate sums, so that an interrupted audit continues, and parts can be joined.
-        run: how the work is spread, with a callback for progress. A part needs `keep`; the last part gives the verdicts.
+        keep: folder for intermediate sums, so that an interrupted audit continues, and parts can be
+            joined.
+        run: how the work is spread, with a callback for progress. A part needs `keep`; the last
+            part gives the verdicts.
 
     Returns:
         The verdict of each check, with its number, interval and place.
@@ -135,15 +175,23 @@ def audit(
     """
     start = time.perf_counter()
     if made_from is not None and not made_from[0] <= 0 <= made_from[1]:
-        raise ArgumentError("made_from", expected="a range that contains 0, such as -30:30", found=str(made_from))
+        raise ArgumentError(
+            "made_from", expected="a range that contains 0, such as -30:30", found=str(made_from)
+        )
     if run.part.count > 1 and keep is None:
-        raise ArgumentError("part", expected="`keep`, a folder in which parts are joined", found="no folder")
+        raise ArgumentError(
+            "part", expected="`keep`, a folder in which parts are joined", found="no folder"
+        )
     matched = match_grids(grids, scans, grid, frames)
     notes = [f"{one.path}: {note}" for one in matched for note in one.notes]
     stretches = list(chain.from_iterable(_stretches_of(one, made_from, keep) for one in matched))
     with one_pool(run) as spread:
         sums, worst, failures, is_whole = _count_all(stretches, spread, notes)
-    verdicts = {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in matched} if is_whole else {}
+    verdicts = (
+        {one.path: _judge(Stretches(sums[one.path]), one, made_from) for one in matched}
+        if is_whole
+        else {}
+    )
     return AuditResult(
         grids.location if isinstance(grids, Source) else str(grids),
         scans.location if isinstance(scans, Source) else str(scans),
@@ -158,53 +206,93 @@ def audit(
     )
 
 
-def voxels_of(result: AuditResult, path: str, number: int, frame: int) -> tuple[MatchedGrids, NDArray[np.uint8]]:
-    """Count a frame of an audit again: return its grids, and the states of its voxels (see `FrameCounter.add_frame`)."""
-    one = next(one for one in match_grids(result.grids, result.scans, result.grid, None) if one.path == path)
-    return one, FrameCounter(one, _actors_of(one, frame, frame, Run(workers=1), [])).add_frame({}, number, frame)
+def voxels_of(
+    result: AuditResult, path: str, number: int, frame: int
+) -> tuple[MatchedGrids, NDArray[np.uint8]]:
+    """Count a frame of an audit again: return its grids, and the states of its voxels (see
+    `FrameCounter.add_frame`).
+    """
+    one = next(
+        one
+        for one in match_grids(result.grids, result.scans, result.grid, None)
+        if one.path == path
+    )
+    return one, FrameCounter(one, _actors_of(one, frame, frame, Run(workers=1), [])).add_frame(
+        {}, number, frame
+    )
 
 
-def _judge(sums: Stretches, one: MatchedGrids, window: tuple[int, int] | None) -> tuple[Verdict, ...]:
+def _judge(
+    sums: Stretches, one: MatchedGrids, window: tuple[int, int] | None
+) -> tuple[Verdict, ...]:
     geometry = list(judge_geometry(sums, one))
     wrong = next((verdict.check for verdict in geometry if verdict.state == "fault"), "")
     return (*geometry, *judge_contents(sums, one, window, wrong))
 
 
-def _stretches_of(one: MatchedGrids, window: tuple[int, int] | None, keep: str | Path | None) -> Iterator[_Stretch]:
+def _stretches_of(
+    one: MatchedGrids, window: tuple[int, int] | None, keep: str | Path | None
+) -> Iterator[_Stretch]:
     """Yield the stretches of a sequence, without actors."""
     writer, digest, scans = None, "", one.scans.frames("points")
     if keep is not None:
         writer, digest = FolderSink(keep).sequence(one.path), scans_digest(one.scans, scans)
-        digest = derived_key(one.scans, scans, digest) if layout.POSES in one.scans.documents() else digest
+        digest = (
+            derived_key(one.scans, scans, digest)
+            if layout.POSES in one.scans.documents()
+            else digest
+        )
     size = int(np.clip(len(one.frames) // _STRETCHES, 1, _STRETCH))
     for first in range(0, len(one.frames), size):
-        yield _Stretch(FrameCounter(one, MovingActors(), window), one.frames[first : first + size], writer, digest)
+        yield _Stretch(
+            FrameCounter(one, MovingActors(), window),
+            one.frames[first : first + size],
+            writer,
+            digest,
+        )
 
 
 def _with_actors(stretches: Iterable[_Stretch], run: Run, notes: list[str]) -> Iterator[_Stretch]:
-    """Yield stretches with the moving actors near them. Actors are found for some hundred frames at a time, to bound memory."""
+    """Yield stretches with the moving actors near them.
+
+    Actors are found for some hundred frames at a time, to bound memory.
+    """
     known, actors = ("", -1), MovingActors()
     for stretch in stretches:
         if stretch.read() is None:
-            one, (first, last) = stretch.counter.matched, (stretch.frames[0][1], stretch.frames[-1][1])
+            one, (first, last) = (
+                stretch.counter.matched,
+                (stretch.frames[0][1], stretch.frames[-1][1]),
+            )
             block = first // _BLOCK
             if known != (one.path, block):
                 known = one.path, block
-                actors = _actors_of(one, block * _BLOCK, (block + 1) * _BLOCK + last - first, run, notes)
+                actors = _actors_of(
+                    one, block * _BLOCK, (block + 1) * _BLOCK + last - first, run, notes
+                )
             near = actors.between(first - _REACH, last + _REACH)
             yield replace(stretch, counter=replace(stretch.counter, actors=near))
         else:
             yield stretch
 
 
-def _actors_of(one: MatchedGrids, first: int, last: int, run: Run, notes: list[str]) -> MovingActors:
-    """Return the moving actors near some frames of a recording: by its fields, or without any by free space."""
+def _actors_of(
+    one: MatchedGrids, first: int, last: int, run: Run, notes: list[str]
+) -> MovingActors:
+    """Return the moving actors near some frames of a recording: by its fields, or without any by
+    free space.
+    """
     if layout.POSES not in one.scans.documents():
-        notes.append(f"{one.pair}: the scans have no poses.txt: moving actors and drift are not checked")
+        notes.append(
+            f"{one.pair}: the scans have no poses.txt: moving actors and drift are not checked"
+        )
         return MovingActors()
     frames = one.scans.frames("points")
     far = frames[(frames < first - 2 * _REACH) | (frames > last + 2 * _REACH)].tolist()
-    scans, named = WithoutScans(one.scans, far), [n for n in ScanFeed(one.scans, FromScans()).motion if n != "evidence"]
+    scans, named = (
+        WithoutScans(one.scans, far),
+        [n for n in ScanFeed(one.scans, FromScans()).motion if n != "evidence"],
+    )
     # if a field names actors, evidence would only add doubtful ones
     observe = FromScans(motion=MotionOptions(named[0] if named else "evidence"))  # type: ignore[arg-type]
     try:
@@ -217,7 +305,9 @@ def _actors_of(one: MatchedGrids, first: int, last: int, run: Run, notes: list[s
 def _count_all(
     stretches: list[_Stretch], run: Run, notes: list[str]
 ) -> tuple[dict[str, list[Sums]], list[_Row], list[AuditFailure], bool]:
-    """Count the stretches of this part, and read those of others: sums by sequence, worst frames, failures, and whether all exist."""
+    """Count the stretches of this part, and read those of others: sums by sequence, worst frames,
+    failures, and whether all exist.
+    """
     own = run.part.take(range(len(stretches)))
     steps = StepCounter(run.progress, sum(len(stretch.frames) for stretch in stretches))
     steps(0)
@@ -233,7 +323,9 @@ def _count_all(
             failures += failed
             for name, counts in (found or {}).items():
                 if name == _WORST:
-                    worst += [(path, number, frame, wrong) for number, frame, wrong in counts.tolist()]
+                    worst += [
+                        (path, number, frame, wrong) for number, frame, wrong in counts.tolist()
+                    ]
                 else:
                     add(sums[path][rows[path] * len(sums[path]) // lengths[path]], name, counts)
             rows[path] += 1

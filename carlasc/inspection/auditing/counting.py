@@ -1,4 +1,6 @@
-"""Counting frames: the counts of a frame are added to sums, so that memory does not grow with the number of frames."""
+"""Counting frames: the counts of a frame are added to sums, so that memory does not grow with the
+number of frames.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,29 @@ from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 
 HEIGHTS = 4  # shares are also computed for this number of layers of equal height
 MAX_ID = 511  # larger ids of classes count as this one
-_SPREAD, _RAYS = 20_000, 8000  # points of a frame that are thinned evenly in space, and rays that are followed
-_LEAST, _MOST, _IN_ALL = 500, 2500, 250_000  # points that are kept of these in a frame, and in all frames
-_TIMES = (*range(-20, -1, 2), *range(2, 21, 2))  # frames before and after, in which the paths of actors are checked
+# points of a frame that are thinned evenly in space, and rays that are followed
+_SPREAD, _RAYS = (
+    20_000,
+    8000,
+)
+# points that are kept of these in a frame, and in all frames
+_LEAST, _MOST, _IN_ALL = (
+    500,
+    2500,
+    250_000,
+)
+# frames before and after, in which the paths of actors are checked
+_TIMES = (
+    *range(-20, -1, 2),
+    *range(2, 21, 2),
+)
 _APART = 20  # frames between the scans that show a drift
 _CLEAR_RAYS = 3  # an occupied voxel that this number of rays cross is a phantom
-_AROUND_M = 0.6  # an actor may be larger than its body by this, because bodies are measured on a few sides only
-_INSET_M = 0.2  # the path of an actor is narrower than its body by this, and as far above the ground
+# an actor may be larger than its body by this, because bodies are measured on a few sides only
+_AROUND_M = 0.6
+_INSET_M = (
+    0.2  # the path of an actor is narrower than its body by this, and as far above the ground
+)
 _MEMBERS = 5  # an actor counts if it is seen in this number of voxels
 _KEPT = 14  # number of scans kept in memory for later frames
 FREE, OCCUPIED, PHANTOM, TRAIL, FALSE_FREE = range(5)
@@ -37,7 +55,9 @@ FREE, OCCUPIED, PHANTOM, TRAIL, FALSE_FREE = range(5)
 
 @dataclass
 class _Frame:
-    """A grid and its scan; `voxels` is -1 for points outside of the grid, and for points that are no returns."""
+    """A grid and its scan; `voxels` is -1 for points outside of the grid, and for points that are
+    no returns.
+    """
 
     number: int
     scan: Scan
@@ -69,7 +89,8 @@ class FrameCounter:
     Attributes:
         matched: the grids and their scans.
         actors: the moving actors of the recording.
-        window: first and last scan that the grids were made from, relative to the frame; None if that is not known.
+        window: first and last scan that the grids were made from, relative to the frame; None if
+            that is not known.
     """
 
     matched: MatchedGrids
@@ -129,7 +150,9 @@ class FrameCounter:
         return families(self.matched.spec)
 
     def _fits(self, seen: _Frame) -> NDArray[np.int64]:
-        """Return (H, 2) points, and those in occupied voxels, under all corrections of all families."""
+        """Return (H, 2) points, and those in occupied voxels, under all corrections of all
+        families.
+        """
         drift, lag = self._families[-2:]
         own = self._fit_points(seen.number)
         counts = [self._fit(seen, family.warps, own) for family in self._families[:-2]]
@@ -138,11 +161,18 @@ class FrameCounter:
             if (placed := self._standing(seen.number, other)) is not None:
                 later_s = self._second(other) - self._second(seen.number)
                 drifts += self._fit(seen, drift.warps, thin(placed, self._most), later_s)
-        lags = [self._fit(seen, lag.warps[:1], self._fit_points(seen.number + int(value))) for value in lag.values]
+        lags = [
+            self._fit(seen, lag.warps[:1], self._fit_points(seen.number + int(value)))
+            for value in lag.values
+        ]
         return np.concatenate([*counts, drifts, *lags])
 
     def _fit(
-        self, seen: _Frame, warps: NDArray[np.float64], points: NDArray[np.float64], later_s: float = 0.0
+        self,
+        seen: _Frame,
+        warps: NDArray[np.float64],
+        points: NDArray[np.float64],
+        later_s: float = 0.0,
     ) -> NDArray[np.int64]:
         timed = np.column_stack([points, np.full(len(points), later_s)])
         found = count_occupied_under(timed, warps, self.matched.spec, seen.occupied)
@@ -153,12 +183,20 @@ class FrameCounter:
         return int(np.clip(_IN_ALL // len(self.matched.frames), _LEAST, _MOST))
 
     def _fit_points(self, frame: int) -> NDArray[np.float64]:
-        """Return (N, 3) points of a scan inside the grid, thinned evenly in space; none if it cannot be read."""
+        """Return (N, 3) points of a scan inside the grid, thinned evenly in space; none if it
+        cannot be read.
+        """
         if frame not in self._spread:
             spec, edge = self.matched.spec, float(self.matched.spec.voxel_size[[0, 2]].min()) / 2
             scan = self._other(frame)
-            some = np.empty((0, 3), np.float32) if scan is None else thin(scan.points[_are_returns(scan)], _SPREAD)
-            points = self.matched.place(some[first_of_cells(np.floor(some / edge).astype(np.int64))])
+            some = (
+                np.empty((0, 3), np.float32)
+                if scan is None
+                else thin(scan.points[_are_returns(scan)], _SPREAD)
+            )
+            points = self.matched.place(
+                some[first_of_cells(np.floor(some / edge).astype(np.int64))]
+            )
             self._spread[frame] = thin(points[spec.flat_index(points) >= 0], self._most)
             while len(self._spread) > _KEPT:
                 self._spread.pop(next(iter(self._spread)))
@@ -167,7 +205,9 @@ class FrameCounter:
     # Scans at other times
 
     def _other(self, frame: int) -> Scan | None:
-        """Return the scan of another frame; None if it does not exist or cannot be read (its own frame reports the error)."""
+        """Return the scan of another frame; None if it does not exist or cannot be read (its own
+        frame reports the error).
+        """
         try:
             return None if self._row(frame) is None else self._scan(frame)
         except (CarlascError, OSError):
@@ -186,14 +226,18 @@ class FrameCounter:
         return None if poses is None else self.matched.grid_T_scan @ invert(poses[self._row(frame)])
 
     def _standing(self, frame: int, other: int) -> NDArray[np.float64] | None:
-        """Return (N, 3) returns of another scan inside the grid of a frame, without classes that can move; None without the scan."""
+        """Return (N, 3) returns of another scan inside the grid of a frame, without classes that
+        can move; None without the scan.
+        """
         grid_T_world, poses = self._grid_T_world(frame), self.matched.trajectory[2]
         if grid_T_world is None or poses is None or (scan := self._other(other)) is None:
             return None
         keep = _are_returns(scan)
         if scan.labels is not None:
             keep &= ~np.isin(scan.labels, sorted(self.matched.scans.metadata.classes.movable))
-        placed = transform_points(grid_T_world @ poses[self._row(other)], thin(scan.points[keep], _SPREAD))
+        placed = transform_points(
+            grid_T_world @ poses[self._row(other)], thin(scan.points[keep], _SPREAD)
+        )
         return placed[self.matched.spec.flat_index(placed) >= 0]
 
     def _add_held_out(self, sums: Sums, seen: _Frame) -> None:
@@ -212,13 +256,23 @@ class FrameCounter:
     def ground(self) -> list[int]:
         """The classes of the grids that are ground, by the class table of the scans."""
         lookup = self.matched.lookup
-        found = set() if lookup is None else {int(lookup[i]) for i in self.matched.scans.metadata.classes.ground}
+        found = (
+            set()
+            if lookup is None
+            else {int(lookup[i]) for i in self.matched.scans.metadata.classes.ground}
+        )
         return sorted(found - {-1, 0})
 
     def _add_classes(self, sums: Sums, seen: _Frame) -> None:
-        """Count the classes of the grid, points by their class and the class of their voxel, and columns with ground at one and at two heights."""
+        """Count the classes of the grid, points by their class and the class of their voxel, and
+        columns with ground at one and at two heights.
+        """
         lookup, labels = self.matched.lookup, seen.scan.labels
-        add(sums, "classes of grids", np.bincount(seen.labels[seen.occupied].astype(np.int64), minlength=MAX_ID + 1))
+        add(
+            sums,
+            "classes of grids",
+            np.bincount(seen.labels[seen.occupied].astype(np.int64), minlength=MAX_ID + 1),
+        )
         if len(self.ground):
             ground = seen.occupied & np.isin(seen.labels, self.ground)
             layers = (ground & ~np.pad(ground, ((0, 0), (0, 0), (1, 0)))[:, :, :-1]).sum(axis=2)
@@ -228,7 +282,8 @@ class FrameCounter:
             own = lookup[np.minimum(labels.astype(np.int64), len(lookup) - 1)]
             both = np.flatnonzero((seen.voxels >= 0) & (own >= 0) & (own < size))
             both = both[seen.occupied.reshape(-1)[seen.voxels[both]]]
-            met = np.minimum(seen.labels.reshape(-1)[seen.voxels[both]].astype(np.int64), size)  # an id without a name
+            # an id without a name
+            met = np.minimum(seen.labels.reshape(-1)[seen.voxels[both]].astype(np.int64), size)
             confusion = np.bincount(own[both] * (size + 1) + met, minlength=(size + 1) ** 2)
             add(sums, "confusion", confusion.reshape(size + 1, size + 1))
 
@@ -240,18 +295,28 @@ class FrameCounter:
             own = own[seen.known.reshape(-1)[seen.voxels[own]]]
             free = ~seen.occupied.reshape(-1)[seen.voxels[own]]
             wrong.reshape(-1)[seen.voxels[own[free]]] = True
-            kinds = np.zeros(len(own), np.int64) if seen.scan.labels is None else seen.scan.labels[own]
+            kinds = (
+                np.zeros(len(own), np.int64) if seen.scan.labels is None else seen.scan.labels[own]
+            )
             self._add_by(sums, "returns", kinds, seen.points[own], free)
         return wrong
 
     def _add_phantoms(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
-        """Count occupied voxels that rays see, and those that rays cross, by class, distance and height; return the crossed ones."""
+        """Count occupied voxels that rays see, and those that rays cross, by class, distance and
+        height; return the crossed ones.
+        """
         spec, clear = self.matched.spec, seen.crossed >= _CLEAR_RAYS
         wrong = seen.occupied & clear & ~seen.around
         # rays near the ground cross its voxels for metres
-        wrong &= ~(np.isin(seen.labels, self.ground) if len(self.ground) else lowest_of_columns(seen.occupied))
+        wrong &= ~(
+            np.isin(seen.labels, self.ground)
+            if len(self.ground)
+            else lowest_of_columns(seen.occupied)
+        )
         looked = np.nonzero(seen.occupied & (clear | seen.hit))
-        centers = spec.from_axes(np.array(spec.lower) + (np.column_stack(looked) + 0.5) * spec.voxel_size)
+        centers = spec.from_axes(
+            np.array(spec.lower) + (np.column_stack(looked) + 0.5) * spec.voxel_size
+        )
         self._add_by(sums, "seen voxels", seen.labels[looked], centers, wrong[looked])
         return wrong
 
@@ -265,21 +330,28 @@ class FrameCounter:
     ) -> None:
         """Add (K, B, H, 2) counts by class, distance and height: all of them, and the wrong ones."""
         low, high = self.matched.spec.lower[2], self.matched.spec.upper[2]
-        heights = np.clip((points[:, 2] - low) / (high - low) * HEIGHTS, 0, HEIGHTS - 1).astype(np.int64)
+        heights = np.clip((points[:, 2] - low) / (high - low) * HEIGHTS, 0, HEIGHTS - 1).astype(
+            np.int64
+        )
         bands = np.searchsorted(BANDS_M, np.linalg.norm(points, axis=1), side="right") - 1
         shape = (MAX_ID + 1, len(BANDS_M) - 1, HEIGHTS, 2)
         cells = np.ravel_multi_index(
-            (np.minimum(kinds.astype(np.int64), MAX_ID), bands, heights, wrong.astype(np.int64)), shape
+            (np.minimum(kinds.astype(np.int64), MAX_ID), bands, heights, wrong.astype(np.int64)),
+            shape,
         )
         counts = np.bincount(cells, minlength=int(np.prod(shape))).reshape(shape)
         add(sums, name, np.stack([counts.sum(axis=3), counts[..., 1]], axis=3))
 
     def _add_unknown(self, sums: Sums, seen: _Frame) -> None:
-        """Count unknown voxels by cause: they hold a return, a ray crosses them, they are outside of the view, or hidden."""
+        """Count unknown voxels by cause: they hold a return, a ray crosses them, they are outside
+        of the view, or hidden.
+        """
         if seen.known is None or not seen.hit.any():
             return
         points = seen.points[seen.voxels >= 0]
-        angles = np.arctan2(points[:, 2] - self.matched.height_m, np.hypot(points[:, 0], points[:, 1]))
+        angles = np.arctan2(
+            points[:, 2] - self.matched.height_m, np.hypot(points[:, 0], points[:, 1])
+        )
         rest = ~seen.known & ~seen.hit & (seen.crossed == 0)
         view = (self._elevations >= angles.min()) & (self._elevations <= angles.max())
         crossed = ~seen.known & ~seen.hit & (seen.crossed > 0)
@@ -288,13 +360,19 @@ class FrameCounter:
 
     @cached_property
     def _elevations(self) -> NDArray[np.float32]:
-        x, y, z = np.moveaxis(self.matched.spec.from_axes(self.matched.spec.centers().reshape(-1, 3)), -1, 0)
-        return np.arctan2(z - self.matched.height_m, np.hypot(x, y), dtype=np.float32).reshape(self.matched.spec.size)
+        x, y, z = np.moveaxis(
+            self.matched.spec.from_axes(self.matched.spec.centers().reshape(-1, 3)), -1, 0
+        )
+        return np.arctan2(z - self.matched.height_m, np.hypot(x, y), dtype=np.float32).reshape(
+            self.matched.spec.size
+        )
 
     # Actors
 
     def _add_actors(self, sums: Sums, seen: _Frame) -> NDArray[np.bool_]:
-        """Count voxels, and occupied voxels, on the path and on the body of each actor; return the occupied voxels of paths."""
+        """Count voxels, and occupied voxels, on the path and on the body of each actor; return the
+        occupied voxels of paths.
+        """
         trails, flat = np.zeros(seen.occupied.size, np.bool_), seen.occupied.reshape(-1)
         for name, members in self._members(seen):
             own = np.unique(seen.voxels[members])
@@ -303,7 +381,8 @@ class FrameCounter:
                 add(sums, f"actor {name}", [0, 0, len(own), flat[own].sum(), 1])
         if (grid_T_world := self._grid_T_world(seen.number)) is not None:
             wide = max(float(self.matched.spec.voxel_size[0]), _AROUND_M)
-            here = seen.around.reshape(-1).copy()  # a voxel with a return of the scan is rightly occupied
+            # a voxel with a return of the scan is rightly occupied
+            here = seen.around.reshape(-1).copy()
             for track in self.actors.tracks.values():
                 here[self._body(track, [seen.number], grid_T_world, wide)] = True
             for number, track in self.actors.tracks.items():
@@ -311,7 +390,11 @@ class FrameCounter:
                 path = path[~here[path]]
                 if len(path):
                     trails[path[flat[path]]] = True
-                    add(sums, f"actor {_name(number, track)}", [len(path), flat[path].sum(), 0, 0, 0])
+                    add(
+                        sums,
+                        f"actor {_name(number, track)}",
+                        [len(path), flat[path].sum(), 0, 0, 0],
+                    )
         return trails.reshape(seen.occupied.shape)
 
     def _members(self, seen: _Frame) -> list[tuple[str, NDArray[np.integer]]]:
@@ -319,25 +402,44 @@ class FrameCounter:
         ids, labels = seen.scan.instances, seen.scan.labels
         if ids is None or not ids.any():
             tracks = self.actors.tracks.items()
-            return [(_name(n, t), t.members[seen.number]) for n, t in tracks if seen.number in t.members]
+            return [
+                (_name(n, t), t.members[seen.number]) for n, t in tracks if seen.number in t.members
+            ]
         order = np.argsort(ids, kind="stable")
         found, starts = np.unique(ids[order], return_index=True)
         movable = sorted(self.matched.scans.metadata.classes.movable)
         parts = zip(found.tolist(), np.split(order, starts[1:]), strict=True)
-        return [(str(i), own) for i, own in parts if i and (labels is None or np.isin(labels[own], movable).all())]
+        return [
+            (str(i), own)
+            for i, own in parts
+            if i and (labels is None or np.isin(labels[own], movable).all())
+        ]
 
     def _body(
-        self, track: Track, frames: Sequence[int], grid_T_world: NDArray[np.float64], margin_m: float
+        self,
+        track: Track,
+        frames: Sequence[int],
+        grid_T_world: NDArray[np.float64],
+        margin_m: float,
     ) -> NDArray[np.int64]:
-        """Return the voxels in the body of an actor at some frames, wider by a margin. A negative margin also leaves out the lowest voxel."""
-        spec, poses = self.matched.spec, [pose for frame in frames if (pose := track.pose(frame)) is not None]
+        """Return the voxels in the body of an actor at some frames, wider by a margin.
+
+        A negative margin also leaves out the lowest voxel.
+        """
+        spec, poses = (
+            self.matched.spec,
+            [pose for frame in frames if (pose := track.pose(frame)) is not None],
+        )
         lower, upper = track.lower - margin_m, track.upper + margin_m
         if margin_m < 0:
             lower[2] = track.lower[2] + float(spec.voxel_size[2])
         if not poses or (upper <= lower).any():
             return np.empty(0, np.int64)
         edge = float(spec.voxel_size[[0, 2]].min()) / 1.5
-        lines = [np.linspace(a, b, max(2, round((b - a) / edge) + 1)) for a, b in zip(lower, upper, strict=True)]
+        lines = [
+            np.linspace(a, b, max(2, round((b - a) / edge) + 1))
+            for a, b in zip(lower, upper, strict=True)
+        ]
         lattice = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
         return voxels_at(lattice, grid_T_world @ np.stack(poses), spec)
 

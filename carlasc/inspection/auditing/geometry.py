@@ -1,8 +1,9 @@
 """The verdicts on the geometry, the times and the drift of grids.
 
-The share of the points of scans in occupied voxels is highest if scans and grids are aligned, and it already falls at a shift of a tenth of
-a voxel. Each correction is therefore a hypothesis, and the best one gives the fault and its size. Corrections come in families, most of which
-move the points of scans by an affine map.
+The share of the points of scans in occupied voxels is highest if scans and grids are aligned, and
+it already falls at a shift of a tenth of a voxel. Each correction is therefore a hypothesis, and
+the best one gives the fault and its size. Corrections come in families, most of which move the
+points of scans by an affine map.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from carlasc.errors import count
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import State, Stretches, Verdict
 
-# A correction must raise the share of points in occupied voxels by this much, and lower the share of other points by this factor.
+# A correction must raise the share of points in occupied voxels by this much, and lower the share
+# of other points by this factor.
 _GAIN, _FEWER = 0.01, 1.3
 _ALIKE = 0.02  # axes and lags are not distinguished if their shares differ by less
 _SAME = 0.25  # of the gain: corrections are not distinguished if their gains differ by less
@@ -54,7 +56,9 @@ class _Fit:
 
     @property
     def is_fault(self) -> bool:
-        """Whether a correction fits better than the data as they are, by more than chance, and the fault is large enough to matter."""
+        """Whether a correction fits better than the data as they are, by more than chance, and the
+        fault is large enough to matter.
+        """
         family = self.family
         own, best = (1 - float(self.shares[0, row]) for row in (family.neutral, self.best))
         gains = self.shares[1:, self.best] - self.shares[1:, family.neutral]
@@ -67,8 +71,13 @@ class _Fit:
 
     @cached_property
     def interval(self) -> tuple[float, float]:
-        """The lowest and the highest value that fit as well as the best one, or are the best in nearly all draws."""
-        values, worse = self.family.values, np.flatnonzero(self.shares[0] < self.shares[0, self.best] - _FLAT)
+        """The lowest and the highest value that fit as well as the best one, or are the best in
+        nearly all draws.
+        """
+        values, worse = (
+            self.family.values,
+            np.flatnonzero(self.shares[0] < self.shares[0, self.best] - _FLAT),
+        )
         low = int(worse[worse < self.best].max(initial=-1)) + 1
         high = int(worse[worse > self.best].min(initial=len(values))) - 1
         drawn = np.quantile(values[self.shares[1:].argmax(axis=1)], (0.025, 0.975))
@@ -76,7 +85,9 @@ class _Fit:
 
 
 def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]:
-    """Yield the verdicts on axes, shifts, yaw, voxel size, drift of height, and lag, from the sums of a sequence."""
+    """Yield the verdicts on axes, shifts, yaw, voxel size, drift of height, and lag, from the sums
+    of a sequence.
+    """
     sums = stretches.drawn("fits")
     if sums is None or not sums[0, 0, 0]:
         text = "no point of a scan is inside a grid"
@@ -85,13 +96,26 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
     shares = np.where(sums[..., 0] > 0, sums[..., 1] / np.maximum(sums[..., 0], 1), -1.0)
     kinds = families(one.spec)
     ends = np.cumsum([len(family.values) for family in kinds])
-    fits = [_Fit(family, part) for family, part in zip(kinds, np.split(shares, ends[:-1], axis=1), strict=True)]
+    fits = [
+        _Fit(family, part)
+        for family, part in zip(kinds, np.split(shares, ends[:-1], axis=1), strict=True)
+    ]
     top, own = max(float(fit.shares[0].max()) for fit in fits), shares[:, 0]
     low, high = np.quantile(own[1:], (0.025, 0.975)).tolist()
     text = f"{own[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} with the best correction"
     state: State = "sound" if top >= _BELONGS else "fault"
     advice = f"check that scans and grids are of the same sequence and in a known coordinate frame; tried: {one.pair}"
-    yield Verdict("fit", state, float(own[0]), low, high, "share", text, one.path, "" if state == "sound" else advice)
+    yield Verdict(
+        "fit",
+        state,
+        float(own[0]),
+        low,
+        high,
+        "share",
+        text,
+        one.path,
+        "" if state == "sound" else advice,
+    )
     if state == "fault":
         return
     found = [fit for fit in fits if fit.is_measured and fit.is_fault]
@@ -100,10 +124,18 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
         return
     best = max(found, key=lambda fit: fit.gain)
     # a shift that fits nearly as well as another size is preferred: it needs fewer assumptions
-    near = [fit for fit in found if fit.family.kind == "shift" and fit.gain >= (1 - _SAME / 5) * best.gain]
-    winner = max(near, key=lambda fit: fit.gain) if near and best.family.kind == "voxel size" else best
+    near = [
+        fit
+        for fit in found
+        if fit.family.kind == "shift" and fit.gain >= (1 - _SAME / 5) * best.gain
+    ]
+    winner = (
+        max(near, key=lambda fit: fit.gain) if near and best.family.kind == "voxel size" else best
+    )
     for fit in found:
-        together = fit.family.kind == winner.family.kind == "shift" and fit.gain >= _SAME * winner.gain
+        together = (
+            fit.family.kind == winner.family.kind == "shift" and fit.gain >= _SAME * winner.gain
+        )
         if fit is winner or together:
             yield _fault(fit, found, one)
     text = f"not judged before the fault of {winner.family.name} is corrected"
@@ -113,18 +145,28 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
 def _fault(fit: _Fit, found: list[_Fit], one: MatchedGrids) -> Verdict:
     family, (low, high) = fit.family, fit.interval
     others = [
-        o for o in found if o is not fit and o.family.kind != "voxel size" and o.gain >= (1 - _SAME / 3) * fit.gain
+        o
+        for o in found
+        if o is not fit and o.family.kind != "voxel size" and o.gain >= (1 - _SAME / 3) * fit.gain
     ]
-    also = f"; {' or '.join(o.family.name for o in others)} explains it nearly as well" if others else ""
+    also = (
+        f"; {' or '.join(o.family.name for o in others)} explains it nearly as well"
+        if others
+        else ""
+    )
     own, best = (float(fit.shares[0, row]) for row in (family.neutral, fit.best))
     text = f"{_describe(fit, one)}: corrected, {best:.1%} instead of {own:.1%} of points are in occupied voxels{also}"
     if family.kind == "axes":
         low = high = fit.value
-    return Verdict(family.name, "fault", fit.value, low, high, family.unit, text, one.path, family.advice)
+    return Verdict(
+        family.name, "fault", fit.value, low, high, family.unit, text, one.path, family.advice
+    )
 
 
 def _sound_or_not(fit: _Fit, where: str) -> Verdict:
-    """Return the verdict of a family without a better correction: sound, if the data distinguish the right value from others."""
+    """Return the verdict of a family without a better correction: sound, if the data distinguish
+    the right value from others.
+    """
     family, shares, (low, high) = fit.family, fit.shares[0], fit.interval
     neutral, measured, unclear = float(family.values[family.neutral]), fit.value, ""
     if family.kind == "axes":
@@ -133,7 +175,9 @@ def _sound_or_not(fit: _Fit, where: str) -> Verdict:
         text, measured, low, high = "those of the scans", neutral, neutral, neutral
     elif family.kind == "lag":
         near = shares[np.abs(family.values) == 1]
-        unclear = "the vehicle hardly moves" if (near >= shares[family.neutral] - _ALIKE).any() else ""
+        unclear = (
+            "the vehicle hardly moves" if (near >= shares[family.neutral] - _ALIKE).any() else ""
+        )
         text, measured, low, high = "grids fit their own scans best", neutral, neutral, neutral
     else:
         unclear = f"any value from {low:.3g} to {high:.3g} {family.unit} fits this drive"
@@ -169,7 +213,11 @@ def _describe(fit: _Fit, one: MatchedGrids) -> str:
 
 
 _FINE, _VOXELS = 0.1, 1.5  # steps of a shift, in voxels, and as far as these go
-_COARSE_M = {"x": np.arange(-4.0, 4.5, 0.5), "y": np.arange(-4.0, 4.5, 0.5), "z": np.arange(-3.0, 3.25, 0.25)}
+_COARSE_M = {
+    "x": np.arange(-4.0, 4.5, 0.5),
+    "y": np.arange(-4.0, 4.5, 0.5),
+    "z": np.arange(-3.0, 3.25, 0.25),
+}
 _YAW_DEG = np.sort([*np.arange(-6.0, 6.01, 0.25), -30, -20, -15, -10, -8, 8, 10, 15, 20, 30])
 _RATIOS = np.unique(np.round([*np.geomspace(0.5, 2.0, 57), 0.8, 1.25, 2 / 3, 1.5], 6))
 _DRIFT_M_S = np.round(np.arange(-0.3, 0.301, 0.01), 2)
@@ -183,8 +231,10 @@ class Family:
     Attributes:
         name: name of the fault, such as "shift x".
         kind: "axes", "shift", "yaw", "voxel size", "height drift" or "lag".
-        values: (V,) size of the fault that each correction removes, rising; numbers of the choices of axes.
-        warps: (V, 3, 5) maps of points: p' = A p + b + c dt, as columns A, b, c; dt is how much later than the frame the points were seen.
+        values: (V,) size of the fault that each correction removes, rising; numbers of the choices
+            of axes.
+        warps: (V, 3, 5) maps of points: p' = A p + b + c dt, as columns A, b, c; dt is how much
+            later than the frame the points were seen.
         neutral: row of the correction that changes nothing.
         unit: of the values.
         least: smaller faults are ignored.
@@ -205,37 +255,65 @@ class Family:
 
 def families(spec: GridSpec) -> list[Family]:
     """Return the families of corrections of a grid."""
-    found = [_family("axes", "axes", range(len(AXES)), [m for _, m in AXES], "give grids and scans the same axes")]
+    found = [
+        _family(
+            "axes",
+            "axes",
+            range(len(AXES)),
+            [m for _, m in AXES],
+            "give grids and scans the same axes",
+        )
+    ]
     advice = "move the bounds, or correct the position of the sensor in the poses that the grids were made with"
     for axis, name in enumerate("xyz"):
         step = shift_step(spec, name)
         fine = np.arange(-round(_VOXELS / _FINE), round(_VOXELS / _FINE) + 1) * _FINE * step
         values = np.sort([*fine, *_COARSE_M[name][np.abs(_COARSE_M[name]) > _VOXELS * step + 0.01]])
-        shifts = _family(f"shift {name}", "shift", values, [np.eye(3)], advice, "m", 0.2 * step, step)
+        shifts = _family(
+            f"shift {name}", "shift", values, [np.eye(3)], advice, "m", 0.2 * step, step
+        )
         shifts.warps[:, axis, 3] = values
         found.append(shifts)
     turns = [rotation_z(angle)[:3, :3] for angle in np.radians(_YAW_DEG)]
     advice = "correct the yaw of the sensor in the calibration that the grids were made with"
     found.append(_family("yaw", "yaw", _YAW_DEG, turns, advice, "degrees", 0.4, 1.5))
     for axes, which in (("", (1, 1, 1)), (" x, y", (1, 1, 0)), (" z", (0, 0, 1))):
-        # the fault is declared = ratio * true size: p is in the true grid where p * ratio is in the declared one
+        # the fault is declared = ratio * true size: p is in the true grid where p * ratio is in the
+        # declared one
         scales = [np.diag(np.where(which, ratio, 1.0)) for ratio in _RATIOS]
         for anchor, fixed in (("", np.zeros(3)), (", lower bound kept", np.array(spec.lower))):
             if not anchor or spec.coordinates == "cartesian":
                 advice = "correct the declared voxel size or bounds"
-                sizes = _family(f"voxel size{axes}{anchor}", "voxel size", _RATIOS, scales, advice, "times", 0.02, 0.15)
+                sizes = _family(
+                    f"voxel size{axes}{anchor}",
+                    "voxel size",
+                    _RATIOS,
+                    scales,
+                    advice,
+                    "times",
+                    0.02,
+                    0.15,
+                )
                 sizes.warps[:, :, 3] = fixed - sizes.warps[:, :, :3] @ fixed
                 found.append(sizes)
     advice = "refine the poses (`carlasc refine`) and make the grids again"
-    drift = _family("height drift", "height drift", _DRIFT_M_S, [np.eye(3)], advice, "m/s", 0.02, 0.06)
+    drift = _family(
+        "height drift", "height drift", _DRIFT_M_S, [np.eye(3)], advice, "m/s", 0.02, 0.06
+    )
     drift.warps[:, 2, 4] = _DRIFT_M_S
     advice = "give the grids the numbers or the times of these scans"
     return [*found, drift, _family("lag", "lag", _LAGS, [np.eye(3)], advice, "frames", 1.0, 1.0)]
 
 
 def shift_step(spec: GridSpec, axis: str) -> float:
-    """Return the size of a voxel along x, y or z; in a cylindrical grid, x and y take the size along the radius."""
-    return float(spec.voxel_size[0 if spec.coordinates == "cylindrical" and axis != "z" else "xyz".index(axis)])
+    """Return the size of a voxel along x, y or z; in a cylindrical grid, x and y take the size
+    along the radius.
+    """
+    return float(
+        spec.voxel_size[
+            0 if spec.coordinates == "cylindrical" and axis != "z" else "xyz".index(axis)
+        ]
+    )
 
 
 def _family(
@@ -256,5 +334,10 @@ def _family(
 
 
 _MIRRORED = {"-x, y, z": "x mirrored", "x, -y, z": "y mirrored", "x, y, -z": "z mirrored"}
-AXES = [(_MIRRORED.get(n, f"x, y, z of the grid are {n} of the scans"), matrix) for n, matrix in choices_of_axes()]
-"""The choices of axes: (description, (3, 3) matrix from the scans' axes to the grid's); the first is the right one."""
+AXES = [
+    (_MIRRORED.get(n, f"x, y, z of the grid are {n} of the scans"), matrix)
+    for n, matrix in choices_of_axes()
+]
+"""The choices of axes: (description, (3, 3) matrix from the scans' axes to the grid's); the first
+is the right one.
+"""

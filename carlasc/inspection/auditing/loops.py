@@ -1,4 +1,6 @@
-"""The compiled loops of the audit: points under many corrections, the voxels of bodies, and the rays that cross each voxel."""
+"""The compiled loops of the audit: points under many corrections, the voxels of bodies, and the
+rays that cross each voxel.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,16 @@ from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
 
 _SAMPLES = 4  # samples on a ray per edge of the smallest voxel
-_INSIDE = 3  # least samples of a ray in a voxel that it crosses: rays that graze a corner do not count
+_INSIDE = (
+    3  # least samples of a ray in a voxel that it crosses: rays that graze a corner do not count
+)
 
 
 def count_occupied_under(
-    points: NDArray[np.float64], warps: NDArray[np.float64], spec: GridSpec, occupied: NDArray[np.bool_]
+    points: NDArray[np.float64],
+    warps: NDArray[np.float64],
+    spec: GridSpec,
+    occupied: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
     """Return (W,) how many points lie in occupied voxels under each correction.
 
@@ -25,7 +32,13 @@ def count_occupied_under(
         occupied: (X, Y, Z).
     """
     counted = np.zeros(len(warps), np.int64)
-    _count(points, np.ascontiguousarray(warps), Cells.of(spec), np.append(occupied.reshape(-1), False), counted)
+    _count(
+        points,
+        np.ascontiguousarray(warps),
+        Cells.of(spec),
+        np.append(occupied.reshape(-1), False),
+        counted,
+    )
     return counted
 
 
@@ -47,7 +60,8 @@ def _count(points, warps, cells, occupied, counted):  # type: ignore[no-untyped-
 def crossings(
     origins: NDArray[np.float64], points: NDArray[np.float64], spec: GridSpec, margin_m: float
 ) -> NDArray[np.int64]:
-    """Return (X, Y, Z) how many rays cross each voxel, not only a corner of it, before they come near their return.
+    """Return (X, Y, Z) how many rays cross each voxel, not only a corner of it, before they come
+    near their return.
 
     Args:
         origins: (N, 3) metres, where each ray begins, in the frame of the grid.
@@ -81,8 +95,12 @@ def _cross(origins, points, cells, step_m, margin_m, crossed):  # type: ignore[n
                 crossed[voxel] += 1
 
 
-def voxels_at(points: NDArray[np.float64], poses: NDArray[np.float64], spec: GridSpec) -> NDArray[np.int64]:
-    """Return the voxels that hold any of (N, 3) points at any of (P, 4, 4) poses in the frame of the grid, rising."""
+def voxels_at(
+    points: NDArray[np.float64], poses: NDArray[np.float64], spec: GridSpec
+) -> NDArray[np.int64]:
+    """Return the voxels that hold any of (N, 3) points at any of (P, 4, 4) poses in the frame of
+    the grid, rising.
+    """
     inside = np.zeros(spec.num_voxels + 1, np.bool_)
     _mark(points, np.ascontiguousarray(poses), Cells.of(spec), inside)
     return np.flatnonzero(inside[:-1])
@@ -104,9 +122,13 @@ def _mark(points, poses, cells, inside):  # type: ignore[no-untyped-def]
 
 
 def grown(mask: NDArray[np.bool_], turns: bool) -> NDArray[np.bool_]:
-    """Return a mask grown by one voxel in each direction; if `turns`, the azimuth of a cylindrical grid is periodic."""
+    """Return a mask grown by one voxel in each direction; if `turns`, the azimuth of a cylindrical
+    grid is periodic.
+    """
     for axis in range(3):
         sides = [(1, 1) if a == axis else (0, 0) for a in range(3)]
-        wide = np.moveaxis(np.pad(mask, sides, mode="wrap" if turns and axis == 1 else "constant"), axis, 0)
+        wide = np.moveaxis(
+            np.pad(mask, sides, mode="wrap" if turns and axis == 1 else "constant"), axis, 0
+        )
         mask = np.moveaxis(wide[:-2] | wide[1:-1] | wide[2:], 0, axis)
     return mask

@@ -1,4 +1,6 @@
-"""Pairs of grids and scans: by the names of sequences, and by the numbers or times of frames; and the pose of a scan in the frame of its grid."""
+"""Pairs of grids and scans: by the names of sequences, and by the numbers or times of frames; and
+the pose of a scan in the frame of its grid.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ from carlasc.storage.protocol import Sequence
 _SAME_TIME_S = 0.06  # a grid belongs to a scan if their times differ by less
 _NOISE = 255
 _HEIGHT_M = 1.8  # height of the sensor above the ground in CarlaSC, used if the recording has none
-_TIMES = "tokens.txt"  # table of times beside grids that are named by tokens: lines of a token and seconds
+# table of times beside grids that are named by tokens: lines of a token and seconds
+_TIMES = "tokens.txt"
 _FRAMES = {
     "occ3d-lidar": "the vehicle, with its origin on the ground",
     "openoccupancy": "the LiDAR, x to the right and y forward",
@@ -80,7 +83,10 @@ class MatchedGrids:
             FormatError: it is not known.
         """
         if self.grids.spec is None:
-            expected, advice = "grids of known geometry", "add params.json: docs/format.md#the-record-in-paramsjson"
+            expected, advice = (
+                "grids of known geometry",
+                "add params.json: docs/format.md#the-record-in-paramsjson",
+            )
             found = "a folder without params.json"
             raise FormatError(self.grids.location, expected=expected, found=found, advice=advice)
         return self.grids.spec
@@ -88,7 +94,9 @@ class MatchedGrids:
     @property
     def axes(self) -> str:
         """Handedness of the grids: "left" or "right"; formats of other benchmarks are right-handed."""
-        return self.grids.sequence.metadata.axes if isinstance(self.grids, SequenceGrid) else "right"
+        return (
+            self.grids.sequence.metadata.axes if isinstance(self.grids, SequenceGrid) else "right"
+        )
 
     @property
     def frame_name(self) -> str:
@@ -98,7 +106,9 @@ class MatchedGrids:
     @cached_property
     def grid_T_scan(self) -> Transform:
         """(4, 4) from the sensor's frame to that of the grids; it may mirror y."""
-        matrix: Transform = np.diag([1.0, 1.0 if self.axes == self.scans.metadata.axes else -1.0, 1.0, 1.0])
+        matrix: Transform = np.diag(
+            [1.0, 1.0 if self.axes == self.scans.metadata.axes else -1.0, 1.0, 1.0]
+        )
         if self.grids.benchmark == "openoccupancy":
             matrix = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ matrix
         matrix[2, 3] = self.height_m
@@ -106,7 +116,9 @@ class MatchedGrids:
 
     @property
     def _many_to_one(self) -> bool:
-        """Whether the labels of the grids are mapped, not those of the scans: if several classes of the grids are one class of the scans."""
+        """Whether the labels of the grids are mapped, not those of the scans: if several classes of
+        the grids are one class of the scans.
+        """
         return isinstance(self.grids, CarlaOccGrids) and self.scans.metadata.classes != CARLAOCC
 
     @property
@@ -118,9 +130,13 @@ class MatchedGrids:
 
     @cached_property
     def lookup(self) -> NDArray[np.int64] | None:
-        """(K,) class of the grids for each class of the scans, -1 for none; None if no map is known."""
+        """(K,) class of the grids for each class of the scans, -1 for none; None if no map is
+        known.
+        """
         source = self.scans.metadata.classes
-        mapping = None if self.classes is None else _mapping(source, self.classes, self.grids.benchmark)
+        mapping = (
+            None if self.classes is None else _mapping(source, self.classes, self.grids.benchmark)
+        )
         if mapping is None:
             return None
         lookup = np.full(source.num_channels, -1, np.int64)
@@ -128,8 +144,11 @@ class MatchedGrids:
         lookup[0] = -1
         return lookup
 
-    def read(self, frame: int) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_], NDArray[np.bool_] | None]:
-        """Return (X, Y, Z) labels of a grid, occupied voxels, and known voxels; None for these if the files do not contain them.
+    def read(
+        self, frame: int
+    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_], NDArray[np.bool_] | None]:
+        """Return (X, Y, Z) labels of a grid, occupied voxels, and known voxels; None for these if
+        the files do not contain them.
 
         Raises:
             CarlascError: the grid cannot be read.
@@ -155,17 +174,26 @@ class MatchedGrids:
         return transform_points(self.grid_T_scan, points)
 
     @cached_property
-    def trajectory(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
+    def trajectory(
+        self,
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
         """(F,) frames with scans, their seconds, and their (F, 4, 4) poses, None without poses.txt."""
         frames, documents = self.scans.frames("points"), self.scans.documents()
-        poses = np.stack([self.scans.read_pose(f) for f in frames.tolist()]) if layout.POSES in documents else None
+        poses = (
+            np.stack([self.scans.read_pose(f) for f in frames.tolist()])
+            if layout.POSES in documents
+            else None
+        )
         return frames, self.scans.times_of(frames), poses
 
     @property
     def period_s(self) -> float:
         """Seconds between two scans."""
         frames, seconds, _ = self.trajectory
-        return float(seconds[-1] - seconds[0]) / max(int(frames[-1] - frames[0]), 1) or layout.FRAME_PERIOD_S
+        return (
+            float(seconds[-1] - seconds[0]) / max(int(frames[-1] - frames[0]), 1)
+            or layout.FRAME_PERIOD_S
+        )
 
 
 def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) -> list[MatchedGrids]:
@@ -178,7 +206,8 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
         frames: frames of the grids that are audited; None for all.
 
     Raises:
-        MissingDataError: there are no grids, no scans, or no pair of them; names the pairs that were tried.
+        MissingDataError: there are no grids, no scans, or no pair of them; names the pairs that
+            were tried.
         FormatError: the geometry of the grids is not known.
     """
     source = as_source(scans)
@@ -189,9 +218,13 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
         expected = "sequences with scans (velodyne/)"
         raise MissingDataError(source.location, expected=expected, found="none", advice=advice)
     pairs = [(one, _recording_of(one, recordings, alone=len(found) == 1)) for one in found]
-    matched = [_match_frames(one, own, FrameRange.of(frames)) for one, own in pairs if own is not None]
+    matched = [
+        _match_frames(one, own, FrameRange.of(frames)) for one, own in pairs if own is not None
+    ]
     if not matched:
-        tried = first_names([f"{one.path or one.location} with {path}" for one in found for path in recordings], 6)
+        tried = first_names(
+            [f"{one.path or one.location} with {path}" for one in found for path in recordings], 6
+        )
         raise MissingDataError(
             str(grids),
             expected="grids of a sequence of the scans",
@@ -201,9 +234,15 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
     return matched
 
 
-def _recording_of(grids: GridFrames, recordings: Mapping[str, Sequence], *, alone: bool) -> Sequence | None:
+def _recording_of(
+    grids: GridFrames, recordings: Mapping[str, Sequence], *, alone: bool
+) -> Sequence | None:
     name = identity_of(grids.path)[1:]
-    same = [s for path, s in recordings.items() if path == grids.path or (grids.path and identity_of(path)[1:] == name)]
+    same = [
+        s
+        for path, s in recordings.items()
+        if path == grids.path or (grids.path and identity_of(path)[1:] == name)
+    ]
     if len(same) == 1:
         return same[0]
     return next(iter(recordings.values())) if alone and len(recordings) == 1 else None
@@ -221,9 +260,17 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
         pairs = [(number, number) for number in numbers if number in set(own.tolist())]
     elif (times := _token_times(grids)) is not None:
         seconds = result.trajectory[1]
-        timed = [(number, times[grids.name_of(number)]) for number in numbers if grids.name_of(number) in times]
+        timed = [
+            (number, times[grids.name_of(number)])
+            for number in numbers
+            if grids.name_of(number) in times
+        ]
         nearest = [(number, int(np.abs(seconds - t).argmin()), t) for number, t in timed]
-        pairs = [(number, int(own[row])) for number, row, t in nearest if abs(seconds[row] - t) <= _SAME_TIME_S]
+        pairs = [
+            (number, int(own[row]))
+            for number, row, t in nearest
+            if abs(seconds[row] - t) <= _SAME_TIME_S
+        ]
     elif len(numbers) == len(own):
         notes.append("tokens have no times: they were matched to the scans in their order")
         pairs = list(zip(numbers, own.tolist(), strict=True))
@@ -236,21 +283,32 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
         )
     if without := sorted(set(numbers) - {number for number, _ in pairs}):
         names = first_names([grids.name_of(number) for number in without], 4)
-        notes.append(f"{len(without)} of {count(len(numbers), 'grid')} left out, without a scan of the same number or time: {names}")  # fmt: skip
+        notes.append(f"{len(without)} of {count(len(numbers), 'grid')} left out, without a scan "
+                     f"of the same number or time: {names}")  # fmt: skip
     pairs = [pair for pair in pairs if pair[0] in chosen]
     if not pairs:
         where = f"frames {own[0]} to {own[-1]}" if len(own) else "frames with scans"
-        shown = f"{grids.name_of(numbers[0])} to {grids.name_of(numbers[-1])}" if numbers else "no frame"
+        shown = (
+            f"{grids.name_of(numbers[0])} to {grids.name_of(numbers[-1])}"
+            if numbers
+            else "no frame"
+        )
         advice = "check the names of the files: no grid has the number or time of a scan"
-        raise MissingDataError(result.pair, expected=f"grids of {where}", found=shown, advice=advice)
+        raise MissingDataError(
+            result.pair, expected=f"grids of {where}", found=shown, advice=advice
+        )
     made = [scan for _, scan in pairs]
     step = max(int(np.bincount(np.diff(made)).argmax()), 1) if len(made) > 1 else 1
     usual = [f for f in own.tolist() if made[0] <= f <= made[-1] and (f - made[0]) % step == 0]
-    return MatchedGrids(grids, scans, tuple(pairs), tuple(sorted(set(usual) - set(made))), tuple(notes), height)
+    return MatchedGrids(
+        grids, scans, tuple(pairs), tuple(sorted(set(usual) - set(made))), tuple(notes), height
+    )
 
 
 def _token_times(grids: TokenFrames) -> dict[str, float] | None:
-    """Return the seconds of tokens, from tokens.txt or Occ3D's annotations.json, in the folder of the scene or one above it."""
+    """Return the seconds of tokens, from tokens.txt or Occ3D's annotations.json, in the folder of
+    the scene or one above it.
+    """
     folder = Path(grids.location)
     for place in (folder, folder.parent, folder.parent.parent):
         if (file := place / _TIMES).is_file():
@@ -259,7 +317,11 @@ def _token_times(grids: TokenFrames) -> dict[str, float] | None:
                 return {token: float(seconds) for token, seconds in rows}
         if (file := place / "annotations.json").is_file():
             with reading(file, "timestamps of tokens"):
-                scene: Any = parse_json(file.read_bytes(), str(file)).get("scene_infos", {}).get(folder.name, {})
+                scene: Any = (
+                    parse_json(file.read_bytes(), str(file))
+                    .get("scene_infos", {})
+                    .get(folder.name, {})
+                )
                 return {token: float(entry["timestamp"]) / 1e6 for token, entry in scene.items()}
     return None
 
@@ -268,10 +330,14 @@ def _height_of(scans: Sequence) -> float | None:
     sensors = scans.metadata.extra.get("sensors")
     first = sensors[0] if isinstance(sensors, list) and sensors else None
     height = first.get("height_m") if isinstance(first, dict) else None
-    return float(height) if isinstance(height, int | float) and not isinstance(height, bool) else None
+    return (
+        float(height) if isinstance(height, int | float) and not isinstance(height, bool) else None
+    )
 
 
-def _mapping(source: ClassTable, target: ClassTable, benchmark: str | None) -> Mapping[int, int] | None:
+def _mapping(
+    source: ClassTable, target: ClassTable, benchmark: str | None
+) -> Mapping[int, int] | None:
     """Return the class of the grids for each class of the scans; None if no map is known."""
     if benchmark in _FRAMES:
         to_occ3d = TO_OCC3D.get(source.name)
@@ -289,5 +355,9 @@ def _mapping(source: ClassTable, target: ClassTable, benchmark: str | None) -> M
         return mapping
     except ArgumentError:
         names = {name.lower(): index for index, name in target.names.items()}
-        same = {index: names[name.lower()] for index, name in source.names.items() if name.lower() in names}
+        same = {
+            index: names[name.lower()]
+            for index, name in source.names.items()
+            if name.lower() in names
+        }
         return same if len(same) > 1 else None

@@ -1,4 +1,5 @@
-"""The sums and the verdicts of an audit: sums over blocks of successive frames, shares of them, and a verdict for each check.
+"""The sums and the verdicts of an audit: sums over blocks of successive frames, shares of them, and
+a verdict for each check.
 
 The intervals of shares come from a block bootstrap: blocks are drawn with replacement.
 """
@@ -76,10 +77,12 @@ class AuditResult:
     Attributes:
         grids: location of the grids.
         scans: location of the scans.
-        verdicts: of all checks, by path of the sequence; empty until all parts have counted their frames.
+        verdicts: of all checks, by path of the sequence; empty until all parts have counted their
+            frames.
         frames: number of audited frames, by path of the sequence.
         placed: the assumed coordinate frame of the grids, in words, by path of the sequence.
-        worst: the frames with most wrong voxels, worst first: path, frame of the grids, frame of the scan, number of wrong voxels.
+        worst: the frames with most wrong voxels, worst first: path, frame of the grids, frame of
+            the scan, number of wrong voxels.
         notes: what was assumed.
         failures: frames that could not be audited.
         grid: requested name of the grids.
@@ -105,7 +108,9 @@ class AuditResult:
     @property
     def faults(self) -> tuple[Verdict, ...]:
         """The verdicts that are faults."""
-        return tuple(v for verdicts in self.verdicts.values() for v in verdicts if v.state == "fault")
+        return tuple(
+            v for verdicts in self.verdicts.values() for v in verdicts if v.state == "fault"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
@@ -148,7 +153,9 @@ class Stretches:
         return np.concatenate([np.ones((1, count)), drawn])
 
     def draw(self, counts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return (1 + DRAWS, ...) sums of (S, ...) counts: of all stretches, then of stretches that are drawn with replacement."""
+        """Return (1 + DRAWS, ...) sums of (S, ...) counts: of all stretches, then of stretches that
+        are drawn with replacement.
+        """
         return np.tensordot(self._weights, counts.astype(np.float64), axes=1)
 
     def drawn(self, name: str) -> NDArray[np.float64] | None:
@@ -157,7 +164,9 @@ class Stretches:
         return None if counts is None else self.draw(counts)
 
     def share(self, name: str) -> Share | None:
-        """Return the share of the second of two counts in the first; None if the first is missing or 0."""
+        """Return the share of the second of two counts in the first; None if the first is missing
+        or 0.
+        """
         drawn = self.drawn(name)
         return None if drawn is None else share_of(drawn[:, 1], drawn[:, 0])
 

@@ -8,7 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from carlasc.errors import ArgumentError, ConflictError, DependencyError, FormatError, MissingDataError
+from carlasc.errors import (
+    ArgumentError,
+    ConflictError,
+    DependencyError,
+    FormatError,
+    MissingDataError,
+)
 from carlasc.inspection.cards.croissant import WRITER, croissant
 from carlasc.inspection.cards.facts import CardDetails, Facts, gather
 from carlasc.inspection.cards.licenses import license_given
@@ -70,14 +76,16 @@ def card(
     overwrite: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> CardResult:
-    """Write the card of a data set: README.md with the YAML that the Hugging Face Hub reads, croissant.json, and pictures.
+    """Write the card of a data set: README.md with the YAML that the Hugging Face Hub reads,
+    croissant.json, and pictures.
 
-    Counts, classes, splits, sensors, licences, sources, settings and limits are read from the data. All other details are given in `about`.
+    Counts, classes, splits, sensors, licences, sources, settings and limits are read from the data.
+    All other details are given in `about`.
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source at such a place.
-        out: folder of the card, the root folder of the publication. None: the source, if it is a folder or a Parquet store;
-            otherwise the folder that contains it.
+        out: folder of the card, the root folder of the publication. None: the source, if it is a
+            folder or a Parquet store; otherwise the folder that contains it.
         about: details that are not in the data: their name, authors, licence, and how to cite them.
         pictures: whether a grid and a scan are drawn, which needs the extra `render`.
         every: count the classes of every N-th frame.
@@ -89,7 +97,8 @@ def card(
 
     Raises:
         MissingDataError: there is no data set, or it has no sequences.
-        ArgumentError: a licence, a version or a date is not valid; no licence is known; or the licence contradicts that of the source.
+        ArgumentError: a licence, a version or a date is not valid; no licence is known; or the
+            licence contradicts that of the source.
         FormatError: the data do not have the format, or the licence in carlasc.json is not known.
         CarlascError: the licence of the source forbids publishing derived data.
         ConflictError: a card exists, and `overwrite` is not given.
@@ -126,7 +135,8 @@ def card(
 def _check_free(folder: Path, overwrite: bool, pictures: bool) -> bool:
     """Check that no card exists, before anything is counted; return whether files may be replaced.
 
-    croissant.json is the first file of a card, and README.md the last: a folder with the first one only is from a run that was killed.
+    croissant.json is the first file of a card, and README.md the last: a folder with the first one
+    only is from a run that was killed.
     """
     if folder.exists() and not folder.is_dir():
         raise ArgumentError("out", expected="a folder", found=f"the file {folder}")
@@ -136,7 +146,9 @@ def _check_free(folder: Path, overwrite: bool, pictures: bool) -> bool:
     for path in (folder / README, folder / CROISSANT, *drawn):
         if path.exists():
             raise ConflictError(
-                path, problem="exists already", advice="choose another folder, or replace it with `overwrite=True`"
+                path,
+                problem="exists already",
+                advice="choose another folder, or replace it with `overwrite=True`",
             )
     return False
 
@@ -152,17 +164,27 @@ def _is_ours(path: Path) -> bool:
 
 def _describe(facts: Facts) -> str:
     """Return a description of the data set, in two sentences."""
-    grids = ", ".join(f"{grid.name} ({' x '.join(map(str, grid.size))})" for grid, _, _ in facts.grids[:3])
-    what = f"with voxel grids of complete semantic scenes: {grids}" if grids else "without voxel grids"
+    grids = ", ".join(
+        f"{grid.name} ({' x '.join(map(str, grid.size))})" for grid, _, _ in facts.grids[:3]
+    )
+    what = (
+        f"with voxel grids of complete semantic scenes: {grids}" if grids else "without voxel grids"
+    )
     made = ["recorded in a simulator"] if facts.simulated else []
     made += [f"converted from {', '.join(facts.sources)}"] if facts.sources else []
     return say(
-        "summary", frames=f"{facts.frames:,}", sequences=facts.sequences_told, grids=what, made=" and ".join(made)
+        "summary",
+        frames=f"{facts.frames:,}",
+        sequences=facts.sequences_told,
+        grids=what,
+        made=" and ".join(made),
     )
 
 
 def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path, str]], list[str]]:
-    """Draw a grid and a scan; return (file, content) of each picture, and a note for each picture that could not be drawn."""
+    """Draw a grid and a scan; return (file, content) of each picture, and a note for each picture
+    that could not be drawn.
+    """
     from carlasc.viewing import Scene, StyleOptions, render
 
     drawn, notes = [], []
@@ -177,13 +199,19 @@ def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path,
         sequence = facts.sequences[path]
         target = folder / PICTURES / f"{what}.png"
         try:
-            field = "points" if what == "scan" else next(f"{grid}/labels" for grid in sequence.grids)
+            field = (
+                "points" if what == "scan" else next(f"{grid}/labels" for grid in sequence.grids)
+            )
             frames = sequence.frames(field)
             frame = int(frames[len(frames) // 2])
             scene = Scene(
-                sequence, frames=(frame, frame + 1), grid=None if what == "scan" else next(iter(sequence.grids))
+                sequence,
+                frames=(frame, frame + 1),
+                grid=None if what == "scan" else next(iter(sequence.grids)),
             )
-            result = render(scene, target, what=what, style=StyleOptions(size=_SIZE), overwrite=overwrite)
+            result = render(
+                scene, target, what=what, style=StyleOptions(size=_SIZE), overwrite=overwrite
+            )
         except (DependencyError, MissingDataError) as error:
             notes.append(f"no picture of a {what}: {error}")
             continue

@@ -1,4 +1,6 @@
-"""croissant.json: the card for programs, in Croissant 1.1 with the RAI vocabulary 1.0 (https://docs.mlcommons.org/croissant)."""
+"""croissant.json: the card for programs, in Croissant 1.1 with the RAI vocabulary 1.0
+(https://docs.mlcommons.org/croissant).
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,21 @@ Json = dict[str, Any]
 WRITER = "carlasc"
 """The `sdPublisher` of the file: the program that wrote it."""
 CONFORMS_TO = ("http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0")
-KEYWORDS = ("LiDAR", "voxel grid", "semantic scene completion", "semantic mapping", "occupancy", "scene flow")
+KEYWORDS = (
+    "LiDAR",
+    "voxel grid",
+    "semantic scene completion",
+    "semantic mapping",
+    "occupancy",
+    "scene flow",
+)
 _PARQUET = "application/x-parquet"
 _ENCODINGS = {".h5": "application/x-hdf5", ".hdf5": "application/x-hdf5", ".zip": "application/zip"}
 
 
-def croissant(facts: Facts, details: CardDetails, place: Place, tables: Sequence[PublishedTable]) -> bytes:
+def croissant(
+    facts: Facts, details: CardDetails, place: Place, tables: Sequence[PublishedTable]
+) -> bytes:
     """Return the bytes of croissant.json."""
     licenses = [license_.url for license_ in facts.licenses]
     content: Json = {
@@ -45,7 +56,9 @@ def croissant(facts: Facts, details: CardDetails, place: Place, tables: Sequence
     if details.url:
         content["url"] = details.url
     if details.authors:
-        content["creator"] = [{"@type": "sc:Organization", "name": name} for name in details.authors]
+        content["creator"] = [
+            {"@type": "sc:Organization", "name": name} for name in details.authors
+        ]
     content |= {f"rai:{name}": value for name, value in responsibility(facts, details).items()}
     content["prov:wasDerivedFrom"] = facts.sources or ["no other data set: recorded in a simulator"]
     content["prov:wasGeneratedBy"] = [
@@ -53,7 +66,11 @@ def croissant(facts: Facts, details: CardDetails, place: Place, tables: Sequence
         _activity("Ground truth", " ".join(made(facts))),
     ]
     content["distribution"] = [*_files(facts, place, tables)]
-    content["recordSet"] = [*_classes(facts), _sequences(facts), *(_record_set(table) for table in tables)]
+    content["recordSet"] = [
+        *_classes(facts),
+        _sequences(facts),
+        *(_record_set(table) for table in tables),
+    ]
     return (json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode()
 
 
@@ -108,13 +125,18 @@ def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iter
     if tables:
         return
     if place.is_file:
-        yield _file_object(place, "", _ENCODINGS.get(Path(place.name).suffix.lower(), "application/octet-stream"))
+        yield _file_object(
+            place, "", _ENCODINGS.get(Path(place.name).suffix.lower(), "application/octet-stream")
+        )
     elif facts.overview.store == "zarr":
         if place.local is not None:
             yield _file_object(place, "zarr.json", "application/json")
         yield (
             _file_set(
-                "zarr", "The chunks of a zarr store of version 3.", "application/vnd.zarr", [place.published("*")]
+                "zarr",
+                "The chunks of a zarr store of version 3.",
+                "application/vnd.zarr",
+                [place.published("*")],
             )
             | inside
         )
@@ -125,11 +147,19 @@ def _files(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> Iter
 
 def _patterns(facts: Facts) -> Iterable[tuple[str, str, str, str]]:
     """Yield name, pattern, encoding and meaning of the files of each field of the published layout."""
-    names = [*facts.fields, *dict.fromkeys(f"{g.name}/{part}" for g, _, _ in facts.grids for part in g.parts)]
+    names = [
+        *facts.fields,
+        *dict.fromkeys(f"{g.name}/{part}" for g, _, _ in facts.grids for part in g.parts),
+    ]
     for name in names:
         entry = layout.field_named(name)
         encoding = "image/jpeg" if entry.kind == "picture" else "application/octet-stream"
-        yield name.replace("/", "_"), f"*{entry.folder}/*{entry.suffix}", encoding, f"{entry.meaning}."
+        yield (
+            name.replace("/", "_"),
+            f"*{entry.folder}/*{entry.suffix}",
+            encoding,
+            f"{entry.meaning}.",
+        )
     yield "text", "*.txt", "text/plain", "Poses and times, one line per frame."
     yield (
         "passports",
@@ -140,7 +170,12 @@ def _patterns(facts: Facts) -> Iterable[tuple[str, str, str, str]]:
 
 
 def _file_set(name: str, meaning: str, encoding: str, includes: list[str]) -> Json:
-    head = {"@type": "cr:FileSet", "@id": f"{_id(name)}-files", "name": f"{name}-files", "description": meaning}
+    head = {
+        "@type": "cr:FileSet",
+        "@id": f"{_id(name)}-files",
+        "name": f"{name}-files",
+        "description": meaning,
+    }
     return head | {"encodingFormat": encoding, "includes": includes}
 
 
@@ -163,16 +198,29 @@ def _classes(facts: Facts) -> Iterable[Json]:
         name = _id(f"classes-{one.classes.name}")
         rows = [
             {f"{name}/id": index, f"{name}/name": label}
-            | {f"{name}/points": round(of_points or 0.0, 6), f"{name}/voxels": round(of_voxels or 0.0, 6)}
+            | {
+                f"{name}/points": round(of_points or 0.0, 6),
+                f"{name}/voxels": round(of_voxels or 0.0, 6),
+            }
             for index, label, of_points, of_voxels in shares(one, one.total)
         ]
         fields = (
-            ("id", "sc:Integer", "number of the class; 0 is unlabelled on points and free in voxels"),
+            (
+                "id",
+                "sc:Integer",
+                "number of the class; 0 is unlabelled on points and free in voxels",
+            ),
             ("name", "sc:Text", "name of the class"),
             ("points", "sc:Float", "share of the points"),
             ("voxels", "sc:Float", "share of the known voxels"),
         )
-        yield _inline(name, f"The classes of {one.classes.name} that occur, and their shares.", fields, rows, "id")
+        yield _inline(
+            name,
+            f"The classes of {one.classes.name} that occur, and their shares.",
+            fields,
+            rows,
+            "id",
+        )
 
 
 def _sequences(facts: Facts) -> Json:
@@ -196,7 +244,9 @@ def _sequences(facts: Facts) -> Json:
     return _inline("sequences", "The sequences, with the licence of each.", fields, rows, "path")
 
 
-def _inline(name: str, meaning: str, fields: Sequence[tuple[str, str, str]], rows: list[Json], key: str) -> Json:
+def _inline(
+    name: str, meaning: str, fields: Sequence[tuple[str, str, str]], rows: list[Json], key: str
+) -> Json:
     return {
         "@type": "cr:RecordSet",
         "@id": name,
@@ -204,7 +254,13 @@ def _inline(name: str, meaning: str, fields: Sequence[tuple[str, str, str]], row
         "description": meaning,
         "key": {"@id": f"{name}/{key}"},
         "field": [
-            {"@type": "cr:Field", "@id": f"{name}/{part}", "name": part, "description": text, "dataType": type_}
+            {
+                "@type": "cr:Field",
+                "@id": f"{name}/{part}",
+                "name": part,
+                "description": text,
+                "dataType": type_,
+            }
             for part, type_, text in fields
         ],
         "data": rows,
@@ -225,7 +281,10 @@ def _record_set(table: PublishedTable) -> Json:
                 "name": column,
                 "description": _vocabulary()["columns"].get(column, column),
                 **_type_of(type_),
-                "source": {"fileSet": {"@id": f"{_id(table.name)}-files"}, "extract": {"column": column}},
+                "source": {
+                    "fileSet": {"@id": f"{_id(table.name)}-files"},
+                    "extract": {"column": column},
+                },
             }
             for column, type_ in table.columns.items()
         ],

@@ -30,10 +30,12 @@ class CardDetails:
         name: name of the data set; None takes that of the source.
         description: a sentence or two; None makes one from the data.
         authors: names of the people or groups that publish it.
-        license: licence of the sequences whose carlasc.json names none, such as "cc-by-4.0", or the address of its text. Converted
-            sequences keep the licence of their source.
-        citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is always named, too.
-        url: address of the page where the data are published, such as "https://huggingface.co/datasets/ORG/NAME".
+        license: licence of the sequences whose carlasc.json names none, such as "cc-by-4.0", or the
+            address of its text. Converted sequences keep the licence of their source.
+        citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is always named,
+            too.
+        url: address of the page where the data are published, such as
+            "https://huggingface.co/datasets/ORG/NAME".
         contact: a name or an address for questions.
         version: version of the data.
         published: date of the publication, YYYY-MM-DD; None takes today.
@@ -54,13 +56,19 @@ class CardDetails:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"\d+(\.\d+){0,2}([-+][0-9A-Za-z.-]+)?", self.version):
-            raise ArgumentError("version", expected="a version such as 1.0.0", found=repr(self.version))
+            raise ArgumentError(
+                "version", expected="a version such as 1.0.0", found=repr(self.version)
+            )
         try:
             datetime.date.fromisoformat(self.published or "2000-01-01")
         except ValueError:
-            raise ArgumentError("published", expected="a date YYYY-MM-DD", found=repr(self.published)) from None
+            raise ArgumentError(
+                "published", expected="a date YYYY-MM-DD", found=repr(self.published)
+            ) from None
         if self.url is not None and not re.fullmatch(r"https?://[^\s\"'<>]+", self.url):
-            raise ArgumentError("url", expected="an address that begins with https://", found=repr(self.url))
+            raise ArgumentError(
+                "url", expected="an address that begins with https://", found=repr(self.url)
+            )
 
 
 @dataclass(frozen=True)
@@ -74,7 +82,8 @@ class Facts:
         statistics: the counts of classes, one for each class table; none without labels.
         every: every N-th frame was counted.
         reports: the reports beside the grids, by sequence and grid.
-        lossy_mm: step to which coordinates of points were rounded, millimetres; None for exact ones.
+        lossy_mm: step to which coordinates of points were rounded, millimetres; None for exact
+            ones.
     """
 
     overview: Overview
@@ -98,10 +107,14 @@ class Facts:
 
     @cached_property
     def splits(self) -> dict[str, tuple[int, int]]:
-        """Number of sequences and of frames of each split, in the order of the layout; "none" for sequences without a split."""
+        """Number of sequences and of frames of each split, in the order of the layout; "none" for
+        sequences without a split.
+        """
         order = {name: place for place, name in enumerate((*layout.SPLITS, "none"))}
         found: dict[str, tuple[int, int]] = {}
-        for sequence in sorted(self.overview.sequences, key=lambda one: order.get(one.split or "none", 9)):
+        for sequence in sorted(
+            self.overview.sequences, key=lambda one: order.get(one.split or "none", 9)
+        ):
             count, frames = found.get(sequence.split or "none", (0, 0))
             found[sequence.split or "none"] = (count + 1, frames + sequence.frames)
         return found
@@ -116,13 +129,26 @@ class Facts:
 
     @cached_property
     def grids(self) -> list[tuple[GridOverview, int, int]]:
-        """Each kind of grid, with its number of sequences and of frames. Grids of one kind differ only in their sequence."""
+        """Each kind of grid, with its number of sequences and of frames.
+
+        Grids of one kind differ only in their sequence.
+        """
         kinds: dict[tuple[object, ...], list[GridOverview]] = {}
         for sequence in self.overview.sequences:
             for grid in sequence.grids:
-                key = (grid.name, grid.coordinates, grid.size, grid.lower, grid.upper, grid.parts, str(grid.made))
+                key = (
+                    grid.name,
+                    grid.coordinates,
+                    grid.size,
+                    grid.lower,
+                    grid.upper,
+                    grid.parts,
+                    str(grid.made),
+                )
                 kinds.setdefault(key, []).append(grid)
-        return [(grids[0], len(grids), sum(grid.frames for grid in grids)) for grids in kinds.values()]
+        return [
+            (grids[0], len(grids), sum(grid.frames for grid in grids)) for grids in kinds.values()
+        ]
 
     @cached_property
     def licenses(self) -> list[License]:
@@ -142,13 +168,21 @@ class Facts:
     @property
     def synthetic(self) -> bool:
         """Whether some sequences were recorded in a simulator, by us or by others."""
-        return self.simulated or any(one.metadata.extra.get("simulated") is True for one in self.sequences.values())
+        return self.simulated or any(
+            one.metadata.extra.get("simulated") is True for one in self.sequences.values()
+        )
 
     @cached_property
     def citations(self) -> dict[str, str]:
         """What to cite for each source; "" if carlasc.json does not name it."""
-        said = {one.metadata.source: one.metadata.extra.get("citation") for one in self.sequences.values()}
-        return {source: text if isinstance(text := said.get(source), str) else "" for source in self.sources}
+        said = {
+            one.metadata.source: one.metadata.extra.get("citation")
+            for one in self.sequences.values()
+        }
+        return {
+            source: text if isinstance(text := said.get(source), str) else ""
+            for source in self.sources
+        }
 
     @cached_property
     def sensors(self) -> list[str]:
@@ -158,7 +192,9 @@ class Facts:
     @cached_property
     def versions(self) -> list[str]:
         """The versions of carlasc that made the grids, as their reports say."""
-        return sorted({str(report.versions.get("carlasc", "?")) for report in self.reports.values()})
+        return sorted(
+            {str(report.versions.get("carlasc", "?")) for report in self.reports.values()}
+        )
 
     @cached_property
     def gaps(self) -> int:
@@ -173,7 +209,9 @@ class Facts:
     def known_share(self) -> float | None:
         """Share of the voxels that are known; None without grids."""
         total = sum(one.total.unknown + int(one.total.voxels.sum()) for one in self.statistics)
-        return sum(int(one.total.voxels.sum()) for one in self.statistics) / total if total else None
+        return (
+            sum(int(one.total.voxels.sum()) for one in self.statistics) / total if total else None
+        )
 
 
 def gather(source: Source, license_: License | None, every: int, run: Run) -> Facts:
@@ -187,7 +225,10 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
     sequences = {path: one for path, one in source.sequences().items() if one.fields()}
     if not sequences:
         raise MissingDataError(
-            source.location, expected="sequences", found="none", advice="make them with `carlasc regrid`"
+            source.location,
+            expected="sequences",
+            found="none",
+            advice="make them with `carlasc regrid`",
         )
     parts = licensed_parts(sequences.values(), license_, source.location)
     reports = {}
@@ -196,10 +237,14 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
             name = layout.report_file(grid)
             if name in sequence.documents():
                 where = f"{sequence.location}/{name}"
-                reports[f"{path}/{grid}" if path else grid] = Report.from_json(sequence.read_document(name), where)
+                reports[f"{path}/{grid}" if path else grid] = Report.from_json(
+                    sequence.read_document(name), where
+                )
     overview = info(source)
     for one in overview.sequences:
-        if one.problem:  # otherwise, a grid that cannot be described would be missing from the card without a message
+        # otherwise, a grid that cannot be described would be missing from the card without a
+        # message
+        if one.problem:
             raise FormatError(one.path or source.location, problem=one.problem)
     return Facts(
         overview,
@@ -212,24 +257,32 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
     )
 
 
-def _count(location: str, sequences: Mapping[str, StoredSequence], every: int, run: Run) -> tuple[Statistics, ...]:
+def _count(
+    location: str, sequences: Mapping[str, StoredSequence], every: int, run: Run
+) -> tuple[Statistics, ...]:
     """Count the classes, separately for each class table; sequences without labels are left out."""
     if every < 1:
         raise ArgumentError("every", expected="1 or more", found=str(every))
     tables: dict[str, dict[str, StoredSequence]] = {}
     for path, sequence in sequences.items():
-        if "labels" in sequence.fields() or any(name.endswith("/labels") for name in sequence.fields()):
+        if "labels" in sequence.fields() or any(
+            name.endswith("/labels") for name in sequence.fields()
+        ):
             tables.setdefault(sequence.metadata.classes.name, {})[path] = sequence
     counted = []
     for chosen in tables.values():
         try:
-            counted.append(stats(ChosenSequences(location, chosen), remap=None, every=every, run=run))
+            counted.append(
+                stats(ChosenSequences(location, chosen), remap=None, every=every, run=run)
+            )
         except MissingDataError:  # several grids without the published one
             continue
     return tuple(counted)
 
 
-def shares(statistics: Statistics, histogram: Histogram) -> list[tuple[int, str, float | None, float | None]]:
+def shares(
+    statistics: Statistics, histogram: Histogram
+) -> list[tuple[int, str, float | None, float | None]]:
     """Return id, name, share of the points and share of the known voxels of each class that occurs."""
     points, voxels = int(histogram.points.sum()), int(histogram.voxels.sum())
     rows = []

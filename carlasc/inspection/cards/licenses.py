@@ -56,7 +56,11 @@ class License:
     @property
     def strictness(self) -> tuple[bool, bool, bool]:
         """A key by which stricter licences sort last."""
-        return self.derivatives is not True, self.commercial is not True, self.share_alike is not False
+        return (
+            self.derivatives is not True,
+            self.commercial is not True,
+            self.share_alike is not False,
+        )
 
 
 @cache
@@ -74,17 +78,26 @@ def _licenses() -> dict[str, License]:
 
 
 def find_license(text: str) -> License | None:
-    """Return the licence of a name such as "CC BY 4.0" or "cc-by-4.0", or of the address of a licence's text; None for another text."""
+    """Return the licence of a name such as "CC BY 4.0" or "cc-by-4.0", or of the address of a
+    licence's text; None for another text.
+    """
     stripped = text.strip()
     if re.fullmatch(r"https?://[^\s\"'<>]+", stripped):
-        if deed := re.match(r"https?://(?:www\.)?creativecommons\.org/licenses/([a-z-]+)/(\d\.\d)\b", stripped):
-            return _licenses().get(f"cc-{deed[1]}-{deed[2]}")  # /deed.en, /legalcode or a country may follow
+        if deed := re.match(
+            r"https?://(?:www\.)?creativecommons\.org/licenses/([a-z-]+)/(\d\.\d)\b", stripped
+        ):
+            # /deed.en, /legalcode or a country may follow
+            return _licenses().get(f"cc-{deed[1]}-{deed[2]}")
         address = re.sub(r"^https?://(www\.)?", "", stripped).rstrip("/")
         known = (
-            one for one in _licenses().values() if re.sub(r"^https://(www\.)?", "", one.url).rstrip("/") == address
+            one
+            for one in _licenses().values()
+            if re.sub(r"^https://(www\.)?", "", one.url).rstrip("/") == address
         )
         return next(known, License(stripped, stripped, _OTHER, None, None, None))
-    key = re.sub(r"\blicen[cs]e\b|\bv(?=\d)", "", stripped.lower().replace("creative commons", "cc"))
+    key = re.sub(
+        r"\blicen[cs]e\b|\bv(?=\d)", "", stripped.lower().replace("creative commons", "cc")
+    )
     key = re.sub(r"[^a-z0-9.]+", "-", key).strip("-")
     return _licenses().get(read_table("licenses.toml")["short"].get(key, key))
 
@@ -97,10 +110,13 @@ def license_given(text: str) -> License:
     """
     found = find_license(text)
     if found is None:
-        near = difflib.get_close_matches(text.lower(), [one.hub for one in _licenses().values()], 3, 0.5)
+        near = difflib.get_close_matches(
+            text.lower(), [one.hub for one in _licenses().values()], 3, 0.5
+        )
         raise ArgumentError(
             "license",
-            expected=f"the name of a licence, such as {', '.join(near or ['cc-by-4.0', 'cc-by-nc-sa-4.0', 'mit'])}",
+            expected=f"the name of a licence, such as "
+            f"{', '.join(near or ['cc-by-4.0', 'cc-by-nc-sa-4.0', 'mit'])}",
             found=repr(text),
             advice="for another licence, give the address of its text (https://...)",
         )
@@ -112,7 +128,8 @@ class LicensedPart:
     """The sequences of a data set that come from one source under one licence.
 
     Attributes:
-        source: what they were converted from, as carlasc.json says; None for sequences that were not converted.
+        source: what they were converted from, as carlasc.json says; None for sequences that were
+            not converted.
         license: the licence that holds for them.
         stated: whether the author of the card named the licence, because the data do not name one.
         paths: the sequences.
@@ -124,10 +141,13 @@ class LicensedPart:
     paths: tuple[str, ...]
 
 
-def licensed_parts(sequences: Iterable[Sequence], given: License | None, location: str) -> tuple[LicensedPart, ...]:
+def licensed_parts(
+    sequences: Iterable[Sequence], given: License | None, location: str
+) -> tuple[LicensedPart, ...]:
     """Return the licences of a data set, the strictest first.
 
-    A converted sequence keeps the licence of its source. `given` is the licence of sequences that name none.
+    A converted sequence keeps the licence of its source. `given` is the licence of sequences that
+    name none.
 
     Args:
         sequences: the sequences.
@@ -136,7 +156,8 @@ def licensed_parts(sequences: Iterable[Sequence], given: License | None, locatio
 
     Raises:
         FormatError: the licence in carlasc.json is unknown.
-        ArgumentError: a sequence has no licence, and none is given; or one is given, although all sequences have a licence.
+        ArgumentError: a sequence has no licence, and none is given; or one is given, although all
+            sequences have a licence.
         CarlascError: a licence forbids publishing derived data.
     """
     found: dict[tuple[str | None, License | None], list[str]] = {}
@@ -147,7 +168,8 @@ def licensed_parts(sequences: Iterable[Sequence], given: License | None, locatio
                 sequence.location,
                 expected="a licence that permits publishing derived data",
                 found=f"{license_.name} of {source or 'its source'}, which forbids that",
-                advice="publish instead how you made the data, so that others can convert their own copies",
+                advice="publish instead how you made the data, so that others can convert their "
+                "own copies",
             )
         found.setdefault((source, license_), []).append(sequence.path)
     known = {license_ for _, license_ in found if license_ is not None}
@@ -163,7 +185,8 @@ def licensed_parts(sequences: Iterable[Sequence], given: License | None, locatio
     if given is not None and not without and given not in known:
         raise ArgumentError(
             "license",
-            expected=f"{', '.join(sorted(one.name for one in known))}, the licence of the source, which also holds for data that are made from it",
+            expected=f"{', '.join(sorted(one.name for one in known))}, the licence of the source, "
+            f"which also holds for data that are made from it",
             found=given.name,
         )
     parts = []
@@ -171,7 +194,9 @@ def licensed_parts(sequences: Iterable[Sequence], given: License | None, locatio
         holds = given if license_ is None else license_
         assert holds is not None  # checked above
         parts.append(LicensedPart(source, holds, license_ is None, tuple(paths)))
-    return tuple(sorted(parts, key=lambda part: (part.license.strictness, part.source or ""), reverse=True))
+    return tuple(
+        sorted(parts, key=lambda part: (part.license.strictness, part.source or ""), reverse=True)
+    )
 
 
 def _license_of(sequence: Sequence) -> License | None:

@@ -1,4 +1,6 @@
-"""The location of the data of a card, on this machine and after publication; and the tables of a Parquet store, with their names in `datasets.load_dataset`."""
+"""The location of the data of a card, on this machine and after publication; and the tables of a
+Parquet store, with their names in `datasets.load_dataset`.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class PublishedTable:
     """The tables of one field of all sequences.
 
     Attributes:
-        name: its name as a configuration: `points`, `evaluation_labels`; `frames` for the table of frames.
+        name: its name as a configuration: `points`, `evaluation_labels`; `frames` for the table of
+            frames.
         title: what a row is.
         columns: type of each column, as pyarrow names it.
         files: paths of the files below the store, by split.
@@ -50,7 +53,8 @@ def split_of(sequence: Sequence) -> str:
 def tables_of(source: ParquetSource) -> list[PublishedTable]:
     """Return the tables, that of frames first.
 
-    Sequences whose tables have other columns (no times, or two bytes per label where others have one) have tables of their own.
+    Sequences whose tables have other columns (no times, or two bytes per label where others have
+    one) have tables of their own.
 
     Raises:
         FormatError: a table is damaged.
@@ -92,7 +96,8 @@ class Place:
         local: its path on this machine; None for a URL.
         name: its path below the folder of the card; "" if that is the folder itself.
         is_file: whether it is a single file.
-        repository: the address of the data at the Hugging Face Hub; None if they are not published there.
+        repository: the address of the data at the Hugging Face Hub; None if they are not published
+            there.
     """
 
     location: str
@@ -104,7 +109,11 @@ class Place:
     @property
     def title(self) -> str:
         """A name for the data set: that of its file or folder, without the ending of a store."""
-        name = PurePosixPath(self.location.partition("://")[2]).name if self.local is None else self.local.name
+        name = (
+            PurePosixPath(self.location.partition("://")[2]).name
+            if self.local is None
+            else self.local.name
+        )
         return re.sub(r"\.(parquet|zarr|h5|hdf5|zip)$", "", name) or "data"
 
     def published(self, path: str) -> str:
@@ -112,12 +121,17 @@ class Place:
         return str(PurePosixPath(self.name) / path) if self.name or path else ""
 
     def address(self, path: str) -> str:
-        """Return the address of a file: its URL if that is known, otherwise its path below the folder of the card."""
+        """Return the address of a file: its URL if that is known, otherwise its path below the
+        folder of the card.
+        """
         published = self.published(path)
         return f"{self.repository}/resolve/main/{published}" if self.repository else published
 
     def measure(self, path: str) -> tuple[int, str]:
-        """Return the bytes of a file and its SHA-256, 64 hexadecimal digits. The file is read once."""
+        """Return the bytes of a file and its SHA-256, 64 hexadecimal digits.
+
+        The file is read once.
+        """
         digest, size = hashlib.sha256(), 0
         for block in self._blocks(path):
             digest.update(block)
@@ -136,11 +150,14 @@ class Place:
                 yield block
 
 
-def place_of(source: str | os.PathLike[str] | Source, out: Path | None, url: str | None) -> tuple[Place, Path]:
+def place_of(
+    source: str | os.PathLike[str] | Source, out: Path | None, url: str | None
+) -> tuple[Place, Path]:
     """Return the location of the data, and the folder of the card.
 
-    The card is inside a folder of sequences or a Parquet store, because the Hugging Face Hub looks for it there, and beside other stores. A
-    source that is not below the folder of the card is described as if it were there, under its own name.
+    The card is inside a folder of sequences or a Parquet store, because the Hugging Face Hub looks
+    for it there, and beside other stores. A source that is not below the folder of the card is
+    described as if it were there, under its own name.
 
     Raises:
         ArgumentError: no folder is given, and the source is a URL or no path.
@@ -149,7 +166,9 @@ def place_of(source: str | os.PathLike[str] | Source, out: Path | None, url: str
     repository = url.rstrip("/") if url and url.startswith(_HUB) else None
     if is_url(location):
         if out is None:
-            raise ArgumentError("out", expected=f"a folder for the card, because {location} is a URL", found="none")
+            raise ArgumentError(
+                "out", expected=f"a folder for the card, because {location} is a URL", found="none"
+            )
         tree = RemoteTree(location)
         name = PurePosixPath(location.partition("://")[2].partition("?")[0]).name
         return Place(location, None, name, tree.size() is not None, repository), out

@@ -1,4 +1,8 @@
-"""README.md: the card for people. It begins with YAML that the Hugging Face Hub reads (https://huggingface.co/docs/hub/datasets-cards)."""
+"""README.md: the card for people.
+
+It begins with YAML that the Hugging Face Hub reads
+(https://huggingface.co/docs/hub/datasets-cards).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,13 @@ from carlasc.inspection.overview import GridOverview, SequenceOverview
 from carlasc.inspection.texts import fill, read, say
 from carlasc.storage.layout import EVALUATION
 
-_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"), (10**7, "1M<n<10M"))
+_SIZES = (
+    (1_000, "n<1K"),
+    (10_000, "1K<n<10K"),
+    (100_000, "10K<n<100K"),
+    (1_000_000, "100K<n<1M"),
+    (10**7, "1M<n<10M"),
+)
 _MOST_SEQUENCES = 60  # rows of the table of sequences
 
 
@@ -45,7 +55,10 @@ def readme(
         tables: the tables of a Parquet store.
         pictures: (path below the folder of the card, content) of each picture.
     """
-    opening = [_text(details.description or ""), *(f"![{_text(caption)}]({path})" for path, caption in pictures)]
+    opening = [
+        _text(details.description or ""),
+        *(f"![{_text(caption)}]({path})" for path, caption in pictures),
+    ]
     text = fill(
         "card.md",
         front_matter=_front_matter(facts, details, place, tables),
@@ -63,7 +76,9 @@ def readme(
     return text.encode()
 
 
-def _front_matter(facts: Facts, details: CardDetails, place: Place, tables: Sequence[PublishedTable]) -> str:
+def _front_matter(
+    facts: Facts, details: CardDetails, place: Place, tables: Sequence[PublishedTable]
+) -> str:
     names = list(dict.fromkeys(license_.hub for license_ in facts.licenses))
     others = [license_ for license_ in facts.licenses if license_.hub == "other"]
     values: dict[str, Any] = {"license": names[0] if len(names) == 1 else names}
@@ -85,13 +100,17 @@ def _front_matter(facts: Facts, details: CardDetails, place: Place, tables: Sequ
                 **({"default": True} if place_first else {}),
                 "data_files": [
                     {"split": split, "path": [glob.escape(place.published(path)) for path in paths]}
-                    for split, paths in sorted(table.files.items(), key=lambda item: _SPLITS.index(item[0]))
+                    for split, paths in sorted(
+                        table.files.items(), key=lambda item: _SPLITS.index(item[0])
+                    )
                 ],
             }
             for place_first, table in ((number == 0, table) for number, table in enumerate(tables))
         ]
     else:
-        values["viewer"] = False  # otherwise, the Hub would take the pictures of the card for the data
+        values["viewer"] = (
+            False  # otherwise, the Hub would take the pictures of the card for the data
+        )
     return _yaml(values)
 
 
@@ -115,7 +134,9 @@ def _tags(facts: Facts) -> list[str]:
 
 
 def _yaml(value: Any, indent: str = "") -> str:
-    """Return plain values as YAML: blocks for lists and objects, and JSON (a subset of YAML) for other values."""
+    """Return plain values as YAML: blocks for lists and objects, and JSON (a subset of YAML) for
+    other values.
+    """
     lines = []
     for key, entry in value.items() if isinstance(value, Mapping) else enumerate(value):
         head = f"{indent}- " if not isinstance(value, Mapping) else f"{indent}{key}:"
@@ -132,10 +153,16 @@ def _yaml(value: Any, indent: str = "") -> str:
 def _glance(facts: Facts, details: CardDetails) -> str:
     rows = [
         ["frames", f"{facts.frames:,} in {facts.sequences_told}"],
-        ["frames by split", ", ".join(f"{name} {frames:,}" for name, (_, frames) in facts.splits.items())],
+        [
+            "frames by split",
+            ", ".join(f"{name} {frames:,}" for name, (_, frames) in facts.splits.items()),
+        ],
         ["fields of scans", ", ".join(facts.fields) or "none"],
         ["grids", "; ".join(_grid(grid) for grid, _, _ in facts.grids) or "none"],
-        ["sensors", ", ".join(facts.sensors) or ("simulated LiDAR" if facts.simulated else "not named")],
+        [
+            "sensors",
+            ", ".join(facts.sensors) or ("simulated LiDAR" if facts.simulated else "not named"),
+        ],
         ["axes", " and ".join(sorted({one.axes for one in facts.overview.sequences})) + "-handed"],
         ["licence", ", ".join(license_.name for license_ in facts.licenses)],
         ["version", f"{details.version}, {details.published}"],
@@ -149,14 +176,14 @@ def _glance(facts: Facts, details: CardDetails) -> str:
 def _grid(grid: GridOverview) -> str:
     size = " x ".join(map(str, grid.size))
     cells = " x ".join(f"{edge:.3g}" for edge in grid.voxel_size)
-    return (
-        f"{grid.name} ({grid.coordinates}, {size} voxels of {cells}{' m' if grid.coordinates == 'cartesian' else ''})"
-    )
+    return f"{grid.name} ({grid.coordinates}, {size} voxels of {cells}{' m' if grid.coordinates == 'cartesian' else ''})"
 
 
 def _opening(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> str:
     name, first = place.name or ".", facts.overview.sequences[0]
-    extra = {"zarr": "[zarr]", "hdf5": "[hdf5]", "parquet": "[parquet]"}.get(facts.overview.store, "")
+    extra = {"zarr": "[zarr]", "hdf5": "[hdf5]", "parquet": "[parquet]"}.get(
+        facts.overview.store, ""
+    )
     target = place.repository and f"hf://datasets/{place.repository.partition('/datasets/')[2]}" + (
         f"/{place.name}" if place.name else ""
     )
@@ -176,12 +203,16 @@ def _opening(facts: Facts, place: Place, tables: Sequence[PublishedTable]) -> st
         config = next((table for table in tables if table.name == "points"), tables[0])
         split = json.dumps(sorted(config.files, key=_SPLITS.index)[0])
         hub = place.repository and json.dumps(place.repository.partition("/datasets/")[2])
-        data = say("data_on_hub", name=hub) if hub else say("data_here")  # "." would be a data set without a name
+        # "." would be a data set without a name
+        data = say("data_on_hub", name=hub) if hub else say("data_here")
         text += [
             say("open_tables"),
             say("open_datasets", data=data, split=split, config=json.dumps(config.name)),
             say("order_of_rows"),
-            _table(["configuration", "rows", "columns"], [[t.name, t.title, ", ".join(t.columns)] for t in tables]),
+            _table(
+                ["configuration", "rows", "columns"],
+                [[t.name, t.title, ", ".join(t.columns)] for t in tables],
+            ),
         ]
         text += [say("whole_numbers", step=f"{facts.lossy_mm:g}")] if facts.lossy_mm else []
     return "\n\n".join(text)
@@ -196,10 +227,14 @@ def _first_read(first: SequenceOverview) -> str:
 
 
 def _samples(facts: Facts, name: str) -> str:
-    """Return a line of Python that opens the data for training; "" without scans, or without grids of one name."""
+    """Return a line of Python that opens the data for training; "" without scans, or without grids
+    of one name.
+    """
     if not all("points" in one.fields and one.grids for one in facts.overview.sequences):
         return ""
-    common = set.intersection(*({grid.name for grid in one.grids} for one in facts.overview.sequences))
+    common = set.intersection(
+        *({grid.name for grid in one.grids} for one in facts.overview.sequences)
+    )
     if not common:
         return ""
     chosen = "" if EVALUATION in common else f", grid={json.dumps(min(common))}"
@@ -229,10 +264,18 @@ def _sequences(facts: Facts) -> str:
     text = [_table(["split", "sequences", "frames"], rows)]
     licenses = {path: part.license.name for part in facts.parts for path in part.paths}
     rows = [
-        [one.path or one.name, str(one.frames), one.source or "simulator", licenses.get(one.path, ""), one.classes]
+        [
+            one.path or one.name,
+            str(one.frames),
+            one.source or "simulator",
+            licenses.get(one.path, ""),
+            one.classes,
+        ]
         for one in facts.overview.sequences
     ]
-    text.append(_table(["sequence", "frames", "made from", "licence", "classes"], rows[:_MOST_SEQUENCES]))
+    text.append(
+        _table(["sequence", "frames", "made from", "licence", "classes"], rows[:_MOST_SEQUENCES])
+    )
     if len(rows) > _MOST_SEQUENCES:
         text.append(say("more_sequences", count=len(rows) - _MOST_SEQUENCES))
     return "\n\n".join(text)
@@ -240,7 +283,10 @@ def _sequences(facts: Facts) -> str:
 
 def _making(facts: Facts) -> str:
     text = [_text(" ".join([*collection(facts), *annotation(facts), *preprocessing(facts)]))]
-    rows = [[grid.name, str(count), f"{frames:,}", how_made(grid.made)] for grid, count, frames in facts.grids]
+    rows = [
+        [grid.name, str(count), f"{frames:,}", how_made(grid.made)]
+        for grid, count, frames in facts.grids
+    ]
     if rows:
         text.append(_table(["grid", "sequences", "frames", "how it was made"], rows))
     if facts.reports:
@@ -255,7 +301,13 @@ def _making(facts: Facts) -> str:
             for name, one in facts.reports.items()
         ]
         text.append(say("from_reports"))
-        header = ["grid", "known voxels %", "occupied of these %", "changed with a tenth fewer scans %", "made with"]
+        header = [
+            "grid",
+            "known voxels %",
+            "occupied of these %",
+            "changed with a tenth fewer scans %",
+            "made with",
+        ]
         text.append(_table(header, rows[:_MOST_SEQUENCES]))
     text += [say("settings")] if facts.grids else []
     return "\n\n".join(text)
@@ -294,7 +346,10 @@ def _limits(facts: Facts, details: CardDetails) -> str:
 def _citation(facts: Facts, details: CardDetails) -> str:
     text = [_code(details.citation)] if details.citation else []
     if facts.sources:
-        papers = [f"{source}: {paper or 'see the page of its publishers'}" for source, paper in facts.citations.items()]
+        papers = [
+            f"{source}: {paper or 'see the page of its publishers'}"
+            for source, paper in facts.citations.items()
+        ]
         text.append(say("cite_sources"))
         text.append("\n".join(f"- {_text(line)}" for line in papers))
     if details.citation or not facts.simulated:
@@ -316,10 +371,16 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]], *, links: bool 
     """Return a table; with `links`, cells may hold links and are not escaped."""
     lines = [header, ["---"] * len(header), *rows]
     cells = [[cell if links else _text(cell) for cell in line] for line in lines]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in cells)
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in cells
+    )
 
 
 def _text(text: str) -> str:
-    """Return a text, escaped for Markdown: names come from data, and must not start a tag, link or heading."""
+    """Return a text, escaped for Markdown: names come from data, and must not start a tag, link or
+    heading.
+    """
     shown = printable(" ".join(text.split()))
-    return re.sub(r"([\\`*_\[\]<>])", r"\\\1", shown) if re.search(r"[`*\[\]<>\\]", shown) else shown
+    return (
+        re.sub(r"([\\`*_\[\]<>])", r"\\\1", shown) if re.search(r"[`*\[\]<>\\]", shown) else shown
+    )

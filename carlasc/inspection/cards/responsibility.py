@@ -1,7 +1,8 @@
-"""The texts of a card about responsible use: how the data were collected and labelled, their limits, biases and uses.
+"""The texts of a card about responsible use: how the data were collected and labelled, their
+limits, biases and uses.
 
-They are made from the data and from their carlasc.json. They are the fields of Croissant's RAI vocabulary
-(https://docs.mlcommons.org/croissant); README.md contains the same texts.
+They are made from the data and from their carlasc.json. They are the fields of Croissant's RAI
+vocabulary (https://docs.mlcommons.org/croissant); README.md contains the same texts.
 """
 
 from __future__ import annotations
@@ -21,13 +22,18 @@ def responsibility(facts: Facts, details: CardDetails) -> dict[str, str | list[s
     """Return the RAI fields by their names in Croissant, without the prefix `rai:`."""
     tools = [f"carlasc {version}" for version in facts.versions] or ["carlasc"]
     grids = ", ".join(dict.fromkeys(grid.name for grid, _, _ in facts.grids)) or "none"
-    kinds = (("Software Collection", facts.simulated), ("Secondary Data analysis", bool(facts.sources)))
+    kinds = (
+        ("Software Collection", facts.simulated),
+        ("Secondary Data analysis", bool(facts.sources)),
+    )
     contact = say("contact", contact=details.contact) if details.contact else ""
     return {
         "dataCollection": " ".join(collection(facts)),
         "dataCollectionType": [kind for kind, holds in kinds if holds],
         "dataCollectionMissingData": " ".join(missing(facts)),
-        "dataCollectionRawData": say("raw_data", fields=", ".join(facts.fields) or "none kept", grids=grids),
+        "dataCollectionRawData": say(
+            "raw_data", fields=", ".join(facts.fields) or "none kept", grids=grids
+        ),
         "dataPreprocessingProtocol": preprocessing(facts),
         "dataImputationProtocol": _imputation(facts),
         "dataManipulationProtocol": " ".join(made(facts)),
@@ -35,7 +41,9 @@ def responsibility(facts: Facts, details: CardDetails) -> dict[str, str | list[s
         "dataAnnotationPlatform": tools,
         "dataAnnotationAnalysis": _analysis(facts),
         "annotationsPerItem": _per_item(facts),
-        "annotatorDemographics": [say("annotators_of_sources" if facts.sources else "no_annotators")],
+        "annotatorDemographics": [
+            say("annotators_of_sources" if facts.sources else "no_annotators")
+        ],
         "machineAnnotationTools": tools,
         "dataBiases": biases(facts),
         "dataUseCases": uses(facts),
@@ -68,11 +76,19 @@ def preprocessing(facts: Facts) -> list[str]:
     """Return how the scans were prepared, one sentence each."""
     axes = sorted({sequence.axes for sequence in facts.overview.sequences})
     sentences = [say("axes", axes=" or ".join(say(f"axes_{one}") for one in axes))]
-    ranges = {(one.metadata.min_range_m, one.metadata.max_range_m) for one in facts.sequences.values()}
+    ranges = {
+        (one.metadata.min_range_m, one.metadata.max_range_m) for one in facts.sequences.values()
+    }
     for near, far in sorted(ranges - {(None, None)}, key=str):
-        limits = [f"nearer than {near:g} m" if near else "", f"farther than {far:g} m" if far else ""]
+        limits = [
+            f"nearer than {near:g} m" if near else "",
+            f"farther than {far:g} m" if far else "",
+        ]
         sentences.append(say("ranges", limits=" or ".join(filter(None, limits))))
-    estimated = any(str(one.metadata.extra.get("poses")).startswith("kiss-icp") for one in facts.sequences.values())
+    estimated = any(
+        str(one.metadata.extra.get("poses")).startswith("kiss-icp")
+        for one in facts.sequences.values()
+    )
     return sentences + ([say("estimated_poses")] if estimated else [])
 
 
@@ -95,7 +111,16 @@ def made(facts: Facts) -> list[str]:
     sentences = []
     for grid, _, frames in facts.grids:
         size, how = " x ".join(map(str, grid.size)), how_made(grid.made)
-        sentences.append(say("grid", name=grid.name, coordinates=grid.coordinates, size=size, frames=frames, made=how))
+        sentences.append(
+            say(
+                "grid",
+                name=grid.name,
+                coordinates=grid.coordinates,
+                size=size,
+                frames=frames,
+                made=how,
+            )
+        )
     return sentences or [say("no_grids")]
 
 
@@ -117,7 +142,10 @@ def biases(facts: Facts) -> list[str]:
     """Return how unbalanced the classes are, one sentence each."""
     sentences = []
     for one in facts.statistics:
-        for what, counts in (("points", one.total.points), ("known voxels that are occupied", one.total.voxels)):
+        for what, counts in (
+            ("points", one.total.points),
+            ("known voxels that are occupied", one.total.voxels),
+        ):
             occupied = counts.copy()
             occupied[0] = 0  # unlabelled points, free voxels
             total = int(occupied.sum())
@@ -125,9 +153,15 @@ def biases(facts: Facts) -> list[str]:
                 continue
             order = np.argsort(occupied)[::-1][:3]
             top = ", ".join(
-                f"{one.classes.names.get(int(k), k)} {occupied[k] / total:.1%}" for k in order if occupied[k]
+                f"{one.classes.names.get(int(k), k)} {occupied[k] / total:.1%}"
+                for k in order
+                if occupied[k]
             )
-            names = [name for index, name in one.classes.names.items() if 0 < occupied[index] < RARE * total]
+            names = [
+                name
+                for index, name in one.classes.names.items()
+                if 0 < occupied[index] < RARE * total
+            ]
             rare = say("rare", limit=f"{RARE:.1%}", names=", ".join(names)) if names else ""
             sentences.append(say("unbalanced", what=what, top=top, rare=rare))
     sentences += [say("simulated_biases")] if facts.simulated else []
@@ -151,18 +185,28 @@ def limitations(facts: Facts) -> list[str]:
     """Return the known limits, one sentence each."""
     sentences = [say("simulated_limits")] if facts.simulated else []
     sentences += [text for text in missing(facts) if text != say("no_gaps")]
-    merged = any(grid.made is not None and grid.made.get("observe") == "scans" for grid, _, _ in facts.grids)
+    merged = any(
+        grid.made is not None and grid.made.get("observe") == "scans" for grid, _, _ in facts.grids
+    )
     sentences += [say("rounded", step=f"{facts.lossy_mm:g}")] if facts.lossy_mm else []
     sentences += [say("traces")] if merged else []
-    sentences += [say("class_tables")] if len({one.classes for one in facts.overview.sequences}) > 1 else []
+    sentences += (
+        [say("class_tables")] if len({one.classes for one in facts.overview.sequences}) > 1 else []
+    )
     return sentences + ([say("counted", every=facts.every)] if facts.every > 1 else [])
 
 
 def _imputation(facts: Facts) -> str:
-    inferred = {name: report.inferred_share for name, report in facts.reports.items() if report.inferred_share}
+    inferred = {
+        name: report.inferred_share
+        for name, report in facts.reports.items()
+        if report.inferred_share
+    }
     if not inferred:
         return say("not_inferred")
-    return say("inferred", shares=", ".join(f"{share:.1%} in {name}" for name, share in inferred.items()))
+    return say(
+        "inferred", shares=", ".join(f"{share:.1%} in {name}" for name, share in inferred.items())
+    )
 
 
 def _analysis(facts: Facts) -> list[str]:
@@ -176,7 +220,9 @@ def _analysis(facts: Facts) -> list[str]:
 
 def _per_item(facts: Facts) -> str:
     votes = [one.coverage.mean_votes for one in facts.reports.values() if one.coverage.mean_votes]
-    return say("per_item", mean=say("mean_votes", mean=f"{sum(votes) / len(votes):.1f}") if votes else "")
+    return say(
+        "per_item", mean=say("mean_votes", mean=f"{sum(votes) / len(votes):.1f}") if votes else ""
+    )
 
 
 def _personal(facts: Facts) -> str:

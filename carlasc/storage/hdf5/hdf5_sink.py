@@ -46,7 +46,10 @@ class HDF5Sink(PackedSink):
     """Writes a packed HDF5 file. It gets its final name only when the sink is finished."""
 
     def __init__(
-        self, path: str | os.PathLike[str], options: PackOptions | None = None, overwrite: bool = False
+        self,
+        path: str | os.PathLike[str],
+        options: PackOptions | None = None,
+        overwrite: bool = False,
     ) -> None:
         """Start a file. The file of an interrupted run is removed.
 
@@ -95,7 +98,12 @@ class HDF5Writer(PackedWriter):
     """Writes one sequence of a packed HDF5 file."""
 
     def __init__(
-        self, output: HDF5Output, path: str, group: str, options: PackOptions, finished: dict[str, str]
+        self,
+        output: HDF5Output,
+        path: str,
+        group: str,
+        options: PackOptions,
+        finished: dict[str, str],
     ) -> None:
         super().__init__(f"{output.location}/{group}", path)
         self._output = output
@@ -105,7 +113,9 @@ class HDF5Writer(PackedWriter):
         self._rows: dict[str, int] = {}
         self._fields: dict[str, HDF5FieldWriter] = {}
 
-    def expect(self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None) -> None:
+    def expect(
+        self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None
+    ) -> None:
         """Record the size of a typical frame, which determines the size of chunks."""
         self._rows.update(rows or {})
 
@@ -113,9 +123,13 @@ class HDF5Writer(PackedWriter):
         entry = layout.field_named(field)
 
         def plan(arrays: list[NDArray[Any]]) -> FieldLayout:
-            return FieldLayout.plan(field, self._options, typical_size(entry, arrays, self._rows, self.read_document))
+            return FieldLayout.plan(
+                field, self._options, typical_size(entry, arrays, self._rows, self.read_document)
+            )
 
-        self._fields[field] = HDF5FieldWriter(self._output, f"{self._group}/{field_node(field)}", field, plan)
+        self._fields[field] = HDF5FieldWriter(
+            self._output, f"{self._group}/{field_node(field)}", field, plan
+        )
         return self._fields[field]
 
     def close(self) -> None:
@@ -123,17 +137,31 @@ class HDF5Writer(PackedWriter):
         for field in self._fields.values():
             field.close()
         for name, data in self.contents.items():
-            attributes = {"type": DOCUMENT, "version": VERSION, "dtype": "uint8", "unit": "bytes", "name": name}
-            self._output.write_small(f"{self._group}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes)
+            attributes = {
+                "type": DOCUMENT,
+                "version": VERSION,
+                "dtype": "uint8",
+                "unit": "bytes",
+                "name": name,
+            }
+            self._output.write_small(
+                f"{self._group}/{document_node(name)}", np.frombuffer(data, np.uint8), attributes
+            )
         layouts = {name: field.layout for name, field in self._fields.items()}
-        frames, counts, columns = count_elements(layouts, {name: one.table for name, one in self._fields.items()})
+        frames, counts, columns = count_elements(
+            layouts, {name: one.table for name, one in self._fields.items()}
+        )
         about = {"version": VERSION, "dtype": "int64"}
-        self._output.write_small(f"{self._group}/frames", frames, about | {"type": "carlasc.frames", "unit": "frame"})
+        self._output.write_small(
+            f"{self._group}/frames", frames, about | {"type": "carlasc.frames", "unit": "frame"}
+        )
         about |= {"type": "carlasc.counts", "unit": "element", "columns": columns}
         self._output.write_small(f"{self._group}/counts", counts, about)
         for name, numbers, attributes in number_arrays(self.read_document):
             self._output.write_small(f"{self._group}/{name}", numbers, attributes)
-        self._output.write_group(self._group, {"type": SEQUENCE, "version": VERSION, **self.about()})
+        self._output.write_group(
+            self._group, {"type": SEQUENCE, "version": VERSION, **self.about()}
+        )
         self._finished[self.path] = self._group
 
 
@@ -148,7 +176,11 @@ class HDF5FieldWriter(FieldWriter):
     layout: FieldLayout
 
     def __init__(
-        self, output: HDF5Output, node: str, field: str, plan: Callable[[list[NDArray[Any]]], FieldLayout]
+        self,
+        output: HDF5Output,
+        node: str,
+        field: str,
+        plan: Callable[[list[NDArray[Any]]], FieldLayout],
     ) -> None:
         super().__init__(field)
         self.table: FrameTable = {}
@@ -165,7 +197,9 @@ class HDF5FieldWriter(FieldWriter):
         counts, parts = self.layout.divide(array, limited=False) if self._planned else ({}, {})
         for name, chunks in parts.items():
             if name not in self._columns:
-                self._columns[name] = HDF5ColumnWriter(self._output, f"{self._node}/{name}", self.layout, name)
+                self._columns[name] = HDF5ColumnWriter(
+                    self._output, f"{self._node}/{name}", self.layout, name
+                )
             self._columns[name].append(frame, chunks)
         self.table[frame] = counts
 
@@ -197,7 +231,9 @@ class HDF5ColumnWriter:
             self._flush()
 
     def close(self, frames: int) -> None:
-        """Write buffered chunks and the checksums of all chunks, and set the length of the data set to `frames`."""
+        """Write buffered chunks and the checksums of all chunks, and set the length of the data set
+        to `frames`.
+        """
         self._flush()
         self._dataset.resize(frames, axis=0)
         about = {"type": "carlasc.checksums", "version": VERSION, "dtype": "uint32"}
@@ -220,7 +256,10 @@ class HDF5ColumnWriter:
 
 
 class HDF5Output:
-    """Writes an HDF5 file with h5py. Chunks are encoded here in parallel, in the same way as by the Blosc filter."""
+    """Writes an HDF5 file with h5py.
+
+    Chunks are encoded here in parallel, in the same way as by the Blosc filter.
+    """
 
     def __init__(self, path: Path, place: Path) -> None:
         h5py = import_extra("h5py", "hdf5")
@@ -246,7 +285,9 @@ class HDF5Output:
         """Write a data set of one chunk."""
         self.remove(node)
         compact = (
-            {"chunks": array.shape, "shuffle": True, "compression": "gzip", "fletcher32": True} if array.size else {}
+            {"chunks": array.shape, "shuffle": True, "compression": "gzip", "fletcher32": True}
+            if array.size
+            else {}
         )
         dataset = self._file.create_dataset(node, data=array, **compact)
         _write_attributes(dataset, attributes)
@@ -255,10 +296,16 @@ class HDF5Output:
     def create(self, node: str, field_layout: FieldLayout, column: Column) -> Any:
         """Create the data set of a column, without frames."""
         shape, encoding = field_layout.frame_shape(column), column.encoding
-        most = shape if field_layout.is_grid else (*shape[:-1], None)  # rarely, a frame is longer, and the axis grows
+        # rarely, a frame is longer, and the axis grows
+        most = shape if field_layout.is_grid else (*shape[:-1], None)
         blosc = self._filters.Blosc(cname="zstd", clevel=encoding.level, shuffle=encoding.shuffle)
         dataset = self._file.create_dataset(
-            node, (0, *shape), column.dtype, chunks=field_layout.chunk_shape(column), maxshape=(None, *most), **blosc
+            node,
+            (0, *shape),
+            column.dtype,
+            chunks=field_layout.chunk_shape(column),
+            maxshape=(None, *most),
+            **blosc,
         )
         _write_attributes(dataset, field_layout.column_attributes(column))
         self.check()
@@ -279,10 +326,12 @@ class HDF5Output:
 
 
 def _write_attributes(node: Any, attributes: dict[str, Any]) -> None:
-    """Replace the attributes of a node. Text and numbers are written unchanged, other values as JSON under `<name>:json`.
+    """Replace the attributes of a node.
 
-    Text has a fixed length. HDF5 stores text of variable length in global heaps, the only structure of a file without a checksum. If a
-    heap is damaged by a few zeros, HDF5 2.0 hangs.
+    Text and numbers are written unchanged, other values as JSON under `<name>:json`.
+
+    Text has a fixed length. HDF5 stores text of variable length in global heaps, the only structure
+    of a file without a checksum. If a heap is damaged by a few zeros, HDF5 2.0 hangs.
     """
     for name in list(node.attrs):
         del node.attrs[name]

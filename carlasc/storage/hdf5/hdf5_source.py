@@ -1,7 +1,7 @@
 """Reading packed stores in HDF5: groups and chunked data sets, compressed by the Blosc filter.
 
-Any HDF5 reader with hdf5plugin can open them. This module looks up the offsets of chunks with h5py once per data set, and reads and
-decodes the chunks directly.
+Any HDF5 reader with hdf5plugin can open them. This module looks up the offsets of chunks with h5py
+once per data set, and reads and decodes the chunks directly.
 """
 
 from __future__ import annotations
@@ -83,7 +83,9 @@ class HDF5Store(ArrayStore):
             )
 
     def stored_bytes(self, node: str) -> int:
-        """Return the stored bytes of the data sets below a node; for the root, the size of the file."""
+        """Return the stored bytes of the data sets below a node; for the root, the size of the
+        file.
+        """
         if not node:
             return Path(self.location).stat().st_size
         h5py = import_extra("h5py", "hdf5")
@@ -102,7 +104,10 @@ class HDF5Store(ArrayStore):
         found = find_node(file, node, self.location)
         if not isinstance(found, import_extra("h5py", "hdf5").Dataset):
             raise FormatError(
-                self.location, expected=f"the data set {node}", found="none", advice="the store is damaged"
+                self.location,
+                expected=f"the data set {node}",
+                found="none",
+                advice="the store is damaged",
             )
         return found
 
@@ -111,7 +116,11 @@ class HDF5Store(ArrayStore):
         h5py = import_extra("h5py", "hdf5")
         with reading(self.location, "an HDF5 file", "the file may be truncated or corrupted"):
             if isinstance(self.tree, RemoteTree):
-                with self.tree.open(self.path) as remote, holding_a_lock(), h5py.File(remote, "r") as file:
+                with (
+                    self.tree.open(self.path) as remote,
+                    holding_a_lock(),
+                    h5py.File(remote, "r") as file,
+                ):
                     yield file
             else:
                 with h5py.File(self.location, "r", locking=False) as file:
@@ -119,7 +128,9 @@ class HDF5Store(ArrayStore):
 
 
 class HDF5Array(StoredArray):
-    """A chunked data set with the Blosc filter, and the offset and the checksum of each existing chunk."""
+    """A chunked data set with the Blosc filter, and the offset and the checksum of each existing
+    chunk.
+    """
 
     extra = "hdf5"
     _path: str
@@ -127,7 +138,9 @@ class HDF5Array(StoredArray):
     _checksums: dict[int, int]
 
     @classmethod
-    def from_dataset(cls, tree: Tree, path: str, dataset: Any, checksums: NDArray[np.uint32]) -> HDF5Array:
+    def from_dataset(
+        cls, tree: Tree, path: str, dataset: Any, checksums: NDArray[np.uint32]
+    ) -> HDF5Array:
         """Look up the offsets of the chunks of a data set.
 
         Args:
@@ -140,7 +153,12 @@ class HDF5Array(StoredArray):
             FormatError: it is not chunked, has other filters, or another number of chunks.
         """
         where, shape, chunk = f"{tree.where(path)}: {dataset.name}", dataset.shape, dataset.chunks
-        if chunk is None or _filters(dataset) != [_BLOSC] or dataset.dtype.kind not in "uif" or checksums.ndim != 1:
+        if (
+            chunk is None
+            or _filters(dataset) != [_BLOSC]
+            or dataset.dtype.kind not in "uif"
+            or checksums.ndim != 1
+        ):
             raise FormatError(
                 where,
                 expected="a chunked data set with the Blosc filter",
@@ -197,9 +215,12 @@ class HDF5Array(StoredArray):
 
 
 def find_node(file: Any, node: str, where: str) -> Any:
-    """Return a group or a data set of a file; None if it does not exist. Only hard links inside the file are followed.
+    """Return a group or a data set of a file; None if it does not exist.
 
-    In HDF5, a link or a data set can refer to another file. An untrusted store must not give access to other files of this machine.
+    Only hard links inside the file are followed.
+
+    In HDF5, a link or a data set can refer to another file. An untrusted store must not give access
+    to other files of this machine.
 
     Raises:
         FormatError: a link on the path refers to another file, or is symbolic.
@@ -211,37 +232,65 @@ def find_node(file: Any, node: str, where: str) -> Any:
         if link is None:
             return None
         if not isinstance(link, h5py.HardLink):
-            kind = "a link to another file" if isinstance(link, h5py.ExternalLink) else "a symbolic link"
-            raise FormatError(f"{where}: {node}", expected="data in the file itself", found=kind, advice=_UNTRUSTED)
+            kind = (
+                "a link to another file"
+                if isinstance(link, h5py.ExternalLink)
+                else "a symbolic link"
+            )
+            raise FormatError(
+                f"{where}: {node}",
+                expected="data in the file itself",
+                found=kind,
+                advice=_UNTRUSTED,
+            )
         found = found[name]
     if isinstance(found, h5py.Dataset) and (found.is_virtual or found.external):
         raise FormatError(
-            f"{where}: {node}", expected="values in the file itself", found="values in other files", advice=_UNTRUSTED
+            f"{where}: {node}",
+            expected="values in the file itself",
+            found="values in other files",
+            advice=_UNTRUSTED,
         )
     return found
 
 
 def check_small(dataset: Any, what: str) -> None:
-    """Check that a data set that is read whole has a plausible size in memory, compared with its stored size.
+    """Check that a data set that is read whole has a plausible size in memory, compared with its
+    stored size.
 
     Raises:
         FormatError: it is too large, or has values or filters that carlasc does not write.
     """
-    size, stored, filters = dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size(), _filters(dataset)
+    size, stored, filters = (
+        dataset.size * dataset.dtype.itemsize,
+        dataset.id.get_storage_size(),
+        _filters(dataset),
+    )
     if dataset.dtype.kind not in "uif" or not set(filters) <= _SMALL_FILTERS:
-        raise FormatError(what, expected="numbers without filters or with gzip", found="other data", advice=_UNTRUSTED)
+        raise FormatError(
+            what,
+            expected="numbers without filters or with gzip",
+            found="other data",
+            advice=_UNTRUSTED,
+        )
     check_ratio(size, stored, what)
     if dataset.chunks is None or not size:
         if size > stored:  # HDF5 would fill the rest with zeros
-            raise FormatError(what, expected=f"{size} bytes", found=f"{stored}", advice="the store is damaged")
+            raise FormatError(
+                what, expected=f"{size} bytes", found=f"{stored}", advice="the store is damaged"
+            )
         return
     if dataset.chunks != dataset.shape or dataset.id.get_num_chunks() != 1:
-        raise FormatError(what, expected="one chunk", found="several chunks", advice="the store is damaged")
+        raise FormatError(
+            what, expected="one chunk", found="several chunks", advice="the store is damaged"
+        )
     if _GZIP in filters:  # HDF5 decompresses a whole chunk without a limit
         packed = dataset.id.read_direct_chunk((0,) * len(dataset.shape))[1]
         unpacked = zlib.decompressobj().decompress(packed, size + 1)
         if len(unpacked) != size:
-            raise FormatError(what, expected=f"{size} bytes", found="another size", advice=_UNTRUSTED)
+            raise FormatError(
+                what, expected=f"{size} bytes", found="another size", advice=_UNTRUSTED
+            )
 
 
 def _filters(dataset: Any) -> list[int]:

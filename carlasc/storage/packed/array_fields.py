@@ -1,4 +1,6 @@
-"""Reading the frames of a field in a store of arrays: finding, fetching and decoding the chunks of a frame."""
+"""Reading the frames of a field in a store of arrays: finding, fetching and decoding the chunks of
+a frame.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,10 @@ class ArrayField:
             where: name of the sequence in errors.
             field_layout: layout of the field.
             frames: (n,) sorted frame numbers.
-            counts: (n,) number of elements of each frame, by column; -1 if the field does not have the frame.
-            array_of: returns the array of a column. Called on the first read, for the columns that are in use.
+            counts: (n,) number of elements of each frame, by column; -1 if the field does not have
+                the frame.
+            array_of: returns the array of a column. Called on the first read, for the columns that
+                are in use.
             local: whether the store is on this machine.
         """
         exists = np.zeros(len(frames), np.bool_)
@@ -49,7 +53,9 @@ class ArrayField:
         self.packing = field_layout.packing
         self.frames = frames[exists]
         self.local = local
-        self._counts = {name: column[exists] for name, column in counts.items() if (column > 0).any()}
+        self._counts = {
+            name: column[exists] for name, column in counts.items() if (column > 0).any()
+        }
         self._array_of = array_of
         self._positions = {frame: position for position, frame in enumerate(self.frames.tolist())}
 
@@ -59,30 +65,48 @@ class ArrayField:
         found = {}
         for name, counts in self._counts.items():
             column, array = self.layout.columns[name], self._array_of(name)
-            self.layout.check(array, column, int(self.frames[-1]), int(counts.max()), f"{self.where}/{name}")
+            self.layout.check(
+                array, column, int(self.frames[-1]), int(counts.max()), f"{self.where}/{name}"
+            )
             firsts = self.frames * array.slots
-            found[name] = StoredColumn(column, array, firsts, np.maximum(counts, 0), self.layout.is_grid)
+            found[name] = StoredColumn(
+                column, array, firsts, np.maximum(counts, 0), self.layout.is_grid
+            )
         return found
 
     def read(self, frames: list[int]) -> list[NDArray[Any]]:
-        """Read frames. All their chunks are fetched at once from a remote store, and frames are decoded in parallel."""
+        """Read frames.
+
+        All their chunks are fetched at once from a remote store, and frames are decoded in
+        parallel.
+        """
         positions = [self._position(frame) for frame in frames]
         tasks = {name: self._parts(column, frames) for name, column in self.columns.items()}
         main = self.columns.get(self.packing.columns[0].name)
-        outputs = self.packing.allocate([main.counts[position] if main else 0 for position in positions])
+        outputs = self.packing.allocate(
+            [main.counts[position] if main else 0 for position in positions]
+        )
 
         def assemble(k: int) -> NDArray[Any]:
             with self._naming([frames[k]]):
                 parts = {}
                 for column in self.packing.columns:
                     name = self._stored_in(column, positions[k])
-                    parts[column.name] = _empty(column) if name is None else self.columns[name].decode(tasks[name][k])
+                    parts[column.name] = (
+                        _empty(column)
+                        if name is None
+                        else self.columns[name].decode(tasks[name][k])
+                    )
                 return self.packing.join(parts, outputs[k])
 
         return parallel(assemble, range(len(frames)))
 
-    def read_planes(self, frames: list[int], spare: list[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-        """Read the points of frames as (N, 3), each coordinate contiguous, into the memory of `spare` where it fits."""
+    def read_planes(
+        self, frames: list[int], spare: list[NDArray[np.float32]]
+    ) -> list[NDArray[np.float32]]:
+        """Read the points of frames as (N, 3), each coordinate contiguous, into the memory of
+        `spare` where it fits.
+        """
         packing, column = cast(PointsPacking, self.packing), self.columns.get("xyz")
         if column is None:
             return [np.empty((0, 3), np.float32) for _ in frames]
@@ -97,21 +121,30 @@ class ArrayField:
 
     def published_bytes(self) -> int:
         """Return the bytes of the field's published files, from the numbers of elements."""
-        return self.packing.published_bytes({name: sum(column.counts) for name, column in self.columns.items()})
+        return self.packing.published_bytes(
+            {name: sum(column.counts) for name, column in self.columns.items()}
+        )
 
     def files_of(self, frames: list[int]) -> list[str]:
         """Return the files that hold some frames, each once."""
         positions = [self._position(frame) for frame in frames]
         files = [
-            column.array.files([number for task in column.parts(positions) for number in task.chunks])
+            column.array.files(
+                [number for task in column.parts(positions) for number in task.chunks]
+            )
             for column in self.columns.values()
         ]
         return list(dict.fromkeys(file for found in files for file in found))
 
     def _stored_in(self, column: Column, position: int) -> str | None:
-        """Return the name of the stored column with the elements of a frame: the column or its wide column."""
+        """Return the name of the stored column with the elements of a frame: the column or its wide
+        column.
+        """
         stored = [name for name in (column.name, f"{column.name}{WIDE}") if name in self.columns]
-        return next((name for name in stored if self.columns[name].counts[position]), stored[0] if stored else None)
+        return next(
+            (name for name in stored if self.columns[name].counts[position]),
+            stored[0] if stored else None,
+        )
 
     def _parts(self, column: StoredColumn, frames: list[int]) -> list[FramePart]:
         """Return the parts of a column to read, already fetched if the store is remote."""
@@ -124,8 +157,12 @@ class ArrayField:
 
     @contextmanager
     def _naming(self, frames: list[int]) -> Iterator[None]:
-        """Add the field and the frames to errors, and turn errors of inconsistent columns into a FormatError."""
-        where = f"{self.where}: field {self.packing.entry.name}, frame {', '.join(map(str, frames))}"
+        """Add the field and the frames to errors, and turn errors of inconsistent columns into a
+        FormatError.
+        """
+        where = (
+            f"{self.where}: field {self.packing.entry.name}, frame {', '.join(map(str, frames))}"
+        )
         with reading(where, "the columns of a frame", "the store is damaged"):
             try:
                 yield
@@ -134,7 +171,9 @@ class ArrayField:
 
     def _position(self, frame: int) -> int:
         if frame not in self._positions:
-            raise MissingDataError(self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it")
+            raise MissingDataError(
+                self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it"
+            )
         return self._positions[frame]
 
 
@@ -160,11 +199,17 @@ class StoredColumn:
         column: description of the column.
         array: the chunks.
         firsts: number of the first chunk of each frame.
-        counts: number of elements of each frame; for a grid, a number above 0 means that the frame exists.
+        counts: number of elements of each frame; for a grid, a number above 0 means that the frame
+            exists.
     """
 
     def __init__(
-        self, column: Column, array: StoredArray, firsts: NDArray[np.int64], counts: NDArray[np.int64], is_grid: bool
+        self,
+        column: Column,
+        array: StoredArray,
+        firsts: NDArray[np.int64],
+        counts: NDArray[np.int64],
+        is_grid: bool,
     ) -> None:
         self.column = column
         self.array = array
@@ -179,7 +224,11 @@ class StoredColumn:
             first, count = self.firsts[position], self.counts[position]
             chunks = min(count, 1) if self.is_grid else -(-count // step)
             if not self.is_grid:
-                check_size((self.column.rows or 1, chunks, step), self.array.dtype, f"a frame of {self.array.name}")
+                check_size(
+                    (self.column.rows or 1, chunks, step),
+                    self.array.dtype,
+                    f"a frame of {self.array.name}",
+                )
             found.append(FramePart(range(first, first + chunks), count))
         return found
 
@@ -190,11 +239,17 @@ class StoredColumn:
             task.fetched = [next(data) for _ in task.chunks]
 
     def memory_for(self, task: FramePart, spare: list[NDArray[Any]]) -> NDArray[Any]:
-        """Return memory to decode a frame into: a spare array of the same shape, otherwise new memory, which is slower to write to."""
+        """Return memory to decode a frame into: a spare array of the same shape, otherwise new
+        memory, which is slower to write to.
+        """
         shape = (self.column.rows or 1, len(task.chunks) * self.array.step)
         while spare:
             memory = spare.pop().base
-            if isinstance(memory, np.ndarray) and memory.shape == shape and memory.dtype == self.array.dtype:
+            if (
+                isinstance(memory, np.ndarray)
+                and memory.shape == shape
+                and memory.dtype == self.array.dtype
+            ):
                 return memory
         return np.empty(shape, self.array.dtype)
 
@@ -202,7 +257,9 @@ class StoredColumn:
         """Decode a frame's chunks, into `out` if it is given."""
         parts = task.fetched if task.fetched is not None else self.array.fetch(task.chunks)
         if self.is_grid:
-            return self._decode_chunk(parts[0], task.chunks[0], np.empty(self.array.chunk, self.array.dtype))[0]
+            return self._decode_chunk(
+                parts[0], task.chunks[0], np.empty(self.array.chunk, self.array.dtype)
+            )[0]
         step, rows = self.array.step, self.column.rows or 1
         shape, dtype = (rows, len(parts) * step), self.array.dtype
         if out is None:

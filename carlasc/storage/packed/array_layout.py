@@ -1,7 +1,9 @@
-"""The layout of the frames of a field in a store of arrays, zarr or HDF5. See `docs/packed-format.md#arrays`.
+"""The layout of the frames of a field in a store of arrays, zarr or HDF5.
 
-The position of a frame depends only on its number: frame i of a column is entry i of its array. Any block of frames can therefore be
-written independently of the others, and found without an index.
+See `docs/packed-format.md#arrays`.
+
+The position of a frame depends only on its number: frame i of a column is entry i of its array. Any
+block of frames can therefore be written independently of the others, and found without an index.
 """
 
 from __future__ import annotations
@@ -22,10 +24,17 @@ from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
 from carlasc.storage.packed.stores import VERSION, PackOptions
 
-SEQUENCE, FIELD, COLUMN, DOCUMENT = "carlasc.sequence", "carlasc.field", "carlasc.column", "carlasc.document"
+SEQUENCE, FIELD, COLUMN, DOCUMENT = (
+    "carlasc.sequence",
+    "carlasc.field",
+    "carlasc.column",
+    "carlasc.document",
+)
 _SLOTS = 16  # a frame has room for this many typical frames
 _PCODEC = "pcodec"  # value of the attribute `codec` of points that PCodec compressed
-_HEADROOM = 1.125  # a chunk is this much larger than a typical frame, so that few frames need a second one
+_HEADROOM = (
+    1.125  # a chunk is this much larger than a typical frame, so that few frames need a second one
+)
 # A frame has room for four votes per voxel, and for one moving voxel in four.
 _CELLS_PER_ROW = {"vote": 4, "moving voxel": 64}
 _PICTURE = 1 << 18  # bytes of a picture, unless the first pictures are larger
@@ -63,7 +72,10 @@ class FieldLayout:
         """
         if attributes is None or attributes.get("type") != FIELD:
             raise FormatError(
-                where, expected="the field that the sequence lists", found="none", advice="the store is damaged"
+                where,
+                expected="the field that the sequence lists",
+                found="none",
+                advice="the store is damaged",
             )
         scale = attributes.get("scale_m")
         if scale is not None and not (type(scale) in (int, float) and 0 < scale <= 1):
@@ -74,13 +86,22 @@ class FieldLayout:
         options = PackOptions(small=attributes.get("codec") == _PCODEC)
         packing = packing_of(layout.field_named(field), options, attributes)
         if attributes.get("kind") != packing.kind:
-            raise FormatError(where, expected=f"a field of kind {packing.kind}", found=repr(attributes.get("kind")))
+            raise FormatError(
+                where,
+                expected=f"a field of kind {packing.kind}",
+                found=repr(attributes.get("kind")),
+            )
         size = attributes.get("shape" if packing.kind == "grid" else "chunk")
         numbers = size if isinstance(size, list) else [size]
         if not all(type(number) is int and 0 < number < 2**31 for number in numbers) or (
             len(numbers) != 3 if packing.kind == "grid" else isinstance(size, list)
         ):
-            raise FormatError(where, expected="a chunk size above 0", found=repr(size), advice="the store is damaged")
+            raise FormatError(
+                where,
+                expected="a chunk size above 0",
+                found=repr(size),
+                advice="the store is damaged",
+            )
         return cls(packing, attributes)
 
     @classmethod
@@ -99,12 +120,21 @@ class FieldLayout:
         else:
             size = {"chunk": max(_round_up(int(typical[0] * _HEADROOM)), LEAST)}
         about = {"type": FIELD, "version": VERSION, "field": entry.name, "kind": packing.kind}
-        about |= {"dtype": np.dtype(entry.dtype).name if entry.dtype else "table", "unit": entry.unit}
-        codec = {"codec": _PCODEC} if any(column.encoding.codec == _PCODEC for column in packing.columns) else {}
+        about |= {
+            "dtype": np.dtype(entry.dtype).name if entry.dtype else "table",
+            "unit": entry.unit,
+        }
+        codec = (
+            {"codec": _PCODEC}
+            if any(column.encoding.codec == _PCODEC for column in packing.columns)
+            else {}
+        )
         return cls(packing, about | size | codec | dict(packing.attributes))
 
     def frame_shape(self, column: Column) -> tuple[int, ...]:
-        """Return the shape of one entry of the array of a column: (X, Y, Z) for a grid, otherwise ([rows,] most elements of a frame)."""
+        """Return the shape of one entry of the array of a column: (X, Y, Z) for a grid, otherwise
+        ([rows,] most elements of a frame).
+        """
         if self.is_grid:
             return tuple(self.attributes["shape"])
         typical, step = self._typical(column), self._step(column)
@@ -117,7 +147,12 @@ class FieldLayout:
 
     def column_attributes(self, column: Column) -> dict[str, Any]:
         """Return the attributes of a column's array."""
-        return {"type": COLUMN, "version": VERSION, "dtype": np.dtype(column.dtype).name, "unit": column.unit}
+        return {
+            "type": COLUMN,
+            "version": VERSION,
+            "dtype": np.dtype(column.dtype).name,
+            "unit": column.unit,
+        }
 
     def _step(self, column: Column) -> int:
         return column.step or self._typical(column)
@@ -126,7 +161,8 @@ class FieldLayout:
         return FEW if column.least == FEW else int(self.attributes["chunk"])
 
     def check(self, array: StoredArray, column: Column, last: int, most: int, where: str) -> None:
-        """Check that a stored array fits a column, and has room for the frames that the store lists.
+        """Check that a stored array fits a column, and has room for the frames that the store
+        lists.
 
         Args:
             array: the stored array.
@@ -138,7 +174,13 @@ class FieldLayout:
         Raises:
             FormatError: the array does not fit, or is too small.
         """
-        rest = tuple(self.attributes["shape"]) if self.is_grid else (column.rows,) if column.rows else ()
+        rest = (
+            tuple(self.attributes["shape"])
+            if self.is_grid
+            else (column.rows,)
+            if column.rows
+            else ()
+        )
         rest += () if self.is_grid else (array.step,)
         fits = array.dtype == np.dtype(column.dtype) and array.chunk == (1, *rest)
         fits = fits and last < array.shape[0] < 2**63 // max(1, array.slots)
@@ -158,10 +200,12 @@ class FieldLayout:
 
         Args:
             array: the array of the frame.
-            limited: whether the number of elements is limited to the reserved room. If not, the last column grows.
+            limited: whether the number of elements is limited to the reserved room. If not, the
+                last column grows.
 
         Returns:
-            The number of elements and the chunks, both by column, of the columns that the frame uses.
+            The number of elements and the chunks, both by column, of the columns that the frame
+            uses.
 
         Raises:
             FormatError: the array does not fit the field.
@@ -169,7 +213,8 @@ class FieldLayout:
         self.packing.entry.check(array, "its array")
         if self.is_grid and list(array.shape) != self.attributes["shape"]:
             raise FormatError(
-                "its array", expected=f"shape {tuple(self.attributes['shape'])}, as in earlier frames",
+                "its array", expected=f"shape {tuple(self.attributes['shape'])}, as in earlier "
+                                      f"frames",
                 found=str(array.shape),
             )  # fmt: skip
         counts, chunks = {}, {}
@@ -193,7 +238,8 @@ class FieldLayout:
             return widest
         raise FormatError(
             "its array",
-            expected=f"at most {self.frame_shape(widest)[-1]} elements ({_SLOTS} times a typical frame)",
+            expected=f"at most {self.frame_shape(widest)[-1]} elements ({_SLOTS} times a typical "
+            f"frame)",
             found=str(values.shape[-1]),
             advice="leave the frame out, or pack to an .h5 store",
         )
@@ -225,7 +271,8 @@ def typical_size(
         read_document: returns a text file of the sequence, None if it does not exist.
 
     Returns:
-        The shape of a grid, or (number of elements of a typical frame,): as announced, otherwise the maximum of the first frames.
+        The shape of a grid, or (number of elements of a typical frame,): as announced, otherwise
+        the maximum of the first frames.
     """
     if entry.per == "voxel":
         return arrays[0].shape
@@ -235,7 +282,11 @@ def typical_size(
         announced = _cells(entry.folder, read_document) // _CELLS_PER_ROW[entry.per]
     if announced is None:
         announced = max(map(len, arrays), default=0)
-        announced = 1 << (max(announced, _PICTURE) - 1).bit_length() if entry.kind == "picture" else announced
+        announced = (
+            1 << (max(announced, _PICTURE) - 1).bit_length()
+            if entry.kind == "picture"
+            else announced
+        )
     return (announced,)
 
 
@@ -243,7 +294,11 @@ def _cells(grid: str, read_document: Callable[[str], bytes | None]) -> int:
     """Return the number of voxels of a grid; 0 if it is not known."""
     data = read_document(layout.params_file(grid))
     try:
-        return 0 if data is None else math.prod(GridSpec.from_params(parse_json(data, grid), grid).size)
+        return (
+            0
+            if data is None
+            else math.prod(GridSpec.from_params(parse_json(data, grid), grid).size)
+        )
     except FormatError:
         return 0
 
@@ -258,8 +313,8 @@ def count_elements(
         tables: the frames of each field, at least one.
 
     Returns:
-        frames: (N,) sorted frame numbers; counts: (N, C) number of elements per frame and column, -1 if the field lacks the frame; and
-        the nodes of the C columns.
+        frames: (N,) sorted frame numbers; counts: (N, C) number of elements per frame and column,
+        -1 if the field lacks the frame; and the nodes of the C columns.
     """
     frames = sorted({frame for table in tables.values() for frame in table})
     columns: dict[str, list[int]] = {}
@@ -273,16 +328,26 @@ def count_elements(
     return np.array(frames, "<i8"), np.ascontiguousarray(counts_of), list(columns)
 
 
-def number_arrays(read_document: Callable[[str], bytes | None]) -> Iterator[tuple[str, NDArray[Any], dict[str, Any]]]:
-    """Yield poses and times as arrays, for programs that do not read the text files: name, values and attributes."""
+def number_arrays(
+    read_document: Callable[[str], bytes | None],
+) -> Iterator[tuple[str, NDArray[Any], dict[str, Any]]]:
+    """Yield poses and times as arrays, for programs that do not read the text files: name, values
+    and attributes.
+    """
     for name, document, decode, unit in (
         ("poses", layout.POSES, layout.decode_poses, "m"),
         ("times", layout.TIMES, layout.decode_times, "s"),
     ):
         data = read_document(document)
-        with suppress(FormatError):  # not numbers: the text is kept unchanged, and its reader reports the error
+        # not numbers: the text is kept unchanged, and its reader reports the error
+        with suppress(FormatError):
             if data is not None:
-                about = {"type": "carlasc.numbers", "version": VERSION, "dtype": "float64", "unit": unit}
+                about = {
+                    "type": "carlasc.numbers",
+                    "version": VERSION,
+                    "dtype": "float64",
+                    "unit": unit,
+                }
                 yield name, decode(data, document), about | {"document": document}
 
 

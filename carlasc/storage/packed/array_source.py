@@ -84,7 +84,9 @@ class ArraySource(PackedSource):
         """Return the size of the published files by field, computed from the numbers of elements."""
         sizes: Counter[str] = Counter()
         for sequence in self._sequences().values():
-            sizes["documents"] += sum(len(sequence.read_document(name)) for name in sequence.documents())
+            sizes["documents"] += sum(
+                len(sequence.read_document(name)) for name in sequence.documents()
+            )
             for field in sorted(sequence.fields()):
                 sizes[field] += sequence.published_bytes(field)
         return dict(sizes)
@@ -101,7 +103,10 @@ class ArraySource(PackedSource):
 
 
 class ArraySequence(PackedSequence[ArrayField]):
-    """One sequence of a packed store of arrays. A table holds the number of elements per frame and column."""
+    """One sequence of a packed store of arrays.
+
+    A table holds the number of elements per frame and column.
+    """
 
     def __init__(self, store: ArrayStore, path: str, group: str) -> None:
         """Read the attributes of the sequence's group.
@@ -115,7 +120,10 @@ class ArraySequence(PackedSequence[ArrayField]):
         attributes = store.attributes(group)
         if attributes is None or attributes.get("type") != SEQUENCE:
             raise FormatError(
-                location, expected="the sequence that the store lists", found="none", advice="the store is damaged"
+                location,
+                expected="the sequence that the store lists",
+                found="none",
+                advice="the store is damaged",
             )
         super().__init__(path, location, attributes)
         self.tree = store.tree
@@ -132,7 +140,10 @@ class ArraySequence(PackedSequence[ArrayField]):
     def read_xyz(
         self, frames: Iterable[int], spare: list[NDArray[np.float32]] | None = None
     ) -> list[NDArray[np.float32]]:
-        """Read the coordinates of points as contiguous planes, as they are stored. The 4th column is not read."""
+        """Read the coordinates of points as contiguous planes, as they are stored.
+
+        The 4th column is not read.
+        """
         numbers = list(frames)
         return self._read_again(lambda: self._field("points").read_planes(numbers, spare or []))
 
@@ -142,7 +153,9 @@ class ArraySequence(PackedSequence[ArrayField]):
         return self.store.read_document(f"{self.group}/{document_node(name)}")
 
     def files_of(self, field: str, frames: Iterable[int]) -> list[str]:
-        """Return the files that hold a field of some frames: shards of a zarr store, the one file of an HDF5 store."""
+        """Return the files that hold a field of some frames: shards of a zarr store, the one file
+        of an HDF5 store.
+        """
         return self._field(field).files_of(list(frames))
 
     def published_bytes(self, field: str) -> int:
@@ -150,7 +163,9 @@ class ArraySequence(PackedSequence[ArrayField]):
         return self._field(field).published_bytes()
 
     def _read_again(self, read: Callable[[], _T]) -> _T:
-        """Call `read`; after an error, once more with new metadata, because the store may have grown meanwhile."""
+        """Call `read`; after an error, once more with new metadata, because the store may have
+        grown meanwhile.
+        """
         try:
             return read()
         except FormatError:
@@ -162,7 +177,9 @@ class ArraySequence(PackedSequence[ArrayField]):
 
     @cached_property
     def _counts(self) -> tuple[NDArray[np.int64], Mapping[str, NDArray[np.int64]]]:
-        """The frames of the sequence, and the number of elements per frame by column; -1 if the field lacks the frame."""
+        """The frames of the sequence, and the number of elements per frame by column; -1 if the
+        field lacks the frame.
+        """
         try:
             return self._read_counts()
         except FormatError:  # new frames may have replaced the arrays since the metadata were read
@@ -175,14 +192,20 @@ class ArraySequence(PackedSequence[ArrayField]):
         frames = self.store.read_small(f"{self.group}/frames").astype(np.int64)
         if frames.ndim != 1 or (np.diff(frames, prepend=-1) <= 0).any():
             raise FormatError(
-                where, expected="ascending frame numbers", found="other values", advice="the store is damaged"
+                where,
+                expected="ascending frame numbers",
+                found="other values",
+                advice="the store is damaged",
             )
         counts = self.store.read_small(f"{self.group}/counts").astype(np.int64)
         columns = (self.store.attributes(f"{self.group}/counts") or {}).get("columns")
         columns = columns if isinstance(columns, list) else []
-        if counts.shape != (len(frames), len(columns)) or not all(isinstance(name, str) for name in columns):
+        if counts.shape != (len(frames), len(columns)) or not all(
+            isinstance(name, str) for name in columns
+        ):
             raise FormatError(
-                where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, with ascending frame numbers", found="other values",
+                where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, with "
+                                f"ascending frame numbers", found="other values",
                 advice="the store is damaged",
             )  # fmt: skip
         return frames, {column: counts[:, number] for number, column in enumerate(columns)}
@@ -194,9 +217,18 @@ class ArraySequence(PackedSequence[ArrayField]):
         if found.is_grid:
             self._check_grid(field, tuple(found.attributes["shape"]))
         frames, counts = self._counts
-        own = {name: counts[place] for name in found.columns if (place := f"{field_node(field)}/{name}") in counts}
+        own = {
+            name: counts[place]
+            for name in found.columns
+            if (place := f"{field_node(field)}/{name}") in counts
+        }
         return ArrayField(
-            where, found, frames, own, lambda name: self.store.array(f"{node}/{name}"), local=self.store.local
+            where,
+            found,
+            frames,
+            own,
+            lambda name: self.store.array(f"{node}/{name}"),
+            local=self.store.local,
         )
 
     def _check_grid(self, field: str, shape: tuple[int, ...]) -> None:

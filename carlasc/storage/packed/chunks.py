@@ -1,8 +1,9 @@
 """Chunked arrays, read directly from the files that hold the chunks.
 
-A chunk is a range of bytes in a file, in zarr shards and in chunked data sets of HDF5. It is fetched, its checksum is verified, and
-numcodecs decodes it. This takes about a millisecond per scan; the zarr and HDF5 libraries take several. No handle stays open, so these
-objects can be pickled, and used on both sides of a fork.
+A chunk is a range of bytes in a file, in zarr shards and in chunked data sets of HDF5. It is
+fetched, its checksum is verified, and numcodecs decodes it. This takes about a millisecond per
+scan; the zarr and HDF5 libraries take several. No handle stays open, so these objects can be
+pickled, and used on both sides of a fork.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ _R = TypeVar("_R")
 
 NO_SHUFFLE, SHUFFLE, BITSHUFFLE = 0, 1, 2
 _BLOSC_HEADER = struct.Struct("<4B3I")
-BLOCK = 1 << 21  # bytes that Blosc compresses together: a whole scan, because smaller blocks compress less
+# bytes that Blosc compresses together: a whole scan, because smaller blocks compress less
+BLOCK = 1 << 21
 
 
 @dataclass(frozen=True)
@@ -53,19 +55,25 @@ class Encoding:
         if self.codec == "pcodec":
             return bytes(_pcodec(self.level, extra).encode(np.ascontiguousarray(chunk).reshape(-1)))
         blosc = import_extra("numcodecs.blosc", extra)
-        return bytes(blosc.compress(np.ascontiguousarray(chunk), b"zstd", self.level, self.shuffle, BLOCK))
+        return bytes(
+            blosc.compress(np.ascontiguousarray(chunk), b"zstd", self.level, self.shuffle, BLOCK)
+        )
 
     def decode(self, data: bytes | memoryview, out: NDArray[Any], extra: str) -> None:
-        """Decode the bytes of a chunk into `out`, a contiguous array with the shape and dtype of the chunk.
+        """Decode the bytes of a chunk into `out`, a contiguous array with the shape and dtype of
+        the chunk.
 
         Raises:
             FormatError: the bytes cannot be decoded, or have another number of elements.
         """
         try:
             if self.codec == "pcodec":
-                # numcodecs does not report the number of decoded values: with too few, the rest of `out` would be unset.
-                # PCodec before 1.1 has `standalone` as a module alone, not as an attribute of the package.
-                progress = import_extra("pcodec.standalone", extra).simple_decompress_into(bytes(data), out.reshape(-1))
+                # numcodecs does not report the number of decoded values: with too few, the rest of
+                # `out` would be unset. PCodec before 1.1 has `standalone` as a module alone, not as
+                # an attribute of the package.
+                progress = import_extra("pcodec.standalone", extra).simple_decompress_into(
+                    bytes(data), out.reshape(-1)
+                )
                 if progress.n_processed != out.size or not progress.finished:
                     raise ValueError(f"{progress.n_processed} elements instead of {out.size}")
             else:
@@ -73,15 +81,21 @@ class Encoding:
                 import_extra("numcodecs.blosc", extra).decompress(data, out)
         except (CarlascError, KeyboardInterrupt, SystemExit):
             raise
-        except BaseException as error:  # each codec raises other types; a Rust panic in PCodec is not an Exception
-            raise FormatError("its bytes", problem=f"cannot be decoded: {describe(error)}") from error
+        except (
+            BaseException
+        ) as error:  # each codec raises other types; a Rust panic in PCodec is not an Exception
+            raise FormatError(
+                "its bytes", problem=f"cannot be decoded: {describe(error)}"
+            ) from error
 
 
 def _check_blosc(data: bytes | memoryview, size: int) -> None:
-    """Check a Blosc header as `blosc_cbuffer_validate` of C-Blosc does, because the Blosc decoder does not check it.
+    """Check a Blosc header as `blosc_cbuffer_validate` of C-Blosc does, because the Blosc decoder
+    does not check it.
 
-    The header of Blosc 1 (README_CHUNK_FORMAT.rst) has the version, the version of the codec, flags and the type size, followed by three
-    32-bit numbers: uncompressed bytes, bytes per block and compressed bytes.
+    The header of Blosc 1 (README_CHUNK_FORMAT.rst) has the version, the version of the codec, flags
+    and the type size, followed by three 32-bit numbers: uncompressed bytes, bytes per block and
+    compressed bytes.
 
     Raises:
         ValueError: the header does not fit the data.
@@ -90,7 +104,10 @@ def _check_blosc(data: bytes | memoryview, size: int) -> None:
         raise ValueError(f"{len(data)} bytes are not a Blosc chunk")
     *_, decoded, block, encoded = _BLOSC_HEADER.unpack_from(data)
     if (decoded, encoded) != (size, len(data)) or not 0 < block <= max(decoded, 1):
-        raise ValueError(f"{decoded} bytes from {encoded}, in blocks of {block}, instead of {size} from {len(data)}")
+        raise ValueError(
+            f"{decoded} bytes from {encoded}, in blocks of {block}, instead of {size} from "
+            f"{len(data)}"
+        )
 
 
 @cache
@@ -99,7 +116,10 @@ def _pcodec(level: int, extra: str) -> Any:
 
 
 class StoredArray:
-    """A chunked array of a store. Chunks are numbered in C order. The array of a column has one entry per frame along its first axis.
+    """A chunked array of a store.
+
+    Chunks are numbered in C order. The array of a column has one entry per frame along its first
+    axis.
 
     Attributes:
         tree: the tree of files that holds the chunks.
@@ -168,9 +188,12 @@ class StoredArray:
 
 
 def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
-    """Apply a function to several items in threads. The function should mostly run decoders, which release the GIL.
+    """Apply a function to several items in threads.
 
-    A worker process, such as one of a DataLoader, uses one thread, because the user has chosen the number of processes.
+    The function should mostly run decoders, which release the GIL.
+
+    A worker process, such as one of a DataLoader, uses one thread, because the user has chosen the
+    number of processes.
     """
     items = list(items)
     if len(items) < 2 or multiprocessing.parent_process() is not None:
@@ -181,8 +204,8 @@ def parallel(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
 def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     """Apply a function in threads other than the main thread.
 
-    In the main thread, Blosc compresses the blocks of a large chunk in several threads and writes them in the order of completion, so the
-    bytes would differ from run to run.
+    In the main thread, Blosc compresses the blocks of a large chunk in several threads and writes
+    them in the order of completion, so the bytes would differ from run to run.
     """
     with postponed_interrupts():
         results = _pool(os.getpid()).map(function, items)
@@ -190,11 +213,13 @@ def in_threads(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
 
 
 def crc32c(data: bytes | memoryview, extra: str) -> int:
-    """Return the CRC-32C of some bytes. CPUs have an instruction for it, which makes it six times as fast as CRC-32."""
+    """Return the CRC-32C of some bytes.
+
+    CPUs have an instruction for it, which makes it six times as fast as CRC-32.
+    """
     source = data.obj if isinstance(data, memoryview) else data
-    whole = (
-        source if isinstance(source, bytes) and len(source) == len(data) else bytes(data)
-    )  # the library takes bytes only
+    # the library takes bytes only
+    whole = source if isinstance(source, bytes) and len(source) == len(data) else bytes(data)
     return int(import_extra("google_crc32c", extra).value(whole))
 
 
@@ -215,6 +240,9 @@ _scratch = _Scratch()
 
 @cache
 def _pool(_pid: int) -> ThreadPoolExecutor:
-    """Return the thread pool of this process. It is created per process, because threads do not survive a fork."""
+    """Return the thread pool of this process.
+
+    It is created per process, because threads do not survive a fork.
+    """
     threads = 1 if multiprocessing.parent_process() is not None else min(8, count_cores())
     return ThreadPoolExecutor(threads, thread_name_prefix="carlasc-codec")

@@ -1,6 +1,7 @@
 """Conversion of the frames of a field to columns of arrays and back, with numbers in fewer bytes.
 
-Every rule is lossless to the last bit, including negative zeros and NaN payloads, except for the option `scale_m`.
+Every rule is lossless to the last bit, including negative zeros and NaN payloads, except for the
+option `scale_m`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ LEAST = 1 << 14  # minimum number of elements per chunk
 FEW = 256  # minimum for boxes, and for the distinct vectors of a flow
 WIDE = "_wide"  # suffix of the name of a wide column
 _GEOMETRY = tuple(name for name in BOXES_DTYPE.names or () if BOXES_DTYPE[name].kind == "f")
-_WIDE_CELLS = {"<u4": ("u1", "<u4"), "<f4": ("<u2", "<f4")}  # narrow and wide type of grids, by the published type
+# narrow and wide type of grids, by the published type
+_WIDE_CELLS = {
+    "<u4": ("u1", "<u4"),
+    "<f4": ("<u2", "<f4"),
+}
 Columns = dict[str, NDArray[Any]]
 
 
@@ -39,10 +44,13 @@ class Column:
         encoding: how its chunks are encoded.
         unit: unit of its values.
         rows: leading dimension of a (rows, N) column; None for a flat column.
-        scratch: whether decoded frames may share memory, because each is copied before the next one is decoded.
+        scratch: whether decoded frames may share memory, because each is copied before the next one
+            is decoded.
         step: elements per chunk; None chooses it so that a typical frame fills one chunk.
-        least: minimum of the chosen `step`, so that a very small first scan does not lead to tiny chunks.
-        wide: type of the column `<name>_wide` for frames whose values do not fit this column; None if it does not exist.
+        least: minimum of the chosen `step`, so that a very small first scan does not lead to tiny
+            chunks.
+        wide: type of the column `<name>_wide` for frames whose values do not fit this column; None
+            if it does not exist.
     """
 
     name: str
@@ -60,7 +68,9 @@ class Column:
         """This column, and its wide column if it exists."""
         if self.wide is None:
             return (self,)
-        return self, replace(self, name=f"{self.name}{WIDE}", dtype=self.wide, least=LEAST, wide=None)
+        return self, replace(
+            self, name=f"{self.name}{WIDE}", dtype=self.wide, least=LEAST, wide=None
+        )
 
 
 class Packing(ABC):
@@ -76,7 +86,9 @@ class Packing(ABC):
     kind: ClassVar[str]
     columns: tuple[Column, ...]
 
-    def __init__(self, entry: field_files.Field, options: PackOptions, attributes: Mapping[str, Any]) -> None:
+    def __init__(
+        self, entry: field_files.Field, options: PackOptions, attributes: Mapping[str, Any]
+    ) -> None:
         self.entry = entry
         self.attributes = attributes
         self.columns = self._columns(options)
@@ -90,22 +102,31 @@ class Packing(ABC):
 
     @abstractmethod
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return the array of a frame, written to `into` if given. Columns that the frame does not use are empty."""
+        """Return the array of a frame, written to `into` if given.
+
+        Columns that the frame does not use are empty.
+        """
 
     def published_bytes(self, counts: Mapping[str, int]) -> int:
-        """Return the size of the published files, from the number of elements by column, including wide columns."""
+        """Return the size of the published files, from the number of elements by column, including
+        wide columns.
+        """
         main = self.columns[0].name
         elements = counts.get(main, 0) + counts.get(f"{main}{WIDE}", 0)
         row = np.dtype(self.entry.dtype or BOXES_DTYPE).itemsize * (self.entry.columns or 1)
         return elements * row
 
     def allocate(self, counts: list[int]) -> list[NDArray[Any] | None]:
-        """Return one array per frame, of `counts` elements, for `join` to write to; None if `join` allocates it."""
+        """Return one array per frame, of `counts` elements, for `join` to write to; None if `join`
+        allocates it.
+        """
         return [None] * len(counts)
 
 
 class PointsPacking(Packing):
-    """(N, 4) points: `xyz` as (3, N), and `fourth` only in frames where the 4th column has a non-zero bit."""
+    """(N, 4) points: `xyz` as (3, N), and `fourth` only in frames where the 4th column has a
+    non-zero bit.
+    """
 
     kind = "points"
 
@@ -114,7 +135,15 @@ class PointsPacking(Packing):
         scale = self.attributes.get("scale_m")
         dtype, unit = ("<i4", f"{scale} m") if scale else ("<f4", "m")
         return (
-            Column("xyz", dtype, encoding, unit, rows=3, scratch=True, step=_PCODEC_STEP if options.small else None),
+            Column(
+                "xyz",
+                dtype,
+                encoding,
+                unit,
+                rows=3,
+                scratch=True,
+                step=_PCODEC_STEP if options.small else None,
+            ),
             Column("fourth", "<f4", Encoding(shuffle=BITSHUFFLE)),
         )
 
@@ -130,9 +159,8 @@ class PointsPacking(Packing):
         """Return (N, 4) float32 rows, as in the published file."""
         xyz, fourth = columns["xyz"], columns["fourth"]
         points = np.empty((xyz.shape[1], 4), np.float32) if into is None else into
-        points[:, 0], points[:, 1], points[:, 2] = self.to_metres(
-            xyz
-        )  # one assignment of all three takes five times as long
+        # one assignment of all three takes five times as long
+        points[:, 0], points[:, 1], points[:, 2] = self.to_metres(xyz)
         points[:, 3] = fourth if fourth.size else 0
         return points
 
@@ -144,8 +172,8 @@ class PointsPacking(Packing):
     def allocate(self, counts: list[int]) -> list[NDArray[Any] | None]:
         """Return the scans of a stack as parts of one block of memory.
 
-        The operating system uses large pages for large blocks. The first access to the small pages of sixteen separate arrays takes
-        longer than decoding the scans.
+        The operating system uses large pages for large blocks. The first access to the small pages
+        of sixteen separate arrays takes longer than decoding the scans.
         """
         ends = np.cumsum(counts).tolist()
         block = np.empty((ends[-1] if ends else 0, 4), np.float32)
@@ -170,17 +198,27 @@ class ValuesPacking(Packing):
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return (N,) values in the type of the field; classes in the narrowest type."""
         values = columns["values"]
-        return values if self.entry.kind in ("class", "picture") else values.astype(self.entry.dtype, copy=False)
+        return (
+            values
+            if self.entry.kind in ("class", "picture")
+            else values.astype(self.entry.dtype, copy=False)
+        )
 
 
 class PairsPacking(Packing):
-    """(N, K) classes and probabilities, as `values` (K, N): values of one column are similar, and compress well together."""
+    """(N, K) classes and probabilities, as `values` (K, N): values of one column are similar, and
+    compress well together.
+    """
 
     kind = "pairs"
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         rows = self.entry.columns
-        return (Column("values", self.entry.dtype, Encoding(shuffle=SHUFFLE), self.entry.unit, rows=rows),)
+        return (
+            Column(
+                "values", self.entry.dtype, Encoding(shuffle=SHUFFLE), self.entry.unit, rows=rows
+            ),
+        )
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Return the columns as planes."""
@@ -192,7 +230,9 @@ class PairsPacking(Packing):
 
 
 class FlowPacking(Packing):
-    """(N, 3) vectors as a `palette` (3, K) of distinct vectors, compared bit by bit, and an `index` (N,) into it."""
+    """(N, 3) vectors as a `palette` (3, K) of distinct vectors, compared bit by bit, and an `index`
+    (N,) into it.
+    """
 
     kind = "flow"
 
@@ -203,7 +243,10 @@ class FlowPacking(Packing):
         )
 
     def split(self, array: NDArray[Any]) -> Columns:
-        """Find the distinct vectors. Most vectors repeat the previous one, so only the first of each run is compared."""
+        """Find the distinct vectors.
+
+        Most vectors repeat the previous one, so only the first of each run is compared.
+        """
         bits = np.ascontiguousarray(array, "<f4").view(np.uint32).reshape(-1, 3)
         starts = np.flatnonzero((bits[1:] != bits[:-1]).any(axis=1)) + 1
         starts = np.concatenate([np.zeros(min(len(bits), 1), np.int64), starts])
@@ -216,7 +259,12 @@ class FlowPacking(Packing):
         index, palette = columns["index"], columns["palette"]
         if index.size and int(index.max()) >= palette.shape[1]:
             found, advice = str(int(index.max())), "the store is damaged"
-            raise FormatError("its index", expected=f"indices below {palette.shape[1]}", found=found, advice=advice)
+            raise FormatError(
+                "its index",
+                expected=f"indices below {palette.shape[1]}",
+                found=found,
+                advice=advice,
+            )
         return np.ascontiguousarray(palette.T)[index]
 
 
@@ -228,14 +276,24 @@ class GridPacking(Packing):
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         shuffle = BITSHUFFLE if self.entry.kind == "count" else NO_SHUFFLE
         dtype, wide = _WIDE_CELLS.get(self.entry.dtype, (self.entry.dtype, None))
-        return (Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit, wide=wide),)
+        return (
+            Column("values", dtype, Encoding(level=8, shuffle=shuffle), self.entry.unit, wide=wide),
+        )
 
     def split(self, array: NDArray[Any]) -> Columns:
-        """Narrow the values, except probabilities: they are rarely integers, and float32 would take more space."""
-        return {"values": array.astype(self.entry.dtype) if self.entry.kind == "probability" else narrow(array)}
+        """Narrow the values, except probabilities: they are rarely integers, and float32 would take
+        more space.
+        """
+        return {
+            "values": array.astype(self.entry.dtype)
+            if self.entry.kind == "probability"
+            else narrow(array)
+        }
 
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return (X, Y, Z): unsigned integers, float32 if counts are not integers, or float16 for probabilities."""
+        """Return (X, Y, Z): unsigned integers, float32 if counts are not integers, or float16 for
+        probabilities.
+        """
         return columns["values"]
 
 
@@ -255,7 +313,10 @@ class VotesPacking(Packing):
         """Return the bytes of tables with this many rows."""
         wide = counts.get(f"label{WIDE}", 0)
         narrow_rows = counts.get("voxel", 0) - wide
-        return narrow_rows * field_files.VOTES_DTYPE.itemsize + wide * field_files.WIDE_VOTES_DTYPE.itemsize
+        return (
+            narrow_rows * field_files.VOTES_DTYPE.itemsize
+            + wide * field_files.WIDE_VOTES_DTYPE.itemsize
+        )
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Return the columns of the table."""
@@ -264,7 +325,9 @@ class VotesPacking(Packing):
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
         """Return the table."""
         wide = columns["label"].dtype.itemsize > 1
-        votes = np.empty(len(columns["voxel"]), field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE)
+        votes = np.empty(
+            len(columns["voxel"]), field_files.WIDE_VOTES_DTYPE if wide else field_files.VOTES_DTYPE
+        )
         for name, column in columns.items():
             votes[name] = column
         return votes
@@ -277,7 +340,9 @@ class VelocitiesPacking(Packing):
 
     def _columns(self, options: PackOptions) -> tuple[Column, ...]:
         encoding = Encoding(shuffle=SHUFFLE)
-        return Column("voxel", "<i4", encoding, "index"), Column("velocity", "<f2", encoding, self.entry.unit, rows=3)
+        return Column("voxel", "<i4", encoding, "index"), Column(
+            "velocity", "<f2", encoding, self.entry.unit, rows=3
+        )
 
     def published_bytes(self, counts: Mapping[str, int]) -> int:
         """Return the bytes of tables with this many rows."""
@@ -310,7 +375,9 @@ class BoxesPacking(Packing):
 
     def split(self, array: NDArray[Any]) -> Columns:
         """Return the columns of the table."""
-        flat = {column.name: np.ascontiguousarray(array[column.name]) for column in self.columns[1:]}
+        flat = {
+            column.name: np.ascontiguousarray(array[column.name]) for column in self.columns[1:]
+        }
         return {"geometry": np.stack([array[name] for name in _GEOMETRY])} | flat
 
     def join(self, columns: Columns, into: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -324,13 +391,21 @@ class BoxesPacking(Packing):
 
 
 def packing_of(
-    entry: field_files.Field, options: PackOptions | None = None, attributes: Mapping[str, Any] | None = None
+    entry: field_files.Field,
+    options: PackOptions | None = None,
+    attributes: Mapping[str, Any] | None = None,
 ) -> Packing:
-    """Return the packing of a field: from `options` for writing, from the `attributes` of the store for reading."""
+    """Return the packing of a field: from `options` for writing, from the `attributes` of the store
+    for reading.
+    """
     options = options or PackOptions()
     if attributes is None:
-        attributes = {"scale_m": options.scale_m} if entry.kind == "position" and options.lossy_mm else {}
-    kind: Callable[..., Packing] = GridPacking if entry.per == "voxel" else _BY_KIND.get(entry.kind, ValuesPacking)
+        attributes = (
+            {"scale_m": options.scale_m} if entry.kind == "position" and options.lossy_mm else {}
+        )
+    kind: Callable[..., Packing] = (
+        GridPacking if entry.per == "voxel" else _BY_KIND.get(entry.kind, ValuesPacking)
+    )
     return kind(entry, options, attributes)
 
 
@@ -362,12 +437,17 @@ def quantise(metres: NDArray[Any], scale_m: float) -> NDArray[np.int32]:
 
 
 def narrow(array: NDArray[Any]) -> NDArray[Any]:
-    """Return integers in the smallest unsigned type that holds them, and other numbers as float32, bit for bit."""
+    """Return integers in the smallest unsigned type that holds them, and other numbers as float32,
+    bit for bit.
+    """
     if array.dtype.kind == "f":
         values = np.ascontiguousarray(array, "<f4")
         with np.errstate(invalid="ignore"):
-            whole = values.astype(np.uint32) if values.size == 0 or values.max() < 2**32 else None  # False for NaN
-        exact = whole is not None and np.array_equal(whole.astype("<f4").view(np.uint32), values.view(np.uint32))
+            # False for NaN
+            whole = values.astype(np.uint32) if values.size == 0 or values.max() < 2**32 else None
+        exact = whole is not None and np.array_equal(
+            whole.astype("<f4").view(np.uint32), values.view(np.uint32)
+        )
         if whole is None or not exact:
             return values
         array = whole

@@ -1,4 +1,6 @@
-"""The output path of a packed store: check for existing files, and rename the finished store into place."""
+"""The output path of a packed store: check for existing files, and rename the finished store into
+place.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError
-from carlasc.storage.files import make_folder, remove_file, rename, replaced, storage_error, sync_all, write_at
+from carlasc.storage.files import (
+    make_folder,
+    remove_file,
+    rename,
+    replaced,
+    storage_error,
+    sync_all,
+    write_at,
+)
 
 TABLES_MARK = "carlasc-tables.json"  # the file that makes a folder a store of tables
 UNFINISHED_MARK = "unfinished.json"  # its name until the store is complete
@@ -33,11 +43,15 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
             path,
             expected="a new path",
             found=f"a {kind}",
-            advice="choose another name, remove it, or give `overwrite=True` if the command has this option",
+            advice="choose another name, remove it, or give `overwrite=True` if the command has "
+            "this option",
         )
     if not _is_store(path):
         raise ConflictError(
-            path, expected="a packed store to overwrite", found=f"another {kind}", advice="choose another name"
+            path,
+            expected="a packed store to overwrite",
+            found=f"another {kind}",
+            advice="choose another name",
         )
 
 
@@ -49,12 +63,15 @@ def _is_store(path: Path) -> bool:
 
 
 def unfinished_error(where: str | os.PathLike[str]) -> FormatError:
-    """Return the error for an unfinished store of any format: it is being written, or the run was interrupted."""
+    """Return the error for an unfinished store of any format: it is being written, or the run was
+    interrupted.
+    """
     return FormatError(
         where,
         expected="a finished store",
         found="an unfinished one: a run is writing it, or was interrupted",
-        advice="run the same command again to finish it (`carlasc finish` if all parts of a .zarr store are written)",
+        advice="run the same command again to finish it (`carlasc finish` if all parts of a .zarr "
+        "store are written)",
     )
 
 
@@ -75,14 +92,17 @@ def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
         if overwrite:
             remove(old)  # also removes what a run left that was killed here
     except OSError as error:
-        raise StorageError(path, problem=f"cannot be put in place: {error.strerror or error}") from error
+        raise StorageError(
+            path, problem=f"cannot be put in place: {error.strerror or error}"
+        ) from error
 
 
 class PatientFile(io.RawIOBase):
     """A new file for libraries that do not handle failed writes.
 
-    After a failed write, h5py crashes, pyarrow prints an error of its destructor, and Foxglove ignores it. This file keeps the first error and
-    drops all later writes; `check` raises the error.
+    After a failed write, h5py crashes, pyarrow prints an error of its destructor, and Foxglove
+    ignores it. This file keeps the first error and drops all later writes; `check` raises the
+    error.
     """
 
     def __init__(self, path: Path, place: Path | None) -> None:
@@ -90,7 +110,8 @@ class PatientFile(io.RawIOBase):
 
         Args:
             path: the file.
-            place: final path of the file, for errors; None if the caller names it: `check` then raises the original error.
+            place: final path of the file, for errors; None if the caller names it: `check` then
+                raises the original error.
 
         Raises:
             StorageError: it cannot be created.
@@ -102,7 +123,8 @@ class PatientFile(io.RawIOBase):
         self._descriptor = -1  # until it is open
         try:
             make_folder(path.parent)
-            path.unlink(missing_ok=True)  # an abandoned writer of this process may still write to the old file
+            # an abandoned writer of this process may still write to the old file
+            path.unlink(missing_ok=True)
             self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
             raise storage_error(place or path, error) from error
@@ -136,7 +158,9 @@ class PatientFile(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Set the position and return it."""
-        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        self._position = (
+            offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        )
         return self._position
 
     def write(self, data: Any) -> int:

@@ -1,4 +1,6 @@
-"""Base classes of all packed stores: options, the check of the root, and reading and writing one sequence."""
+"""Base classes of all packed stores: options, the check of the root, and reading and writing one
+sequence.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ class PackOptions:
     """How a store is packed.
 
     Attributes:
-        small: compress points with PCodec: smaller, but readers need the `pcodec` extension of numcodecs.
+        small: compress points with PCodec: smaller, but readers need the `pcodec` extension of
+            numcodecs.
         lossy_mm: quantise points to this many millimetres; None is lossless.
         block: number of frames per file of a zarr store. One task writes a block.
 
@@ -42,7 +45,9 @@ class PackOptions:
 
     def __post_init__(self) -> None:
         if self.lossy_mm is not None and not 0 < self.lossy_mm <= 1000:
-            raise ArgumentError("lossy_mm", expected="millimetres above 0, up to 1000", found=str(self.lossy_mm))
+            raise ArgumentError(
+                "lossy_mm", expected="millimetres above 0, up to 1000", found=str(self.lossy_mm)
+            )
         if not 1 <= self.block <= 1024:
             raise ArgumentError("block", expected="1 to 1024 frames", found=str(self.block))
 
@@ -57,7 +62,8 @@ class PackedSource(Source):
 
     Attributes:
         nodes: the group (or folder) of each sequence in the store, by the sequence's path.
-        lossy_mm: rounding step of the coordinates of points, millimetres; None if they are lossless.
+        lossy_mm: rounding step of the coordinates of points, millimetres; None if they are
+            lossless.
     """
 
     nodes: Mapping[str, str]
@@ -66,7 +72,8 @@ class PackedSource(Source):
         """Check the attributes of the store's root.
 
         Raises:
-            FormatError: it is not a packed store, is unfinished, has another version, or has a name that leads out of the store.
+            FormatError: it is not a packed store, is unfinished, has another version, or has a name
+                that leads out of the store.
         """
         self.location = location
         self.nodes = _check_root(root, location)
@@ -79,15 +86,21 @@ class PackedSource(Source):
 
     @abstractmethod
     def stored_bytes(self) -> dict[str, int]:
-        """Return the stored bytes by field, with "documents" for the text files and "index" for everything else."""
+        """Return the stored bytes by field, with "documents" for the text files and "index" for
+        everything else.
+        """
 
 
 def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]:
     if root is None or root.get("type") != STORE:
-        raise FormatError(where, expected="a store packed by carlasc", found=f"a store without the type {STORE}")
+        raise FormatError(
+            where, expected="a store packed by carlasc", found=f"a store without the type {STORE}"
+        )
     version = root.get("version", 1)
     if isinstance(version, bool) or not isinstance(version, int | np.integer) or version < 1:
-        raise FormatError(where, expected="a version above 0", found=repr(version), advice="the store is damaged")
+        raise FormatError(
+            where, expected="a version above 0", found=repr(version), advice="the store is damaged"
+        )
     if version != VERSION:
         raise FormatError(
             where,
@@ -100,8 +113,12 @@ def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]
     if not root.get("complete"):
         raise unfinished_error(where)
     sequences = root.get("sequences")
-    if not isinstance(sequences, dict) or not all(isinstance(node, str) for node in sequences.values()):
-        raise FormatError(where, expected="the groups of sequences", found="none", advice="the store is damaged")
+    if not isinstance(sequences, dict) or not all(
+        isinstance(node, str) for node in sequences.values()
+    ):
+        raise FormatError(
+            where, expected="the groups of sequences", found="none", advice="the store is damaged"
+        )
     nodes: dict[str, str] = dict(sorted(sequences.items()))
     check_names([*nodes, *nodes.values()], where)
     return nodes
@@ -134,14 +151,23 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
             self._fields, self._documents = frozenset(about["fields"]), tuple(about["documents"])
         except KeyError as error:
             raise FormatError(
-                location, expected=f"the attribute {error.args[0]}", found="none", advice="the store is damaged"
+                location,
+                expected=f"the attribute {error.args[0]}",
+                found="none",
+                advice="the store is damaged",
             ) from error
         except TypeError as error:
             raise FormatError(
-                location, expected="lists of fields and text files", found=str(error), advice="the store is damaged"
+                location,
+                expected="lists of fields and text files",
+                found=str(error),
+                advice="the store is damaged",
             ) from error
         names = (self.name, self.coordinates, self.split or "", *self._fields, *self._documents)
-        if not all(isinstance(name, str) for name in names) or self.coordinates not in layout.COORDINATES:
+        if (
+            not all(isinstance(name, str) for name in names)
+            or self.coordinates not in layout.COORDINATES
+        ):
             raise FormatError(
                 location, expected="names of the sequence, its fields and its text files", found="other values",
                 advice="the store is damaged",
@@ -167,13 +193,17 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
     def _check_document(self, name: str) -> None:
         if name not in self._documents:
             raise MissingDataError(
-                self.location, expected=f"the text file {name}", found=", ".join(self._documents) or "none"
+                self.location,
+                expected=f"the text file {name}",
+                found=", ".join(self._documents) or "none",
             )
 
     def _field(self, field: str) -> _FieldReader:
         if field not in self._fields:
             raise MissingDataError(
-                self.location, expected=f"the field {field}", found=", ".join(sorted(self._fields)) or "none"
+                self.location,
+                expected=f"the field {field}",
+                found=", ".join(sorted(self._fields)) or "none",
             )
         if field not in self._readers:
             self._readers[field] = self._open_field(field)
@@ -215,7 +245,9 @@ class FieldWriter(ABC):
         """
         last = next(reversed(self.frames), -1)
         if frame <= last:
-            raise FormatError("its number", expected=f"frames in rising order, above {last}", found=str(frame))
+            raise FormatError(
+                "its number", expected=f"frames in rising order, above {last}", found=str(frame)
+            )
         self.entry.check(array, "its array")
         self.write(frame, array)
         self.frames[frame] = None
@@ -250,7 +282,13 @@ class PackedWriter(SequenceWriter):
 
     def __getstate__(self) -> dict[str, Any]:
         """Keep only the name, because only one process writes the store."""
-        return {"location": self.location, "path": self.path, "identity": self.identity, "writers": {}, "contents": {}}
+        return {
+            "location": self.location,
+            "path": self.path,
+            "identity": self.identity,
+            "writers": {},
+            "contents": {},
+        }
 
     def has(self, field: str, frame: int) -> bool:
         """Whether this run has written the frame."""
@@ -260,8 +298,8 @@ class PackedWriter(SequenceWriter):
         """Append one frame to a field.
 
         Raises:
-            FormatError: the array does not fit the field, `frame` is not above the previous one, or the name of the field leads out of the
-                store.
+            FormatError: the array does not fit the field, `frame` is not above the previous one, or
+                the name of the field leads out of the store.
         """
         if field not in self.writers:
             check_names([field], self.location)
@@ -288,7 +326,8 @@ class PackedWriter(SequenceWriter):
 
 
 def node_of(path: str, where: str) -> str:
-    """Return the group (or folder) of a sequence in a store: its path, or "sequence" if the path is empty.
+    """Return the group (or folder) of a sequence in a store: its path, or "sequence" if the path is
+    empty.
 
     Raises:
         FormatError: the path leads out of the store.

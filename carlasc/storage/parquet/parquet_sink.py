@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc.storage import layout
-from carlasc.storage.files import parse_json, remove_file, remove_stale, sync_tree, to_json, unfinished, write_atomic
+from carlasc.storage.files import (
+    parse_json,
+    remove_file,
+    remove_stale,
+    sync_tree,
+    to_json,
+    unfinished,
+    write_atomic,
+)
 from carlasc.storage.packed.output import (
     TABLES_MARK,
     UNFINISHED_MARK,
@@ -30,18 +38,38 @@ from carlasc.storage.packed.stores import (
     PackOptions,
     node_of,
 )
-from carlasc.storage.parquet.parquet_source import DOCUMENTS, FOOTERS, FRAMES, NUMBER, SEQUENCE, footer_checksums
-from carlasc.storage.parquet.table_columns import AXES, column_types, describe, split_columns, statistics
+from carlasc.storage.parquet.parquet_source import (
+    DOCUMENTS,
+    FOOTERS,
+    FRAMES,
+    NUMBER,
+    SEQUENCE,
+    footer_checksums,
+)
+from carlasc.storage.parquet.table_columns import (
+    AXES,
+    column_types,
+    describe,
+    split_columns,
+    statistics,
+)
 
-_LEVEL = 12  # level of Zstandard: from 11, points take 2 % less space; above 12, it takes several times as long
+# level of Zstandard: from 11, points take 2 % less space; above 12, it takes several times as long
+_LEVEL = 12
 _PAGE = 8 << 20  # bytes: one page holds one column of a scan
 
 
 class ParquetSink(PackedSink):
-    """Writes a folder of packed Parquet tables. It gets its final name only when the sink is finished."""
+    """Writes a folder of packed Parquet tables.
+
+    It gets its final name only when the sink is finished.
+    """
 
     def __init__(
-        self, path: str | os.PathLike[str], options: PackOptions | None = None, overwrite: bool = False
+        self,
+        path: str | os.PathLike[str],
+        options: PackOptions | None = None,
+        overwrite: bool = False,
     ) -> None:
         """Start a store, or continue an interrupted run. Its completed sequences are kept.
 
@@ -57,18 +85,28 @@ class ParquetSink(PackedSink):
         self.overwrite = overwrite
         if self.options.small:
             raise ArgumentError(
-                "small", expected="a .zarr store", found=f"{path}: Parquet has no PCodec", advice="leave `small` out"
+                "small",
+                expected="a .zarr store",
+                found=f"{path}: Parquet has no PCodec",
+                advice="leave `small` out",
             )
         refuse_existing(self.path, overwrite)
         self._part = unfinished(self.path)
         run = to_json({"version": VERSION, "lossy_mm": self.options.lossy_mm})
-        if not (self._part / UNFINISHED_MARK).is_file() or (self._part / UNFINISHED_MARK).read_bytes() != run:
+        if (
+            not (self._part / UNFINISHED_MARK).is_file()
+            or (self._part / UNFINISHED_MARK).read_bytes() != run
+        ):
             remove(self._part)
             write_atomic(self._part / UNFINISHED_MARK, run)
         remove_stale(self._part)
-        done = {file: parse_json(file.read_bytes(), str(file)) for file in sorted(self._part.rglob(SEQUENCE))}
+        done = {
+            file: parse_json(file.read_bytes(), str(file))
+            for file in sorted(self._part.rglob(SEQUENCE))
+        }
         self._sequences = {
-            about["path"]: file.parent.relative_to(self._part).as_posix() for file, about in done.items()
+            about["path"]: file.parent.relative_to(self._part).as_posix()
+            for file, about in done.items()
         }
         self._numbers = {str(about["path"]): int(about[NUMBER]) for about in done.values()}
 
@@ -81,7 +119,8 @@ class ParquetSink(PackedSink):
         folder = node_of(path, self.location)
         self._sequences.pop(path, None)
         remove(self._part / folder)
-        # A sequence that is written again keeps its number, so that the store has the same bytes as without an interruption.
+        # A sequence that is written again keeps its number, so that the store has the same bytes as
+        # without an interruption.
         number = self._numbers.setdefault(path, 1 + max(self._numbers.values(), default=-1))
         return ParquetWriter(self._part, path, folder, number, self.options, self._sequences)
 
@@ -103,7 +142,13 @@ class ParquetWriter(PackedWriter):
     """Writes one sequence of a store of tables."""
 
     def __init__(
-        self, root: Path, path: str, folder: str, number: int, options: PackOptions, finished: dict[str, str]
+        self,
+        root: Path,
+        path: str,
+        folder: str,
+        number: int,
+        options: PackOptions,
+        finished: dict[str, str],
     ) -> None:
         super().__init__(str(root / folder), path)
         self._folder = root / folder
@@ -158,9 +203,14 @@ class ParquetWriter(PackedWriter):
         ):
             try:
                 lines = decode(self.contents[document], document)
-                rows = [lines[frame if frames[-1] < len(lines) else frames.index(frame)] for frame in frames]
+                rows = [
+                    lines[frame if frames[-1] < len(lines) else frames.index(frame)]
+                    for frame in frames
+                ]
             except (KeyError, FormatError, IndexError):
-                continue  # missing, or not numbers: the text is kept unchanged, and its reader reports the error
+                # missing, or not numbers: the text is kept unchanged, and its reader reports the
+                # error
+                continue
             values = np.array(rows, np.float64).reshape(len(frames), 1 if name == "time_s" else 16)
             columns[name] = (
                 pa.array(values[:, 0])
@@ -174,7 +224,9 @@ class ParquetWriter(PackedWriter):
 
 def _write_table(table: Any, path: Path) -> None:
     file = PatientFile(path, path)
-    import_extra("pyarrow.parquet", "parquet").write_table(table, file, compression="zstd", write_page_checksum=True)
+    import_extra("pyarrow.parquet", "parquet").write_table(
+        table, file, compression="zstd", write_page_checksum=True
+    )
     file.close()
     file.check()
 
@@ -218,7 +270,11 @@ class TableWriter(FieldWriter):
             [("sequence", pa.int32()), ("frame", pa.int64())]
             + [(name, getattr(pa, dtype)()) for name, dtype in types.items()]
         )
-        split = {name: "BYTE_STREAM_SPLIT" for name in types if self.entry.kind == "position" and name in AXES}
+        split = {
+            name: "BYTE_STREAM_SPLIT"
+            for name in types
+            if self.entry.kind == "position" and name in AXES
+        }
         self._file = PatientFile(self.path, self.path)
         self._writer = parquet.ParquetWriter(
             self._file, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,

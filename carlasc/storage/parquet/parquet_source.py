@@ -1,7 +1,8 @@
 """Reading packed stores of Parquet tables: one file per field, one row group per frame.
 
-Parquet has checksums of pages, but not of the footer. With one wrong bit in a footer, pyarrow 26 terminates the process by an uncaught C++
-exception. A store therefore records the checksums of its footers, and a footer is verified before pyarrow reads it.
+Parquet has checksums of pages, but not of the footer. With one wrong bit in a footer, pyarrow 26
+terminates the process by an uncaught C++ exception. A store therefore records the checksums of its
+footers, and a footer is verified before pyarrow reads it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import LocalTree, Tree
 
 SEQUENCE = "sequence.json"  # written last: a folder with this file holds a whole sequence
-NUMBER = "number"  # key for the number of the sequence, the value of the column `sequence` in the tables
+NUMBER = (
+    "number"  # key for the number of the sequence, the value of the column `sequence` in the tables
+)
 FOOTERS = "footers"  # key for the checksums of the footers of the tables
 FRAMES = "frames.parquet"  # one row per frame
 DOCUMENTS = "documents.parquet"  # one row per text file
@@ -51,12 +54,16 @@ class ParquetSource(PackedSource):
             FormatError: the store is unfinished, or has another version.
         """
         import_extra("pyarrow.parquet", "parquet")
-        super().__init__(tree.location, parse_json(bytes(tree.read(TABLES_MARK)), tree.where(TABLES_MARK)))
+        super().__init__(
+            tree.location, parse_json(bytes(tree.read(TABLES_MARK)), tree.where(TABLES_MARK))
+        )
         self.tree = tree
 
     def sequences(self) -> Mapping[str, Sequence]:
         """Return the sequences that the store lists."""
-        return {path: ParquetSequence(self.tree, path, folder) for path, folder in self.nodes.items()}
+        return {
+            path: ParquetSequence(self.tree, path, folder) for path, folder in self.nodes.items()
+        }
 
     def stored_bytes(self) -> dict[str, int]:
         """Return the stored bytes by field; empty unless the store is a local folder."""
@@ -66,7 +73,9 @@ class ParquetSource(PackedSource):
             sizes["documents"] += (folder / DOCUMENTS).stat().st_size
             for field in sequence.fields():
                 sizes[field] += (folder / f"{field}.parquet").stat().st_size
-        files = (Path(folder) / name for folder, _, names in os.walk(self.location) for name in names)
+        files = (
+            Path(folder) / name for folder, _, names in os.walk(self.location) for name in names
+        )
         return dict(sizes) | {"index": sum(file.stat().st_size for file in files) - sizes.total()}
 
 
@@ -90,7 +99,12 @@ class ParquetSequence(PackedSequence["FieldTable"]):
         grid = field.rpartition("/")[0]
         if per_voxel and grid not in self.grids:
             where = f"{self.location}/{layout.params_file(grid)}"
-            raise FormatError(where, expected="the geometry of the grid", found="none", advice="the store is damaged")
+            raise FormatError(
+                where,
+                expected="the geometry of the grid",
+                found="none",
+                advice="the store is damaged",
+            )
         return table.read(frame, self.grids[grid].size if per_voxel else None)
 
     def read_document(self, name: str) -> bytes:
@@ -104,12 +118,19 @@ class ParquetSequence(PackedSequence["FieldTable"]):
                 for g in map(file.metadata.row_group, range(file.metadata.num_row_groups))
                 for k in range(g.num_columns)
             ):
-                check_ratio(column.total_uncompressed_size, column.total_compressed_size, self.tree.where(path))
+                check_ratio(
+                    column.total_uncompressed_size,
+                    column.total_compressed_size,
+                    self.tree.where(path),
+                )
             rows = file.read(["name", "data"], use_threads=False).to_pylist()
             data = next((row["data"] for row in rows if row["name"] == name), None)
         if not isinstance(data, bytes):
             raise FormatError(
-                self.tree.where(path), expected=f"the text file {name}", found="none", advice="the store is damaged"
+                self.tree.where(path),
+                expected=f"the text file {name}",
+                found="none",
+                advice="the store is damaged",
             )
         return data
 
@@ -133,7 +154,9 @@ class FieldTable:
         with opened(tree, path) as file:
             self._metadata = file.metadata
             about = parse_json(file.metadata.metadata[b"carlasc"], self.where)
-            self._types = column_types(layout.field_named(field), check_attributes(about, self.where))
+            self._types = column_types(
+                layout.field_named(field), check_attributes(about, self.where)
+            )
             _check_types(file.schema_arrow, self._types, self.where)
         self.attributes = about
         frames, rows = (_counts(about.get(name)) for name in ("frames", "rows"))
@@ -151,31 +174,47 @@ class FieldTable:
     def read(self, frame: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
         """Read one frame; reshaped to `shape` if given."""
         if frame not in self._groups:
-            raise MissingDataError(self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it")
+            raise MissingDataError(
+                self.where, expected=f"frame {frame}", found=f"{len(self.frames)} frames without it"
+            )
         rows = self._groups[frame][1]
         where = f"{self.where}: field {self.field}, frame {frame}"
         most = None if shape is None else math.prod(shape)
         if most is not None and rows != most:
-            raise FormatError(where, expected=f"{most} voxels", found=str(rows), advice="the store is damaged")
+            raise FormatError(
+                where, expected=f"{most} voxels", found=str(rows), advice="the store is damaged"
+            )
         if rows:
             columns = self._read_group(frame, most is None)
         else:
-            columns = {name: np.empty(0, "u1" if type_ == "binary" else type_) for name, type_ in self._types.items()}
+            columns = {
+                name: np.empty(0, "u1" if type_ == "binary" else type_)
+                for name, type_ in self._types.items()
+            }
         with reading(where, "values of the field", "the store is damaged"):
             array = join_columns(layout.field_named(self.field), columns, self.attributes)
             return array if shape is None else array.reshape(shape)
 
     def _read_group(self, frame: int, bounded: bool) -> dict[str, NDArray[Any]]:
-        """Return the columns of a frame. The numbers of rows and bytes are checked before decompressing.
+        """Return the columns of a frame.
+
+        The numbers of rows and bytes are checked before decompressing.
 
         With `bounded`, the only limit is the size of the largest possible scan.
         """
-        (group, rows), where = self._groups[frame], f"{self.where}: field {self.field}, frame {frame}"
+        (group, rows), where = (
+            self._groups[frame],
+            f"{self.where}: field {self.field}, frame {frame}",
+        )
         with reading(where, "the rows of a frame", "the file may be truncated or corrupted"):
-            about = self._metadata.row_group(group) if group < self._metadata.num_row_groups else None
+            about = (
+                self._metadata.row_group(group) if group < self._metadata.num_row_groups else None
+            )
             if about is None or about.num_rows != rows:
                 found = "none" if about is None else str(about.num_rows)
-                raise FormatError(where, expected=f"{rows} rows", found=found, advice="the store is damaged")
+                raise FormatError(
+                    where, expected=f"{rows} rows", found=found, advice="the store is damaged"
+                )
             if bounded:
                 for type_ in self._types.values():
                     check_size((rows,), np.dtype("u1" if type_ == "binary" else type_), where)
@@ -189,7 +228,9 @@ class FieldTable:
         except FormatError as error:
             raise error.within(f"field {self.field}, frame {frame}") from error
         for name, column in columns.items():
-            if len(column) != rows or column.dtype != (object if self._types[name] == "binary" else self._types[name]):
+            if len(column) != rows or column.dtype != (
+                object if self._types[name] == "binary" else self._types[name]
+            ):
                 raise FormatError(
                     where,
                     expected=f"{rows} values of {self._types[name]} in {name}",
@@ -217,7 +258,10 @@ def opened(tree: Tree, path: str, metadata: Any = None) -> Iterator[Any]:
     except FormatError as error:
         if isinstance(error.__cause__, FileNotFoundError):
             raise FormatError(
-                where, expected="the table that the sequence lists", found="none", advice="the store is damaged"
+                where,
+                expected="the table that the sequence lists",
+                found="none",
+                advice="the store is damaged",
             ) from error
         raise
 
@@ -226,10 +270,13 @@ def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
     """Return the checked attributes in the footer of a table.
 
     Raises:
-        FormatError: they are missing, the step of coordinates is not a valid length, or labels do not have one or two bytes.
+        FormatError: they are missing, the step of coordinates is not a valid length, or labels do
+            not have one or two bytes.
     """
     scale, label_bytes = about.get("scale_m"), about.get("label_bytes", 1)
-    if ("scale_m" in about and not (type(scale) in (int, float) and 0 < scale <= 1)) or label_bytes not in (1, 2):
+    if (
+        "scale_m" in about and not (type(scale) in (int, float) and 0 < scale <= 1)
+    ) or label_bytes not in (1, 2):
         raise FormatError(
             where,
             expected="a step of coordinates up to 1 m, and labels of 1 or 2 bytes",
@@ -249,11 +296,16 @@ def footer_checksum(tree: Tree, path: str) -> int:
     end = bytes(tree.read_range(path, -_END, 0))
     if len(end) != _END or not end.endswith(_MARK):
         raise FormatError(
-            tree.where(path), expected="a Parquet file", found="another end of the file", advice="it may be truncated"
+            tree.where(path),
+            expected="a Parquet file",
+            found="another end of the file",
+            advice="it may be truncated",
         )
     length = int.from_bytes(end[:4], "little")
     if length > _LONGEST:
-        raise FormatError(tree.where(path), expected=f"a footer of at most {_LONGEST} bytes", found=str(length))
+        raise FormatError(
+            tree.where(path), expected=f"a footer of at most {_LONGEST} bytes", found=str(length)
+        )
     return zlib.crc32(tree.read_range(path, -_END - length, 0))
 
 
@@ -288,17 +340,26 @@ def check_footer(tree: Tree, path: str, expected: object) -> None:
 
 
 def _check_types(schema: Any, types: Mapping[str, str], where: str) -> None:
-    found = {name: str(schema.field(name).type) if name in schema.names else "nothing" for name in types}
+    found = {
+        name: str(schema.field(name).type) if name in schema.names else "nothing" for name in types
+    }
     # pyarrow calls float32 "float" and float64 "double"
     short = {"float32": "float", "float64": "double", "float16": "halffloat"}
     for name, type_ in types.items():
         if found[name] != short.get(type_, type_):
-            raise FormatError(where, expected=f"{type_} in {name}", found=found[name], advice="the store is damaged")
+            raise FormatError(
+                where,
+                expected=f"{type_} in {name}",
+                found=found[name],
+                advice="the store is damaged",
+            )
 
 
 def _counts(values: object) -> list[int]:
     """Return a list of numbers from JSON; empty if it is anything else."""
-    right = isinstance(values, list) and all(type(value) is int and 0 <= value < 2**48 for value in values)
+    right = isinstance(values, list) and all(
+        type(value) is int and 0 <= value < 2**48 for value in values
+    )
     return values if right else []  # type: ignore[return-value]
 
 
@@ -308,4 +369,8 @@ def _rise(values: list[int]) -> bool:
 
 def _to_numpy(column: Any) -> NDArray[Any]:
     """Return a column of a row group, without a copy if it has one chunk and no missing values."""
-    return np.asarray(column.chunk(0).to_numpy(zero_copy_only=False) if column.num_chunks == 1 else column.to_numpy())
+    return np.asarray(
+        column.chunk(0).to_numpy(zero_copy_only=False)
+        if column.num_chunks == 1
+        else column.to_numpy()
+    )

@@ -17,7 +17,10 @@ from carlasc.storage.field_files import VELOCITY_DTYPE, VOTES_DTYPE, WIDE_VOTES_
 from carlasc.storage.packed.columns import narrow, quantise
 
 AXES = frozenset("xyz")
-"""Columns of points that can be quantised. Otherwise they use byte-stream split, because their values rarely repeat."""
+"""Columns of points that can be quantised.
+
+Otherwise they use byte-stream split, because their values rarely repeat.
+"""
 
 _VELOCITY = ("vx", "vy", "vz")
 
@@ -39,11 +42,18 @@ def column_types(entry: Field, attributes: Mapping[str, Any]) -> dict[str, str]:
     """Return the pyarrow type name of each column. `attributes` is the result of `describe`."""
     match entry.kind:
         case "position":
-            return {name: "int32" if "scale_m" in attributes and name in AXES else "float32" for name in entry.names}
+            return {
+                name: "int32" if "scale_m" in attributes and name in AXES else "float32"
+                for name in entry.names
+            }
         case "picture":
             return {"jpeg": "binary"}
         case "votes":
-            return {"voxel": "int32", "label": f"uint{8 * attributes['label_bytes']}", "votes": "uint16"}
+            return {
+                "voxel": "int32",
+                "label": f"uint{8 * attributes['label_bytes']}",
+                "votes": "uint16",
+            }
         case "velocities":
             return {"voxel": "int32"} | dict.fromkeys(_VELOCITY, "float16")
         case "boxes":
@@ -52,11 +62,15 @@ def column_types(entry: Field, attributes: Mapping[str, Any]) -> dict[str, str]:
             return dict.fromkeys(entry.names, np.dtype(entry.dtype).name)
 
 
-def split_columns(entry: Field, array: NDArray[Any], attributes: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """Return the columns of a frame: of a table, of (N, K) rows, of the values of a grid in C order, or of one picture.
+def split_columns(
+    entry: Field, array: NDArray[Any], attributes: Mapping[str, Any]
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of a frame: of a table, of (N, K) rows, of the values of a grid in C
+    order, or of one picture.
 
     Raises:
-        FormatError: labels of votes are wider than those of the first frame, or coordinates cannot be quantised.
+        FormatError: labels of votes are wider than those of the first frame, or coordinates cannot
+            be quantised.
     """
     types = column_types(entry, attributes)
     if entry.kind == "picture":
@@ -83,8 +97,12 @@ def split_columns(entry: Field, array: NDArray[Any], attributes: Mapping[str, An
     }
 
 
-def join_columns(entry: Field, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> NDArray[Any]:
-    """Return the array of a frame: a table, (N, K) rows, (N,) values (classes in the narrowest type), or the bytes of a picture."""
+def join_columns(
+    entry: Field, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
+) -> NDArray[Any]:
+    """Return the array of a frame: a table, (N, K) rows, (N,) values (classes in the narrowest
+    type), or the bytes of a picture.
+    """
     first = next(iter(columns.values()))
     if entry.kind == "picture":
         return np.frombuffer(first[0], np.uint8)
@@ -117,7 +135,11 @@ def statistics(field: str, array: NDArray[Any]) -> dict[str, Any]:
     """Return the columns of frames.parquet for one frame of a field."""
     if field == "points":
         finite = array[np.isfinite(array).all(axis=1), :3]
-        reach = float(np.sqrt((finite.astype(np.float64) ** 2).sum(axis=1).max())) if len(finite) else None
+        reach = (
+            float(np.sqrt((finite.astype(np.float64) ** 2).sum(axis=1).max()))
+            if len(finite)
+            else None
+        )
         return {"points": len(array), "farthest_m": reach}
     if field == "labels":
         return {"labelled_points": int(np.count_nonzero(array))}

@@ -1,7 +1,8 @@
 """A local cache for the files of remote stores. Each file is fetched once for all processes.
 
-The name of a cached file contains its URL and its version: its size, and its ETag or modification time on the server. The modification
-time of a cached file is the time of the last comparison with the remote file, its access time that of its last use. This module sets both.
+The name of a cached file contains its URL and its version: its size, and its ETag or modification
+time on the server. The modification time of a cached file is the time of the last comparison with
+the remote file, its access time that of its last use. This module sets both.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ _FULL_S = 60.0  # pause of fetching after the disk was full
 class Cache:
     """A cache folder for files of remote stores. Several stores and processes may share it.
 
-    When the folder would become larger than `max_bytes`, the least recently used files are removed. An incomplete file of a killed process
-    is never read. Locks are those of the operating system (`flock`), so the folder should be on a local disk.
+    When the folder would become larger than `max_bytes`, the least recently used files are removed.
+    An incomplete file of a killed process is never read. Locks are those of the operating system
+    (`flock`), so the folder should be on a local disk.
 
     Attributes:
         folder: the folder; it is created when a store is opened.
@@ -51,7 +53,9 @@ class Cache:
 
     def __post_init__(self) -> None:
         if self.max_bytes <= 0:
-            raise ArgumentError("max_bytes", expected="a number of bytes above 0", found=str(self.max_bytes))
+            raise ArgumentError(
+                "max_bytes", expected="a number of bytes above 0", found=str(self.max_bytes)
+            )
 
     def create(self) -> None:
         """Create the folder.
@@ -75,7 +79,9 @@ class Cache:
         return Path(self.folder) / name[:2] / name
 
     def find(self, key: str, since: float) -> str | None:
-        """Return the name of the cached file with a key, if it was compared with the remote file after `since`; otherwise None."""
+        """Return the name of the cached file with a key, if it was compared with the remote file
+        after `since`; otherwise None.
+        """
         with suppress(FileNotFoundError), os.scandir(Path(self.folder) / key[:2]) as entries:
             for entry in entries:
                 if entry.name.startswith(f"{key}-") and not entry.name.endswith(_PART):
@@ -94,8 +100,8 @@ class Cache:
             wait: wait for another process that is writing the file.
 
         Returns:
-            Whether the file exists. It does not if another process is writing it and `wait` is False, or if files that are being
-            written leave no room for it.
+            Whether the file exists. It does not if another process is writing it and `wait` is
+            False, or if files that are being written leave no room for it.
 
         Raises:
             OSError: the disk is full.
@@ -114,7 +120,8 @@ class Cache:
                         if not self._make_room(descriptor, _size_of(name)):
                             return False
                         fill(descriptor)
-                        sync_file(descriptor)  # its full size is already set: after a power failure it could hold zeros
+                        # its full size is already set: after a power failure it could hold zeros
+                        sync_file(descriptor)
                         part.rename(path)
                 finally:
                     if _is_at(part, descriptor):
@@ -122,7 +129,10 @@ class Cache:
         return True
 
     def touch(self, name: str, *, compared: bool = False) -> bool:
-        """Record that a file is used, and whether it was `compared` with the remote file. Return whether it still exists."""
+        """Record that a file is used, and whether it was `compared` with the remote file.
+
+        Return whether it still exists.
+        """
         path, now = self.path(name), time.time_ns()
         try:
             os.utime(path, ns=(now, now if compared else path.stat().st_mtime_ns))
@@ -133,7 +143,10 @@ class Cache:
         return True
 
     def _make_room(self, descriptor: int, size: int) -> bool:
-        """Remove the oldest files as needed, and set the size of a new file. Return whether there is room for it."""
+        """Remove the oldest files as needed, and set the size of a new file.
+
+        Return whether there is room for it.
+        """
         folder = Path(self.folder)
         with _locked(folder / _LOCK):
             os.truncate(descriptor, 0)  # discard the bytes of a killed process
@@ -152,8 +165,9 @@ class Cache:
 class CachedTree(Tree):
     """A remote tree whose files are read through a cache, as whole files.
 
-    One process compares a file with the remote file, once after the store was opened. Later changes are not detected. If a file is too
-    large for the cache, or the disk is full, its ranges are read from the server.
+    One process compares a file with the remote file, once after the store was opened. Later changes
+    are not detected. If a file is too large for the cache, or the disk is full, its ranges are read
+    from the server.
     """
 
     def __init__(self, remote: RemoteTree, cache: Cache) -> None:
@@ -213,7 +227,9 @@ class CachedTree(Tree):
             self._names.pop(path, None)  # removed to make room: fetched again
         return False
 
-    def _from_cache(self, path: str, read: Callable[[LocalTree, str], bytes | memoryview]) -> bytes | memoryview | None:
+    def _from_cache(
+        self, path: str, read: Callable[[LocalTree, str], bytes | memoryview]
+    ) -> bytes | memoryview | None:
         for _ in range(2):
             name = self._find(path)
             if name is None:
@@ -231,7 +247,9 @@ class CachedTree(Tree):
         return None
 
     def _find(self, path: str, wait: bool = True) -> str | None:
-        """Return the name of a file in the cache, fetching it if necessary; None if it must be read without the cache."""
+        """Return the name of a file in the cache, fetching it if necessary; None if it must be read
+        without the cache.
+        """
         if (name := self._names.get(path)) is not None:
             return name
         if path in self._too_large:
@@ -262,13 +280,20 @@ class CachedTree(Tree):
     def _fill(self, path: str, size: int, descriptor: int) -> None:
         starts = range(0, size, _PIECE)
         for first in range(0, len(starts), _AT_ONCE):
-            pieces = [(path, start, min(start + _PIECE, size)) for start in starts[first : first + _AT_ONCE]]
+            pieces = [
+                (path, start, min(start + _PIECE, size))
+                for start in starts[first : first + _AT_ONCE]
+            ]
             for (_, start, _), data in zip(pieces, self.remote.read_ranges(pieces), strict=True):
                 write_at(descriptor, data, start)
 
     def _key(self, path: str) -> str:
         options = self.remote.requests.options
-        endpoint = options.get("endpoint_url") or dict(options.get("client_kwargs") or {}).get("endpoint_url") or ""
+        endpoint = (
+            options.get("endpoint_url")
+            or dict(options.get("client_kwargs") or {}).get("endpoint_url")
+            or ""
+        )
         return _digest(f"{endpoint}\n{self.location}\n{path}")[:32]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -293,10 +318,12 @@ class _CacheFolder(LocalTree):
 
 @contextmanager
 def _locked(path: Path, wait: bool = True) -> Iterator[int | None]:
-    """Create and open a file, and hold its lock. Yields None if another process holds the lock and `wait` is False.
+    """Create and open a file, and hold its lock.
 
-    The operating system releases the lock when a process ends for any reason. The lock is released before the file is closed, because
-    a forked process may have inherited the descriptor.
+    Yields None if another process holds the lock and `wait` is False.
+
+    The operating system releases the lock when a process ends for any reason. The lock is released
+    before the file is closed, because a forked process may have inherited the descriptor.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
@@ -319,7 +346,10 @@ def _size_of(name: str) -> int:
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a file exists and has the size in its name. A power failure can leave a shorter file."""
+    """Whether a file exists and has the size in its name.
+
+    A power failure can leave a shorter file.
+    """
     try:
         return path.stat().st_size == _size_of(path.name)
     except FileNotFoundError:

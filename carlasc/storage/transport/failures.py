@@ -1,6 +1,8 @@
-"""Classification of failed requests: whether a request may succeed later, and the error message for the user.
+"""Classification of failed requests: whether a request may succeed later, and the error message for
+the user.
 
-fsspec passes on the errors of other libraries, which share no base class. `TEMPORARY` lists their public classes for failed connections.
+fsspec passes on the errors of other libraries, which share no base class. `TEMPORARY` lists their
+public classes for failed connections.
 """
 
 from __future__ import annotations
@@ -14,7 +16,12 @@ from carlasc.errors import CarlascError, MissingDataError, StorageError
 TEMPORARY: Mapping[str, tuple[str, ...]] = {
     "aiohttp": ("ClientConnectionError", "ClientPayloadError"),
     "aiohttp.http_exceptions": ("HttpProcessingError",),
-    "botocore.exceptions": ("ConnectionError", "HTTPClientError", "FlexibleChecksumError", "IncompleteReadError"),
+    "botocore.exceptions": (
+        "ConnectionError",
+        "HTTPClientError",
+        "FlexibleChecksumError",
+        "IncompleteReadError",
+    ),
     "botocore.parsers": ("ResponseParserError",),
     "requests.exceptions": ("ConnectionError", "ChunkedEncodingError"),
     "http.client": ("IncompleteRead",),
@@ -23,8 +30,11 @@ TEMPORARY: Mapping[str, tuple[str, ...]] = {
 }
 """Connection errors by module. Only modules that are already imported can have raised an error."""
 
-_BUSY = frozenset({408, 409, 425, 429})  # statuses below 500 after which a request may succeed later
-_BUSY_CODES = frozenset({"SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "OperationAborted"})
+# statuses below 500 after which a request may succeed later
+_BUSY = frozenset({408, 409, 425, 429})
+_BUSY_CODES = frozenset(
+    {"SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "OperationAborted"}
+)
 
 
 class WrongAnswerError(Exception):
@@ -46,7 +56,9 @@ def is_temporary(error: BaseException) -> bool:
 
 
 def is_offline(error: BaseException) -> bool:
-    """Whether no request was sent to the Hub, because the environment variable HF_HUB_OFFLINE is set."""
+    """Whether no request was sent to the Hub, because the environment variable HF_HUB_OFFLINE is
+    set.
+    """
     return type(error).__name__ == "OfflineModeIsEnabled"
 
 
@@ -70,7 +82,8 @@ def bucket_is_missing(error: BaseException) -> bool:
 def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn:
     """Raise the error of a request with a message of one line without credentials.
 
-    Messages of other libraries are left out, because they may contain a signature or a key. For the same reason, the error has no cause.
+    Messages of other libraries are left out, because they may contain a signature or a key. For the
+    same reason, the error has no cause.
 
     Args:
         where: the file, without credentials.
@@ -106,21 +119,27 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
         raise kind(
             where,
             problem=f"{verb}: no credentials were found",
-            advice="set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=true for a public bucket",
+            advice="set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=true for a "
+            "public bucket",
         ) from None
     if is_offline(error):
-        raise kind(where, problem=f"{verb}: HF_HUB_OFFLINE is set", advice="unset it to use the network") from None
+        raise kind(
+            where, problem=f"{verb}: HF_HUB_OFFLINE is set", advice="unset it to use the network"
+        ) from None
     if is_temporary(error):
         raise kind(
             where,
-            problem=f"{verb}: the server failed at each attempt, last with {describe_failure(error)}",
+            problem=f"{verb}: the server failed at each attempt, last with "
+            f"{describe_failure(error)}",
             advice="try again later",
         ) from None
     raise kind(where, problem=f"{verb}: {describe_failure(error)}") from None
 
 
 def describe_failure(error: BaseException) -> str:
-    """Describe an error of a request without credentials: its status, its code or the name of its class."""
+    """Describe an error of a request without credentials: its status, its code or the name of its
+    class.
+    """
     status, code = _status_and_code(error)
     if isinstance(error, WrongAnswerError):
         return str(error)
@@ -129,11 +148,17 @@ def describe_failure(error: BaseException) -> str:
         return text
     reason = getattr(error, "strerror", None)
     name = type(error).__name__
-    return f"{name} ({reason})" if isinstance(reason, str) and type(error).__module__ == "builtins" else name
+    return (
+        f"{name} ({reason})"
+        if isinstance(reason, str) and type(error).__module__ == "builtins"
+        else name
+    )
 
 
 def _is_of_connection(error: BaseException) -> bool:
-    """Whether an error, or one of its causes, is a connection error. aiohttp gives answers that are not HTTP an artificial status."""
+    """Whether an error, or one of its causes, is a connection error. aiohttp gives answers that are
+    not HTTP an artificial status.
+    """
     kinds = [
         getattr(sys.modules[module], name, ())
         for module, names in TEMPORARY.items()
@@ -153,8 +178,11 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def _status_and_code(error: BaseException) -> tuple[int | None, str]:
-    """Return the HTTP status of an error, and the code of an S3 error ("NoSuchBucket"), if it has them."""
-    for cause in () if _is_of_connection(error) else _causes(error):  # payload errors of aiohttp have another "code"
+    """Return the HTTP status of an error, and the code of an S3 error ("NoSuchBucket"), if it has
+    them.
+    """
+    # payload errors of aiohttp have another "code"
+    for cause in () if _is_of_connection(error) else _causes(error):
         answer = getattr(cause, "response", None)
         if isinstance(answer, Mapping):  # botocore
             status = answer.get("ResponseMetadata", {}).get("HTTPStatusCode")

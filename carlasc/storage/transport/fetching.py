@@ -1,6 +1,9 @@
-"""Fetching one large file from a web server, in blocks over several connections. An interrupted run can be continued.
+"""Fetching one large file from a web server, in blocks over several connections.
 
-Bytes are written to `<name>.part`, and the list of its blocks to `<name>.part.json`. The file gets its final name when it is complete.
+An interrupted run can be continued.
+
+Bytes are written to `<name>.part`, and the list of its blocks to `<name>.part.json`. The file gets
+its final name when it is complete.
 """
 
 from __future__ import annotations
@@ -16,7 +19,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from carlasc.errors import CarlascError, FormatError, MissingDataError, postponed_interrupts, without_credentials
+from carlasc.errors import (
+    CarlascError,
+    FormatError,
+    MissingDataError,
+    postponed_interrupts,
+    without_credentials,
+)
 from carlasc.storage.files import (
     parse_json,
     remove_file,
@@ -27,7 +36,12 @@ from carlasc.storage.files import (
     write_json,
     writing,
 )
-from carlasc.storage.transport.failures import WrongAnswerError, describe_failure, fail, is_temporary
+from carlasc.storage.transport.failures import (
+    WrongAnswerError,
+    describe_failure,
+    fail,
+    is_temporary,
+)
 from carlasc.storage.transport.requests import HttpAnswer, Requests
 
 _ZIP = b"PK"
@@ -53,7 +67,8 @@ class ServedFile:
 
     Attributes:
         size: size in bytes; None if the server does not report it.
-        validator: its ETag, otherwise its date, to detect changes; None if the server sends neither.
+        validator: its ETag, otherwise its date, to detect changes; None if the server sends
+            neither.
         ranges: whether the server supports range requests.
     """
 
@@ -64,7 +79,9 @@ class ServedFile:
 
 @dataclass
 class _Arrived:
-    """The number of fetched bytes of each block in the .part file, counted from the start of the block."""
+    """The number of fetched bytes of each block in the .part file, counted from the start of the
+    block.
+    """
 
     block: int
     got: dict[int, int] = field(default_factory=dict)
@@ -92,10 +109,21 @@ class FileFetch:
         Raises:
             CarlascError: the server cannot be reached, or the file does not exist or is not a zip.
         """
-        self._url, self._where, self._path, self._connections = url, without_credentials(url), path, connections
-        self._part, self._record = (path.with_name(f"{path.name}{end}") for end in (".part", ".part.json"))
+        self._url, self._where, self._path, self._connections = (
+            url,
+            without_credentials(url),
+            path,
+            connections,
+        )
+        self._part, self._record = (
+            path.with_name(f"{path.name}{end}") for end in (".part", ".part.json")
+        )
         if not url.startswith(("http://", "https://")):
-            raise CarlascError(self._where, expected="a URL that begins with http:// or https://", found="another URL")
+            raise CarlascError(
+                self._where,
+                expected="a URL that begins with http:// or https://",
+                found="another URL",
+            )
         self._requests = Requests(url)
         self.file = self._persist(self._probe)
 
@@ -107,14 +135,16 @@ class FileFetch:
         """Fetch the file, continuing an earlier run.
 
         Args:
-            advance: called with the number of new bytes, from one thread at a time; negative if bytes are discarded.
+            advance: called with the number of new bytes, from one thread at a time; negative if
+                bytes are discarded.
             most: maximum size in bytes, if the server does not report the size.
 
         Returns:
             The number of bytes that an earlier run had fetched.
 
         Raises:
-            CarlascError: the server cannot be reached, or the file keeps changing. The next run continues with the fetched bytes.
+            CarlascError: the server cannot be reached, or the file keeps changing. The next run
+                continues with the fetched bytes.
             StorageError: the disk is full or fails.
         """
         for _ in range(_RESTARTS):
@@ -134,8 +164,11 @@ class FileFetch:
                 advance(-arrived.total)
                 self._part.unlink(missing_ok=True)
                 self._record.unlink(missing_ok=True)
-                changed = isinstance(error, _ChangedError)  # otherwise the server wrongly announced range requests
-                self.file = self._persist(self._probe) if changed else replace(self.file, ranges=False)
+                # otherwise the server wrongly announced range requests
+                changed = isinstance(error, _ChangedError)
+                self.file = (
+                    self._persist(self._probe) if changed else replace(self.file, ranges=False)
+                )
         raise FormatError(
             self._where,
             expected="a file that does not change",
@@ -186,7 +219,9 @@ class FileFetch:
             for future in done:
                 future.result()
         finally:
-            stop.set()  # after Ctrl-C or a failed block, the other blocks stop at their next piece and keep their bytes
+            # after Ctrl-C or a failed block, the other blocks stop at their next piece and keep
+            # their bytes
+            stop.set()
             executor.shutdown(wait=True, cancel_futures=True)
             try:
                 self._save(arrived, descriptor)
@@ -207,12 +242,16 @@ class FileFetch:
                     arrived.got[0] = arrived.got.get(0, 0) + len(data)
                     advance(len(data))
                     if arrived.total > most:
-                        raise FormatError(self._where, expected=f"at most {most:.0f} bytes", found="more")
+                        raise FormatError(
+                            self._where, expected=f"at most {most:.0f} bytes", found="more"
+                        )
 
         self._persist(one_try)
 
     def _probe(self) -> ServedFile:
-        """Request the first bytes, to find the size, whether ranges are supported, and whether it is a zip."""
+        """Request the first bytes, to find the size, whether ranges are supported, and whether it
+        is a zip.
+        """
         with self._answer({"Range": f"bytes=0-{len(_ZIP) - 1}"}) as answer:
             ranges, start = answer.status == _PARTIAL, answer.first[: len(_ZIP)]
             if start != _ZIP:
@@ -223,10 +262,15 @@ class FileFetch:
                     found=f"{content} that begins with {start!r}",
                     advice="check the URL: the file may have moved",
                 )
-            return ServedFile(_total(answer) if ranges else _length(answer), _validator(answer), ranges)
+            return ServedFile(
+                _total(answer) if ranges else _length(answer), _validator(answer), ranges
+            )
 
     def _range(self, start: int, end: int) -> Iterator[bytes]:
-        """Yield the bytes [start, end) in pieces. Checks that all headers of the answer fit the request."""
+        """Yield the bytes [start, end) in pieces.
+
+        Checks that all headers of the answer fit the request.
+        """
         file, headers = self.file, {"Range": f"bytes={start}-{end - 1}"}
         if file.validator is not None and not file.validator.startswith("W/"):
             headers["If-Range"] = file.validator
@@ -237,11 +281,16 @@ class FileFetch:
                 raise _RangeIgnoredError
             if _total(answer) != file.size:
                 raise _ChangedError
-            expected, found = f"bytes {start}-{end - 1}/{file.size}", answer.headers.get("Content-Range", "")
+            expected, found = (
+                f"bytes {start}-{end - 1}/{file.size}",
+                answer.headers.get("Content-Range", ""),
+            )
             if found != expected:
                 raise WrongAnswerError(f"expected {expected}, found {found}")
             if _length(answer) not in (None, end - start):
-                raise WrongAnswerError(f"expected {end - start} bytes, found a Content-Length of {_length(answer)}")
+                raise WrongAnswerError(
+                    f"expected {end - start} bytes, found a Content-Length of {_length(answer)}"
+                )
             yield from _exactly(answer, end - start)
 
     @contextmanager
@@ -249,16 +298,24 @@ class FileFetch:
         with self._requests.answer(headers) as answer:
             if answer.status in _GONE:
                 raise MissingDataError(
-                    self._where, expected="a file", found=f"status {answer.status} ({answer.reason})"
+                    self._where,
+                    expected="a file",
+                    found=f"status {answer.status} ({answer.reason})",
                 )
             if answer.error is not None:
                 raise answer.error
             yield answer
 
     def _persist(
-        self, work: Callable[[], _Result], count: Callable[[], int] = lambda: 0, stop: threading.Event | None = None
+        self,
+        work: Callable[[], _Result],
+        count: Callable[[], int] = lambda: 0,
+        stop: threading.Event | None = None,
     ) -> _Result:
-        """Call `work`, again after temporary failures. If all attempts fail, raise a one-line error about the last failure."""
+        """Call `work`, again after temporary failures.
+
+        If all attempts fail, raise a one-line error about the last failure.
+        """
         try:
             return self._requests.persist(work, count, stop)
         except (CarlascError, _ChangedError, _RangeIgnoredError):
@@ -268,7 +325,8 @@ class FileFetch:
                 raise CarlascError(
                     self._where,
                     expected="data",
-                    found=f"none in {self._requests.settings.attempts} attempts ({describe_failure(error)})",
+                    found=f"none in {self._requests.settings.attempts} attempts "
+                    f"({describe_failure(error)})",
                     advice="run the same command again to continue",
                 ) from None
             if isinstance(error, OSError):
@@ -276,19 +334,31 @@ class FileFetch:
             fail(self._where, error)
 
     def _load(self) -> _Arrived:
-        """Return the blocks that an earlier run fetched of the same file; empty if the file has changed."""
+        """Return the blocks that an earlier run fetched of the same file; empty if the file has
+        changed.
+        """
         fresh, file = _Arrived(_BLOCK), self.file
         if not (self._part.is_file() and self._record.is_file() and file.ranges):
             return fresh
         try:
             values = parse_json(self._record.read_bytes(), str(self._record))
-            arrived = _Arrived(int(values["block"]), {int(k): int(v) for k, v in values["got"].items()})
-            same = (values["url"], values["size"], values["validator"]) == (self._where, file.size, file.validator)
+            arrived = _Arrived(
+                int(values["block"]), {int(k): int(v) for k, v in values["got"].items()}
+            )
+            same = (values["url"], values["size"], values["validator"]) == (
+                self._where,
+                file.size,
+                file.validator,
+            )
         except (FormatError, KeyError, TypeError, ValueError, AttributeError):
             return fresh
         same = same and arrived.block > 0
         # Without a validator, an equal size does not prove that it is the same file.
-        return arrived if same and file.validator is not None and self._part.stat().st_size == file.size else fresh
+        return (
+            arrived
+            if same and file.validator is not None and self._part.stat().st_size == file.size
+            else fresh
+        )
 
     def _save(self, arrived: _Arrived, descriptor: int) -> None:
         """Record the fetched bytes, after syncing them to the disk."""
@@ -298,24 +368,34 @@ class FileFetch:
         write_json(self._record, {**about, "block": arrived.block, "got": got})
 
     def _finish(self, arrived: _Arrived) -> None:
-        """Rename the file if it is complete: it has all bytes, and the central directory at the end of a zip."""
+        """Rename the file if it is complete: it has all bytes, and the central directory at the end
+        of a zip.
+        """
         size, expected = self._part.stat().st_size, self.file.size
         if expected is not None and (arrived.total != expected or size != expected):
             found = str(min(size, arrived.total))
             raise FormatError(
-                self._path, expected=f"{expected} bytes", found=found, advice="run the same command again"
+                self._path,
+                expected=f"{expected} bytes",
+                found=found,
+                advice="run the same command again",
             )
         with self._part.open("rb") as file:
             if not zipfile.is_zipfile(file):
                 advice = f"remove {self._part.name} and run again"
-                raise FormatError(self._path, expected="a whole zip", found="a truncated one", advice=advice)
+                raise FormatError(
+                    self._path, expected="a whole zip", found="a truncated one", advice=advice
+                )
             sync_file(file.fileno())
         rename(self._part, self._path)
         self.discard_record()
 
 
 def _exactly(answer: HttpAnswer, count: int | None) -> Iterator[bytes]:
-    """Yield the body of an answer, and check that it has `count` bytes, if given. Further bytes are not read."""
+    """Yield the body of an answer, and check that it has `count` bytes, if given.
+
+    Further bytes are not read.
+    """
     left = count
     for data in answer.pieces():
         yield data if left is None else data[:left]

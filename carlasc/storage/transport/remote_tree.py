@@ -47,20 +47,29 @@ class RemoteTree(Tree):
             DependencyError: the URL needs a package that is not installed.
         """
         base, mark, query = url.partition("?") if url.startswith("http") else (url, "", "")
-        self._base, self._query = base.rstrip("/"), mark + query  # a signed URL: the signature follows each path
+        # a signed URL: the signature follows each path
+        self._base, self._query = (
+            base.rstrip("/"),
+            mark + query,
+        )
         self.location = without_credentials(self._base)
         self.requests = Requests(url.rstrip("/"), options)
         self._listed: dict[str, dict[str, bool]] = {}
         self._sizes: dict[str, int] = {}  # sizes of files in listed folders
 
     def url(self, path: str = "") -> str:
-        """Return the URL of a file. It may contain credentials, so it must not be shown; use `where` for messages."""
+        """Return the URL of a file.
+
+        It may contain credentials, so it must not be shown; use `where` for messages.
+        """
         return f"{self._base}/{path}{self._query}" if path else self._base + self._query
 
     def below(self, folder: str) -> RemoteTree:
         """Return the tree of a folder in this one."""
         tree = copy.copy(self)
-        tree._base, tree.location = (f"{place}/{folder}" if folder else place for place in (self._base, self.location))
+        tree._base, tree.location = (
+            f"{place}/{folder}" if folder else place for place in (self._base, self.location)
+        )
         tree._listed, tree._sizes = {}, {}
         return tree
 
@@ -71,7 +80,9 @@ class RemoteTree(Tree):
             if url.startswith("http") and not self._query:
                 url += "/"
             (found,) = self.requests.send([Request("ls", url, {"detail": True})])
-            if isinstance(found, FileNotFoundError | NotADirectoryError) and not bucket_is_missing(found):
+            if isinstance(found, FileNotFoundError | NotADirectoryError) and not bucket_is_missing(
+                found
+            ):
                 found = []
             elif isinstance(found, Exception):
                 fail(self.where(folder), found)
@@ -88,7 +99,9 @@ class RemoteTree(Tree):
         return self._listed[folder]
 
     def _own_name(self, folder: str) -> str:
-        """Return the name of the folder itself in its listing: object stores list it among its files."""
+        """Return the name of the folder itself in its listing: object stores list it among its
+        files.
+        """
         place = f"{self._base}/{folder}" if folder else self._base
         return (place if place.startswith("http") else self.requests.path_of(place)).strip("/")
 
@@ -97,7 +110,9 @@ class RemoteTree(Tree):
         self._listed, self._sizes = {}, {}
 
     def note(self, path: str, size: int | None) -> None:
-        """Update the listing of a folder after this process wrote a file of `size` bytes, or removed it (None)."""
+        """Update the listing of a folder after this process wrote a file of `size` bytes, or
+        removed it (None).
+        """
         self._sizes.pop(path, None)
         if size is not None:
             self._sizes[path] = size
@@ -112,11 +127,17 @@ class RemoteTree(Tree):
             name, is_folder = folder, True
 
     def is_file(self, path: str) -> bool:
-        """Whether the file exists, from the listing of its folder, or from the server if folders cannot be listed (http)."""
-        return self.size(path) is not None if self._base.startswith("http") else super().is_file(path)
+        """Whether the file exists, from the listing of its folder, or from the server if folders
+        cannot be listed (http).
+        """
+        return (
+            self.size(path) is not None if self._base.startswith("http") else super().is_file(path)
+        )
 
     def paths(self, folder: str = "") -> Iterator[str]:
-        """Yield the paths of all files below a folder, or the path itself if it is a file, in any order."""
+        """Yield the paths of all files below a folder, or the path itself if it is a file, in any
+        order.
+        """
         yield from self.sizes(folder)
 
     def sizes(self, folder: str = "") -> dict[str, int]:
@@ -143,13 +164,19 @@ class RemoteTree(Tree):
         return self.read_ranges([(path, start, end)])[0]
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Fetch the files, several at a time. Their lengths are checked if their folder has been listed."""
+        """Fetch the files, several at a time.
+
+        Their lengths are checked if their folder has been listed.
+        """
         requests = [Request("get", self.url(path), {}, self._length_check(path)) for path in paths]
         answers = self.requests.send(requests)
         for place, (path, answer) in enumerate(zip(paths, answers, strict=True)):
-            if isinstance(answer, WrongAnswerError):  # the file may have been replaced since the listing
+            # the file may have been replaced since the listing
+            if isinstance(answer, WrongAnswerError):
                 self._sizes[path] = self._size(path)
-                (answers[place],) = self.requests.send([Request("get", self.url(path), {}, self._length_check(path))])
+                (answers[place],) = self.requests.send(
+                    [Request("get", self.url(path), {}, self._length_check(path))]
+                )
             if isinstance(answers[place], Exception):
                 fail(self.where(path), answers[place])
         return [bytes(data) for data in answers]
@@ -160,35 +187,54 @@ class RemoteTree(Tree):
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes]:  # type: ignore[override]
         """Fetch the ranges, several at a time."""
-        sizes = {path: self._size(path) for path in {path for path, start, _ in ranges if start < 0}}
-        wanted = [(p, max(0, sizes[p] + s), sizes[p] + e) if s < 0 else (p, s, e) for p, s, e in ranges]
+        sizes = {
+            path: self._size(path) for path in {path for path, start, _ in ranges if start < 0}
+        }
+        wanted = [
+            (p, max(0, sizes[p] + s), sizes[p] + e) if s < 0 else (p, s, e) for p, s, e in ranges
+        ]
         asked = [part for part in wanted if part[1] < part[2]]
-        answers = iter(self.requests.send([Request("get", self.url(p), {"start": s, "end": e}) for p, s, e in asked]))
+        answers = iter(
+            self.requests.send(
+                [Request("get", self.url(p), {"start": s, "end": e}) for p, s, e in asked]
+            )
+        )
         return [self._checked(part, next(answers)) if part[1] < part[2] else b"" for part in wanted]
 
     def _checked(self, part: tuple[str, int, int], answer: Any) -> bytes:
-        """Return an answer of the right length. After a short answer the request is sent again, unless the file ends there."""
+        """Return an answer of the right length.
+
+        After a short answer the request is sent again, unless the file ends there.
+        """
         path, start, end = part
         if isinstance(answer, Exception):
             fail(self.where(path), answer)
         if len(answer) != end - start and self._size(path) >= end:
             check = partial(check_size, end - start)
-            (answer,) = self.requests.send([Request("get", self.url(path), {"start": start, "end": end}, check)])
+            (answer,) = self.requests.send(
+                [Request("get", self.url(path), {"start": start, "end": end}, check)]
+            )
             if isinstance(answer, Exception):
                 fail(self.where(path), answer)
         return check_length(bytes(answer), end - start, self.where(path))
 
     def open(self, path: str) -> Any:
-        """Open a file as a file object, which fetches blocks on demand. For libraries that take file objects."""
+        """Open a file as a file object, which fetches blocks on demand.
+
+        For libraries that take file objects.
+        """
         return RemoteFile(partial(self.read_range, path), self._size(path))
 
     def size(self, path: str = "") -> int | None:
-        """Return a file's size in bytes; None if it does not exist or is a folder (or a page that lists one)."""
+        """Return a file's size in bytes; None if it does not exist or is a folder (or a page that
+        lists one).
+        """
         found = self._about(path)
         return None if found is None else found["size"]
 
     def version(self, path: str) -> tuple[int, str]:
-        """Return the size of a file in bytes, and a text that changes with the file, if the server reports changes.
+        """Return the size of a file in bytes, and a text that changes with the file, if the server
+        reports changes.
 
         A request is sent each time, regardless of listings.
 
@@ -202,9 +248,13 @@ class RemoteTree(Tree):
         return found["size"], " ".join(str(found[name]) for name in _CHANGES if found.get(name))
 
     def _about(self, path: str) -> dict[str, Any] | None:
-        """Return the fsspec info of a file; None if it does not exist or is a folder (or a page that lists one)."""
+        """Return the fsspec info of a file; None if it does not exist or is a folder (or a page
+        that lists one).
+        """
         (found,) = self.requests.send([Request("info", self.url(path))])
-        if isinstance(found, FileNotFoundError | IsADirectoryError) and not bucket_is_missing(found):
+        if isinstance(found, FileNotFoundError | IsADirectoryError) and not bucket_is_missing(
+            found
+        ):
             return None
         if isinstance(found, Exception):
             fail(self.where(path), found)
@@ -218,14 +268,17 @@ class RemoteTree(Tree):
         return size
 
     def check_ranges(self, path: str = "") -> None:
-        """Request one byte to check for range requests: without them, each read would transfer the whole file.
+        """Request one byte to check for range requests: without them, each read would transfer the
+        whole file.
 
         Raises:
             CarlascError: the server does not support range requests.
         """
         if not self._base.startswith("http"):
             return
-        (answer,) = self.requests.send([Request("get", self.url(path), {"start": 0, "end": 1})], attempts=2)
+        (answer,) = self.requests.send(
+            [Request("get", self.url(path), {"start": 0, "end": 1})], attempts=2
+        )
         if isinstance(answer, WrongAnswerError):
             raise CarlascError(
                 self.where(path),
@@ -240,7 +293,9 @@ class RemoteTree(Tree):
         return self.__dict__ | {"_listed": {}, "_sizes": {}}  # a worker process lists folders again
 
 
-def tree_of(place: str | os.PathLike[str], *, mapped: bool = True, **storage_options: Any) -> LocalTree | RemoteTree:
+def tree_of(
+    place: str | os.PathLike[str], *, mapped: bool = True, **storage_options: Any
+) -> LocalTree | RemoteTree:
     """Return the tree of files at a path or a URL. Nothing is read yet.
 
     Args:
@@ -249,7 +304,11 @@ def tree_of(place: str | os.PathLike[str], *, mapped: bool = True, **storage_opt
         **storage_options: options of fsspec for the URL.
     """
     text = os.fspath(place)
-    return RemoteTree(text, storage_options) if is_url(text) else LocalTree(text.removeprefix("file://"), mapped=mapped)
+    return (
+        RemoteTree(text, storage_options)
+        if is_url(text)
+        else LocalTree(text.removeprefix("file://"), mapped=mapped)
+    )
 
 
 class RemoteFile(io.RawIOBase):
@@ -259,7 +318,10 @@ class RemoteFile(io.RawIOBase):
     """
 
     def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
-        """Create a file of `size` bytes. `fetch` returns the bytes [start, end). Nothing is fetched yet."""
+        """Create a file of `size` bytes.
+
+        `fetch` returns the bytes [start, end). Nothing is fetched yet.
+        """
         self._fetch, self._size, self._place = fetch, size, 0
         self._blocks: dict[int, bytes] = {}  # ordered by last use, the latest at the end
 
@@ -273,7 +335,9 @@ class RemoteFile(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         """Move to a position and return it."""
-        self._place = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._size}[whence])
+        self._place = max(
+            0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._size}[whence]
+        )
         return self._place
 
     def tell(self) -> int:
@@ -298,7 +362,10 @@ class RemoteFile(io.RawIOBase):
         return end - start
 
     def _load(self, first: int, last: int) -> None:
-        """Fetch the blocks from `first` to `last` that are not cached. Adjacent blocks are fetched in one request."""
+        """Fetch the blocks from `first` to `last` that are not cached.
+
+        Adjacent blocks are fetched in one request.
+        """
         number = first
         while number <= last:
             if number in self._blocks:

@@ -1,9 +1,10 @@
 """Parallel requests to object stores and web servers through fsspec, with retries.
 
-Object stores answer some requests with "503 Slow Down", close connections, or send less than they announced. Such requests are sent
-again, after a random time whose limit doubles at each attempt. The retries of s3fs and botocore are turned off, because they would
-multiply with these. `carlasc.storage.transport.servers` has the code for each kind of server, `carlasc.storage.transport.failures`
-decides which failures are temporary.
+Object stores answer some requests with "503 Slow Down", close connections, or send less than they
+announced. Such requests are sent again, after a random time whose limit doubles at each attempt.
+The retries of s3fs and botocore are turned off, because they would multiply with these.
+`carlasc.storage.transport.servers` has the code for each kind of server,
+`carlasc.storage.transport.failures` decides which failures are temporary.
 """
 
 from __future__ import annotations
@@ -50,12 +51,15 @@ _Answer = TypeVar("_Answer")
 
 @dataclass(frozen=True)
 class RemoteSettings:
-    """Settings of requests. Each field is read from an environment variable: `requests` from CARLASC_REMOTE_REQUESTS.
+    """Settings of requests.
+
+    Each field is read from an environment variable: `requests` from CARLASC_REMOTE_REQUESTS.
 
     Attributes:
         requests: maximum number of parallel requests of one call.
         attempts: number of attempts before the error is raised.
-        backoff_s: attempt n + 1 follows after a random time of at most `backoff_s` * 2 ** (n - 1) and at most `longest_wait_s`.
+        backoff_s: attempt n + 1 follows after a random time of at most `backoff_s` * 2 ** (n - 1)
+            and at most `longest_wait_s`.
         longest_wait_s: maximum time between two attempts, seconds.
         timeout_s: maximum time without data from a server, seconds.
     """
@@ -89,7 +93,10 @@ class RemoteSettings:
         return cls(**given)
 
     def draw_wait_s(self, attempts: int) -> float:
-        """Return the time to wait after a number of attempts. It is random, so that many clients do not retry at the same moment."""
+        """Return the time to wait after a number of attempts.
+
+        It is random, so that many clients do not retry at the same moment.
+        """
         return _RANDOM.uniform(0, min(self.backoff_s * 2.0 ** (attempts - 1), self.longest_wait_s))
 
 
@@ -98,7 +105,8 @@ class Request:
     """One request.
 
     Attributes:
-        name: method of fsspec file systems, such as "info" or "pipe_file", or "get" for the function of `servers`.
+        name: method of fsspec file systems, such as "info" or "pipe_file", or "get" for the
+            function of `servers`.
         url: URL of the file; several URLs if the method takes several.
         data: bytes to send, the second argument of the method; None if it has no second argument.
         options: further keyword arguments of the method.
@@ -112,12 +120,18 @@ class Request:
     data: bytes | None = None
 
     def arguments(self) -> tuple[Any, ...]:
-        """Return the positional arguments of the method. They are positional because file systems name the data differently."""
+        """Return the positional arguments of the method.
+
+        They are positional because file systems name the data differently.
+        """
         return (self.url,) if self.data is None else (self.url, self.data)
 
 
 class Requests:
-    """Sends requests to the file system of one URL. It can be pickled; each process opens its own connections."""
+    """Sends requests to the file system of one URL.
+
+    It can be pickled; each process opens its own connections.
+    """
 
     def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
         """Keep the URL and the fsspec storage options. No request is sent yet.
@@ -136,7 +150,10 @@ class Requests:
 
     @property
     def fs(self) -> Any:
-        """The file system of this process. All threads share it; a forked process creates a new one."""
+        """The file system of this process.
+
+        All threads share it; a forked process creates a new one.
+        """
         from fsspec.core import url_to_fs
 
         if self._opened is None or self._opened[0] != os.getpid():
@@ -156,14 +173,21 @@ class Requests:
         return str(url_to_fs(url, **self._fsspec_options())[1])
 
     def _fsspec_options(self) -> dict[str, Any]:
-        """Return the storage options, with retries and listing caches of s3fs and aiohttp turned off."""
+        """Return the storage options, with retries and listing caches of s3fs and aiohttp turned
+        off.
+        """
         timeout, options = self.settings.timeout_s, dict(self.options)
         if self.is_s3:
-            config = {"connect_timeout": timeout, "read_timeout": timeout, "retries": {"total_max_attempts": 1}}
+            config = {
+                "connect_timeout": timeout,
+                "read_timeout": timeout,
+                "retries": {"total_max_attempts": 1},
+            }
             config["max_pool_connections"] = self.settings.requests
             options["config_kwargs"] = config | options.get("config_kwargs", {})
         if self.scheme in (*S3, "gs", "gcs"):
-            options.setdefault("use_listings_cache", False)  # trees cache listings, and update them after writing
+            # trees cache listings, and update them after writing
+            options.setdefault("use_listings_cache", False)
         if self.scheme in HTTP:
             from aiohttp import ClientTimeout
 
@@ -176,7 +200,8 @@ class Requests:
         """Send requests, several at a time. Requests with temporary failures are sent again.
 
         Returns:
-            One answer per request, in their order: the data of the server, or the exception of a failed request.
+            One answer per request, in their order: the data of the server, or the exception of a
+            failed request.
         """
         attempts = attempts or self.settings.attempts
         answers: list[Any] = [None] * len(requests)
@@ -184,9 +209,15 @@ class Requests:
         for attempt in range(attempts):
             if attempt:
                 time.sleep(self.settings.draw_wait_s(attempt))
-            for place, answer in zip(waiting, self._send_once([requests[i] for i in waiting]), strict=True):
+            for place, answer in zip(
+                waiting, self._send_once([requests[i] for i in waiting]), strict=True
+            ):
                 answers[place] = answer
-            waiting = [i for i in waiting if isinstance(answers[i], BaseException) and is_temporary(answers[i])]
+            waiting = [
+                i
+                for i in waiting
+                if isinstance(answers[i], BaseException) and is_temporary(answers[i])
+            ]
             if not waiting:
                 break
         for answer in answers:
@@ -195,13 +226,17 @@ class Requests:
         return answers
 
     def persist(
-        self, work: Callable[[], _Answer], count: Callable[[], int] = lambda: 0, stop: threading.Event | None = None
+        self,
+        work: Callable[[], _Answer],
+        count: Callable[[], int] = lambda: 0,
+        stop: threading.Event | None = None,
     ) -> _Answer:
         """Call a function that sends a request, again after temporary failures, as `send` does.
 
         Args:
             work: the function.
-            count: returns the number of bytes received so far. After progress, attempts are counted from one again.
+            count: returns the number of bytes received so far. After progress, attempts are counted
+                from one again.
             stop: ends the waiting when it is set.
 
         Returns:
@@ -224,13 +259,16 @@ class Requests:
 
     @contextmanager
     def answer(self, headers: Mapping[str, str]) -> Iterator[HttpAnswer]:
-        """Send one request for the file to a web server, and yield its answer. Its body can be read in pieces.
+        """Send one request for the file to a web server, and yield its answer.
+
+        Its body can be read in pieces.
 
         Args:
             headers: headers of the request.
 
         Raises:
-            CarlascError: the request was redirected in a loop, to a URL that is not http(s), or from https to http.
+            CarlascError: the request was redirected in a loop, to a URL that is not http(s), or
+                from https to http.
             Exception: the server cannot be reached (an error of aiohttp).
         """
         from fsspec.asyn import sync
@@ -255,7 +293,8 @@ class Requests:
 
     def _send_once(self, requests: Sequence[Request]) -> list[Any]:
         fs = self.fs
-        if self.scheme == HUB and len(requests) > 1:  # a file system without asyncio, which several threads may use
+        # a file system without asyncio, which several threads may use
+        if self.scheme == HUB and len(requests) > 1:
             with ThreadPoolExecutor(min(self.settings.requests, len(requests))) as threads:
                 return list(threads.map(partial(_plain_call, fs, self.settings), requests))
         if not fs.async_impl:
@@ -323,10 +362,12 @@ _COLLECTING = _Collecting()
 
 @contextmanager
 def holding_a_lock() -> Iterator[None]:
-    """Turn garbage collection off while a library with a global lock, such as h5py, reads a file object with requests.
+    """Turn garbage collection off while a library with a global lock, such as h5py, reads a file
+    object with requests.
 
-    Garbage collection on the thread of fsspec could free an object of that library, which needs the same lock: a deadlock. Before the block
-    starts, a collection in progress on that thread is finished.
+    Garbage collection on the thread of fsspec could free an object of that library, which needs the
+    same lock: a deadlock. Before the block starts, a collection in progress on that thread is
+    finished.
     """
     import asyncio
 
@@ -334,23 +375,31 @@ def holding_a_lock() -> Iterator[None]:
 
     _COLLECTING.stop()
     try:
-        sync(get_loop(), asyncio.sleep, 0)  # after this, no collection is in progress on that thread
+        # after this, no collection is in progress on that thread
+        sync(get_loop(), asyncio.sleep, 0)
         yield
     finally:
         _COLLECTING.resume()
 
 
-async def _gather(fs: Any, requests: Sequence[Request], settings: RemoteSettings, scheme: str) -> list[Any]:
-    import asyncio  # imported here, because it takes 50 ms, and commands on local files do not need it
+async def _gather(
+    fs: Any, requests: Sequence[Request], settings: RemoteSettings, scheme: str
+) -> list[Any]:
+    # imported here, because it takes 50 ms, and commands on local files do not need it
+    import asyncio
 
     gate = asyncio.Semaphore(settings.requests)
 
     async def one(request: Request) -> Any:
         async with gate:
             if request.name == "get":
-                answer = await get(fs, scheme, str(request.url), settings.timeout_s, **request.options)
+                answer = await get(
+                    fs, scheme, str(request.url), settings.timeout_s, **request.options
+                )
             else:
-                answer = await getattr(fs, f"_{request.name}")(*request.arguments(), **request.options)
+                answer = await getattr(fs, f"_{request.name}")(
+                    *request.arguments(), **request.options
+                )
             if request.check is not None:
                 request.check(answer)
             return answer

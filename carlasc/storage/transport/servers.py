@@ -1,8 +1,9 @@
 """Fetching bytes from each kind of server with one checked request.
 
-fsspec file systems list and describe files. This module fetches the bytes, so that answers are checked, and that one rule for retries
-holds for s3fs, botocore and huggingface_hub. `PRIVATE` lists undocumented names of other packages that this needs; a test fails with the
-version of the package if one of them is removed.
+fsspec file systems list and describe files. This module fetches the bytes, so that answers are
+checked, and that one rule for retries holds for s3fs, botocore and huggingface_hub. `PRIVATE` lists
+undocumented names of other packages that this needs; a test fails with the version of the package
+if one of them is removed.
 """
 
 from __future__ import annotations
@@ -16,10 +17,21 @@ from carlasc.errors import CarlascError, import_extra, without_credentials
 from carlasc.storage.transport.failures import WrongAnswerError, ends_before
 
 PRIVATE: Mapping[str, tuple[str, ...]] = {
-    "fsspec.asyn.AsyncFileSystem": ("_cat_file", "_find", "_info", "_ls", "_pipe_file", "_rm", "_rm_file"),
+    "fsspec.asyn.AsyncFileSystem": (
+        "_cat_file",
+        "_find",
+        "_info",
+        "_ls",
+        "_pipe_file",
+        "_rm",
+        "_rm_file",
+    ),
     "s3fs.S3FileSystem": ("_call_s3", "_metadata"),
 }
-"""Undocumented methods by class. For fsspec, they are the coroutines of asynchronous file systems."""
+"""Undocumented methods by class.
+
+For fsspec, they are the coroutines of asynchronous file systems.
+"""
 
 HUB = "hf"
 """The scheme of the URLs of the Hugging Face Hub (`hf://datasets/ORG/NAME/...`)."""
@@ -31,7 +43,12 @@ _LONGEST_PIECE_S = 0.5  # maximum time to collect the bytes of one piece
 
 
 async def get(
-    fs: Any, scheme: str, url: str, patience_s: float, start: int | None = None, end: int | None = None
+    fs: Any,
+    scheme: str,
+    url: str,
+    patience_s: float,
+    start: int | None = None,
+    end: int | None = None,
 ) -> bytes:
     """Return the bytes [start, end) of a file, or the whole file.
 
@@ -57,7 +74,9 @@ async def get(
 
 async def _get_s3(fs: Any, url: str, start: int | None, end: int | None) -> bytes:
     bucket, key, version = fs.split_path(url)
-    wanted: dict[str, Any] = {"Bucket": bucket, "Key": key} | ({"VersionId": version} if version else {})
+    wanted: dict[str, Any] = {"Bucket": bucket, "Key": key} | (
+        {"VersionId": version} if version else {}
+    )
     if start is not None and end is not None:
         wanted["Range"] = f"bytes={start}-{end - 1}"
     try:
@@ -73,7 +92,9 @@ async def _get_s3(fs: Any, url: str, start: int | None, end: int | None) -> byte
     return data
 
 
-async def _get_http(fs: Any, url: str, start: int | None, end: int | None, patience_s: float) -> bytes:
+async def _get_http(
+    fs: Any, url: str, start: int | None, end: int | None, patience_s: float
+) -> bytes:
     wanted = {} if start is None or end is None else {"Range": f"bytes={start}-{end - 1}"}
     async with await http_answer(fs, url, wanted) as answer:
         if answer.status == 416:
@@ -91,7 +112,9 @@ async def _get_http(fs: Any, url: str, start: int | None, end: int | None, patie
 
 
 async def http_answer(fs: Any, url: str, headers: Mapping[str, str]) -> Any:
-    """Send a request for a file to a web server, and return the answer of aiohttp. The body is not read yet.
+    """Send a request for a file to a web server, and return the answer of aiohttp.
+
+    The body is not read yet.
 
     Args:
         fs: the fsspec file system for web servers.
@@ -99,7 +122,8 @@ async def http_answer(fs: Any, url: str, headers: Mapping[str, str]) -> Any:
         headers: headers in addition to those in the options of the file system.
 
     Raises:
-        CarlascError: the request was redirected in a loop, to a URL that is not http(s), or from https to http.
+        CarlascError: the request was redirected in a loop, to a URL that is not http(s), or from
+            https to http.
         aiohttp.ClientError: the request failed.
     """
     session = await fs.set_session()
@@ -138,9 +162,11 @@ def status_error(answer: Any) -> Exception | None:
 
 
 async def read_piece(content: Any, most: int) -> bytes:
-    """Return the next bytes of a body: at most `most`, fewer if they arrive slowly, empty at the end.
+    """Return the next bytes of a body: at most `most`, fewer if they arrive slowly, empty at the
+    end.
 
-    When a connection breaks, aiohttp drops received bytes. This function returns them, and the next call raises the error.
+    When a connection breaks, aiohttp drops received bytes. This function returns them, and the next
+    call raises the error.
 
     Args:
         content: the body of an answer of aiohttp.
@@ -158,7 +184,9 @@ async def read_piece(content: Any, most: int) -> bytes:
     return bytes(data)
 
 
-def get_from_hub(fs: Any, url: str, timeout_s: float, start: int | None = None, end: int | None = None) -> bytes:
+def get_from_hub(
+    fs: Any, url: str, timeout_s: float, start: int | None = None, end: int | None = None
+) -> bytes:
     """Return the bytes [start, end) of a file of the Hub, or the whole file.
 
     Args:
@@ -192,7 +220,9 @@ def get_from_hub(fs: Any, url: str, timeout_s: float, start: int | None = None, 
 
 @cache
 def bounded_response(patience_s: float) -> Any:
-    """Return a subclass of the response of aiohttp that limits the size and time of bodies. fsspec reads listings with it."""
+    """Return a subclass of the response of aiohttp that limits the size and time of bodies. fsspec
+    reads listings with it.
+    """
     from aiohttp import ClientResponse
 
     class BoundedResponse(ClientResponse):
@@ -206,7 +236,9 @@ def bounded_response(patience_s: float) -> Any:
 
 
 async def read_body(content: Any, most: int, patience_s: float) -> bytes:
-    """Read a body of at most `most` bytes. A server may send more than it announced, even an endless body.
+    """Read a body of at most `most` bytes.
+
+    A server may send more than it announced, even an endless body.
 
     Args:
         content: the body of an answer of aiohttp.
@@ -229,7 +261,9 @@ async def read_body(content: Any, most: int, patience_s: float) -> bytes:
 
 
 def check_range(found: str | None, start: int, end: int | None) -> None:
-    """Compare the header Content-Range, "bytes 0-99/1000", with the requested range. The file may end before the range does.
+    """Compare the header Content-Range, "bytes 0-99/1000", with the requested range.
+
+    The file may end before the range does.
 
     Args:
         found: the header; None if the server sent none.
@@ -240,7 +274,9 @@ def check_range(found: str | None, start: int, end: int | None) -> None:
         WrongAnswerError: the header has another range.
     """
     first, _, last = (found or "").removeprefix("bytes ").partition("/")[0].partition("-")
-    if found is not None and not (first == str(start) and last.isdigit() and (end is None or int(last) < end)):
+    if found is not None and not (
+        first == str(start) and last.isdigit() and (end is None or int(last) < end)
+    ):
         raise WrongAnswerError("another range of the file")
 
 

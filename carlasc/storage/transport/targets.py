@@ -1,4 +1,7 @@
-"""Output folders of stores, on this machine or in an object store. Every file is written whole or not at all."""
+"""Output folders of stores, on this machine or in an object store.
+
+Every file is written whole or not at all.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +23,16 @@ from carlasc.storage.transport.requests import Request
 from carlasc.storage.transport.servers import HUB
 from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 
-_EXCLUSIVE = frozenset({"s3", "s3a", "gs", "gcs", "memory"})  # schemes of file systems with a create-only put
+# schemes of file systems with a create-only put
+_EXCLUSIVE = frozenset({"s3", "s3a", "gs", "gcs", "memory"})
 _MARK = "carlasc-writer"
 _MOST_REMOVED = 1000  # objects in one request: the limit of S3
 
 
 class Target(ABC):
-    """A folder to write files to. Paths in it are relative, with "/" between parts. It can be pickled.
+    """A folder to write files to.
+
+    Paths in it are relative, with "/" between parts. It can be pickled.
 
     Attributes:
         location: its name in errors: a folder or a URL.
@@ -58,7 +64,8 @@ class Target(ABC):
         Args:
             path: the file; an existing one is replaced unless `create` is given.
             data: its bytes.
-            create: write only if the file does not exist. If several processes do this at once, exactly one succeeds.
+            create: write only if the file does not exist. If several processes do this at once,
+                exactly one succeeds.
 
         Returns:
             False if `create` is given and the file exists; True otherwise.
@@ -69,14 +76,19 @@ class Target(ABC):
         """
 
     def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
-        """Write several groups of files, one group after the other. Files of a group are written in parallel."""
+        """Write several groups of files, one group after the other.
+
+        Files of a group are written in parallel.
+        """
         for group in groups:
             for path, data in group.items():
                 self.put(path, data)
 
     @abstractmethod
     def paths(self, folder: str = "") -> Iterator[str]:
-        """Yield the paths of all files below a folder, in any order; nothing if the folder does not exist."""
+        """Yield the paths of all files below a folder, in any order; nothing if the folder does not
+        exist.
+        """
 
     @abstractmethod
     def remove(self, path: str) -> None:
@@ -106,7 +118,9 @@ class LocalTarget(Target):
 
     def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
         """Write several files, which are synced together."""
-        write_many(*({self._inside(path): data for path, data in group.items()} for group in groups))
+        write_many(
+            *({self._inside(path): data for path, data in group.items()} for group in groups)
+        )
 
     def paths(self, folder: str = "") -> Iterator[str]:
         """Yield the paths of all files, without temporary files of writers."""
@@ -125,18 +139,22 @@ class LocalTarget(Target):
 
     def _inside(self, path: str) -> Path:
         if leads_outside(path):
-            raise FormatError(path, expected=f"a path inside {self.folder}", found="a path that leads out of it")
+            raise FormatError(
+                path, expected=f"a path inside {self.folder}", found="a path that leads out of it"
+            )
         return self.folder / path
 
 
 class RemoteTarget(Target):
     """A folder in an object store: a prefix of the keys of a bucket.
 
-    An object exists only after all its bytes have arrived, so an upload is complete or absent. Folders need not be created.
+    An object exists only after all its bytes have arrived, so an upload is complete or absent.
+    Folders need not be created.
 
     Attributes:
-        exclusive: whether the store has a create-only put, as S3 ("If-None-Match: *") and Google Cloud Storage do. In other stores, `put`
-            with `create` first checks whether the file exists, so that two processes may both succeed.
+        exclusive: whether the store has a create-only put, as S3 ("If-None-Match: *") and Google
+            Cloud Storage do. In other stores, `put` with `create` first checks whether the file
+            exists, so that two processes may both succeed.
     """
 
     tree: RemoteTree
@@ -176,8 +194,9 @@ class RemoteTarget(Target):
     def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
         """Write an object with one request.
 
-        If the answer to a create-only put is lost, the put is sent again and finds its own object. In S3, a mark in the object identifies
-        its writer; in other stores, such a put is reported as if the file had existed.
+        If the answer to a create-only put is lost, the put is sent again and finds its own object.
+        In S3, a mark in the object identifies its writer; in other stores, such a put is reported
+        as if the file had existed.
         """
         request = self._request(path, data)
         if create and not self.exclusive and self.tree.size(path) is not None:
@@ -186,7 +205,9 @@ class RemoteTarget(Target):
             self._send({path: data}, [request])
             return True
         mark = os.urandom(16).hex()
-        options = {"mode": "create"} | ({"Metadata": {_MARK: mark}} if self.tree.requests.is_s3 else {})
+        options = {"mode": "create"} | (
+            {"Metadata": {_MARK: mark}} if self.tree.requests.is_s3 else {}
+        )
         (answer,) = self.tree.requests.send([replace(request, options=options)])
         if isinstance(answer, Exception):
             if not exists_error(answer):
@@ -224,7 +245,9 @@ class RemoteTarget(Target):
         found = [self._checked(path) for path in paths]
         urls = [self.tree.url(name) for name in found]
         if self.tree.requests.is_s3:
-            batches = [urls[start : start + _MOST_REMOVED] for start in range(0, len(urls), _MOST_REMOVED)]
+            batches = [
+                urls[start : start + _MOST_REMOVED] for start in range(0, len(urls), _MOST_REMOVED)
+            ]
             requests = [Request("rm", batch) for batch in batches]
         else:
             requests = [Request("rm_file", url) for url in urls]
@@ -247,12 +270,16 @@ class RemoteTarget(Target):
 
     def _checked(self, path: str) -> str:
         if leads_outside(path):
-            raise FormatError(path, expected=f"a path inside {self.location}", found="a path that leads out of it")
+            raise FormatError(
+                path, expected=f"a path inside {self.location}", found="a path that leads out of it"
+            )
         return path
 
 
 def target_of(out: str | os.PathLike[str] | Target, **storage_options: Any) -> Target:
-    """Return the Target for a path or a URL. A Target is returned unchanged. Nothing is written yet.
+    """Return the Target for a path or a URL.
+
+    A Target is returned unchanged. Nothing is written yet.
 
     Args:
         out: a folder, or the URL of one in an object store.
@@ -265,15 +292,22 @@ def target_of(out: str | os.PathLike[str] | Target, **storage_options: Any) -> T
     if isinstance(out, Target):
         return out
     text = os.fspath(out)
-    return RemoteTarget(text, storage_options) if is_url(text) else LocalTarget(text.removeprefix("file://"))
+    return (
+        RemoteTarget(text, storage_options)
+        if is_url(text)
+        else LocalTarget(text.removeprefix("file://"))
+    )
 
 
 def check_shared(location: str, run: Run) -> None:
-    """Check that all processes of a run can access the output: `memory://` exists in one process only.
+    """Check that all processes of a run can access the output: `memory://` exists in one process
+    only.
 
     Raises:
         ArgumentError: the output is in memory, and the run has several processes.
     """
     if location.startswith("memory://") and not run.is_alone:
         found = "an executor" if run.executor is not None else str(run.processes)
-        raise ArgumentError("workers", expected=f"1 with {location}, which exists in one process only", found=found)
+        raise ArgumentError(
+            "workers", expected=f"1 with {location}, which exists in one process only", found=found
+        )

@@ -30,7 +30,9 @@ class Tree(ABC):
 
     @abstractmethod
     def entries(self, folder: str = "") -> Mapping[str, bool]:
-        """Return the names in a folder, mapped to whether they are folders; empty if the folder does not exist."""
+        """Return the names in a folder, mapped to whether they are folders; empty if the folder
+        does not exist.
+        """
 
     @abstractmethod
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
@@ -38,7 +40,8 @@ class Tree(ABC):
 
         Args:
             path: the file.
-            size: expected size in bytes; None if it is not known. A compressed file of another size is not decompressed.
+            size: expected size in bytes; None if it is not known. A compressed file of another size
+                is not decompressed.
 
         Raises:
             MissingDataError: the file does not exist.
@@ -47,7 +50,9 @@ class Tree(ABC):
 
     @abstractmethod
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
-        """Return the bytes [start, end) of a file. If start is negative, both are counted from the end of the file.
+        """Return the bytes [start, end) of a file.
+
+        If start is negative, both are counted from the end of the file.
 
         Raises:
             MissingDataError: the file does not exist.
@@ -60,7 +65,10 @@ class Tree(ABC):
         return self.entries(folder).get(name) is False
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Return the bytes of several files, each of `size` (see `read`). Remote trees request all of them at once."""
+        """Return the bytes of several files, each of `size` (see `read`).
+
+        Remote trees request all of them at once.
+        """
         return [self.read(path, size) for path in paths]
 
     def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
@@ -83,7 +91,8 @@ class LocalTree(Tree):
 
         Args:
             root: the folder.
-            mapped: whether `read` maps files into memory, so that only the used parts are read. Files must then not be changed in place.
+            mapped: whether `read` maps files into memory, so that only the used parts are read.
+                Files must then not be changed in place.
         """
         self.root, self.mapped = Path(root), mapped
         self.location = str(self.root)
@@ -100,7 +109,9 @@ class LocalTree(Tree):
         except (FileNotFoundError, NotADirectoryError):
             return {}
         except OSError as error:
-            raise CarlascError(self.where(folder), problem=f"cannot be listed: {error.strerror or error}") from error
+            raise CarlascError(
+                self.where(folder), problem=f"cannot be listed: {error.strerror or error}"
+            ) from error
 
     def is_file(self, path: str) -> bool:
         """Whether the file exists, without listing its folder."""
@@ -150,8 +161,11 @@ class LocalTree(Tree):
 def _map_range(descriptor: int, start: int, end: int) -> memoryview:
     """Map the bytes [start, end) of an open file into memory. The file must be long enough."""
     skipped = start % mmap.ALLOCATIONGRANULARITY
-    flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)  # read all pages at once (Linux only)
-    mapped = mmap.mmap(descriptor, end - start + skipped, flags, mmap.PROT_READ, offset=start - skipped)
+    # read all pages at once (Linux only)
+    flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
+    mapped = mmap.mmap(
+        descriptor, end - start + skipped, flags, mmap.PROT_READ, offset=start - skipped
+    )
     return memoryview(mapped)[skipped:]
 
 
@@ -173,7 +187,10 @@ def check_length(data: bytes, expected: int, where: str) -> bytes:
 
 def _shorter(expected: int, found: int, where: str) -> FormatError:
     return FormatError(
-        where, expected=f"{expected} bytes in this range", found=str(found), advice="the file may be truncated"
+        where,
+        expected=f"{expected} bytes in this range",
+        found=str(found),
+        advice="the file may be truncated",
     )
 
 

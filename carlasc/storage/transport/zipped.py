@@ -1,7 +1,8 @@
 """Reading the files in a local or remote zip in place.
 
-The published zips have a million members. `zipfile` creates an object for each, which takes ten seconds and a gigabyte. This module
-parses the central directory once (PKWARE's APPNOTE, sections 4.3 and 4.4) into a few NumPy columns.
+The published zips have a million members. `zipfile` creates an object for each, which takes ten
+seconds and a gigabyte. This module parses the central directory once (PKWARE's APPNOTE, sections
+4.3 and 4.4) into a few NumPy columns.
 """
 
 from __future__ import annotations
@@ -25,19 +26,23 @@ _END = struct.Struct("<4s4H2LH")  # end of central directory record
 _END64_LOCATOR = struct.Struct("<4sLQL")
 _END64 = struct.Struct("<4sQ2H2L4Q")
 _CENTRAL_SIZE, _LOCAL = 46, struct.Struct("<4s5H3L2H")
-_TAIL = _END.size + 65535 + _END64_LOCATOR.size  # the end record, its longest comment, and the locator before it
+# the end record, its longest comment, and the locator before it
+_TAIL = _END.size + 65535 + _END64_LOCATOR.size
 _STORED, _DEFLATED = 0, 8  # methods
 _ENCRYPTED, _UTF8 = 1, 0x800  # flags
-_SLACK = (
-    64  # additional bytes to fetch: the extra field of the local header may be longer than in the central directory
-)
+# additional bytes to fetch: the extra field of the local header may be longer than in the central
+# directory
+_SLACK = 64
 
 
 class ZipTree(Tree):
     """The members of a zip in another tree."""
 
     def __init__(self, tree: Tree, path: str) -> None:
-        """Keep the path of the zip. Its central directory is read on first use, once per process."""
+        """Keep the path of the zip.
+
+        Its central directory is read on first use, once per process.
+        """
         self.tree = tree
         self.path = path
         self.location = tree.where(path)
@@ -61,13 +66,21 @@ class ZipTree(Tree):
         return self.read_many([path], size)[0]
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
-        """Read several members; all at once from a remote zip. The size and the compression ratio are checked before decompressing."""
+        """Read several members; all at once from a remote zip.
+
+        The size and the compression ratio are checked before decompressing.
+        """
         members = [self._member(path) for path in paths]
         for path, member in zip(paths, members, strict=True):
-            unpacked, packed = (int(self._index.columns[name][member]) for name in ("size", "packed"))
+            unpacked, packed = (
+                int(self._index.columns[name][member]) for name in ("size", "packed")
+            )
             if unpacked != size:
                 check_ratio(unpacked, packed, self.where(path))
-        ranges = [(self.path, int(self._index.columns["offset"][m]), self._index.end_of(m)) for m in members]
+        ranges = [
+            (self.path, int(self._index.columns["offset"][m]), self._index.end_of(m))
+            for m in members
+        ]
         found = zip(paths, members, self.tree.read_ranges(ranges), strict=True)
         return [self._extract(path, member, memoryview(data)) for path, member, data in found]
 
@@ -77,7 +90,10 @@ class ZipTree(Tree):
         start, end = (max(0, len(data) + start), len(data) + end) if start < 0 else (start, end)
         if end > len(data):
             raise FormatError(
-                self.where(path), expected=f"at least {end} bytes", found=str(len(data)), advice="it may be truncated"
+                self.where(path),
+                expected=f"at least {end} bytes",
+                found=str(len(data)),
+                advice="it may be truncated",
             )
         return data[start:end]
 
@@ -89,14 +105,18 @@ class ZipTree(Tree):
         return member
 
     def _extract(self, path: str, member: int, data: memoryview) -> bytes | memoryview:
-        """Return the bytes of a member from a range that starts with its local header and may end after the member."""
+        """Return the bytes of a member from a range that starts with its local header and may end
+        after the member.
+        """
         where = self.where(path)
         columns = {name: int(column[member]) for name, column in self._index.columns.items()}
         if columns["flags"] & _ENCRYPTED or columns["method"] not in (_STORED, _DEFLATED):
             raise FormatError(
                 where,
                 expected="a stored or deflated member",
-                found="an encrypted one" if columns["flags"] & _ENCRYPTED else f"compression {columns['method']}",
+                found="an encrypted one"
+                if columns["flags"] & _ENCRYPTED
+                else f"compression {columns['method']}",
                 advice="unpack the zip and give the folder",
             )
         header = _LOCAL.unpack_from(data) if len(data) >= _LOCAL.size else (b"",)
@@ -110,7 +130,9 @@ class ZipTree(Tree):
         first = _LOCAL.size + header[9] + header[10]
         last = first + columns["packed"]
         if last > len(data):  # the extra field of the local header is longer than expected
-            data = memoryview(self.tree.read_range(self.path, columns["offset"], columns["offset"] + last))
+            data = memoryview(
+                self.tree.read_range(self.path, columns["offset"], columns["offset"] + last)
+            )
         packed = data[first:last]
         content: bytes | memoryview = packed
         if columns["method"] == _DEFLATED:
@@ -133,7 +155,8 @@ class _Index:
     """The central directory of a zip.
 
     Attributes:
-        columns: offset, packed, size, crc, method, flags and further fields, each (M,) for M members.
+        columns: offset, packed, size, crc, method, flags and further fields, each (M,) for M
+            members.
         folders: by folder, the names in it and the member of each; -1 for a folder.
         limit: offset of the central directory; all members end before it.
     """
@@ -145,7 +168,13 @@ class _Index:
     def end_of(self, member: int) -> int:
         """Return an upper bound for the end of a member, valid in nearly all zips."""
         columns = self.columns
-        reach = columns["offset"][member] + _LOCAL.size + columns["header"][member] + columns["packed"][member] + _SLACK
+        reach = (
+            columns["offset"][member]
+            + _LOCAL.size
+            + columns["header"][member]
+            + columns["packed"][member]
+            + _SLACK
+        )
         return min(int(reach), self.limit)
 
 
@@ -153,7 +182,8 @@ def read_index(tree: Tree, path: str) -> _Index:
     """Read a zip's central directory.
 
     Raises:
-        FormatError: the zip is truncated, its directory is damaged, or a member's name leads out of the folder.
+        FormatError: the zip is truncated, its directory is damaged, or a member's name leads out of
+            the folder.
     """
     where = tree.where(path)
     count, start, size = _find_directory(tree, path)
@@ -204,13 +234,20 @@ def _find_directory(tree: Tree, path: str) -> tuple[int, int, int]:
             raise _damaged(where, "no 64-bit end record where its locator points")
         _, _, _, _, disk, _, _, count, size, start = record
     if disk:
-        raise FormatError(where, expected="one zip", found="a part of a split zip", advice="join the parts first")
+        raise FormatError(
+            where, expected="one zip", found="a part of a split zip", advice="join the parts first"
+        )
     return count, start, size
 
 
 def _walk(data: bytes, count: int, where: str) -> NDArray[np.int64]:
-    """Return the start of each record of the central directory. Records have different lengths, so each start follows from the previous one."""
-    positions = np.empty(count, np.int64) if count <= len(data) // _CENTRAL_SIZE else np.empty(0, np.int64)
+    """Return the start of each record of the central directory.
+
+    Records have different lengths, so each start follows from the previous one.
+    """
+    positions = (
+        np.empty(count, np.int64) if count <= len(data) // _CENTRAL_SIZE else np.empty(0, np.int64)
+    )
     lengths = struct.Struct("<3H").unpack_from
     position = 0
     for member in range(len(positions)):
@@ -220,7 +257,9 @@ def _walk(data: bytes, count: int, where: str) -> NDArray[np.int64]:
         name, extra, comment = lengths(data, position + 28)
         position += _CENTRAL_SIZE + name + extra + comment
     if position != len(data) or len(positions) != count:
-        raise _damaged(where, f"{len(positions)} members in {position} bytes instead of {count} in {len(data)}")
+        raise _damaged(
+            where, f"{len(positions)} members in {position} bytes instead of {count} in {len(data)}"
+        )
     return positions
 
 
@@ -242,7 +281,11 @@ def _columns(data: bytes, positions: NDArray[np.int64], where: str) -> dict[str,
         "size": column(24, 4),
     }
     columns |= {"name": column(28, 2), "extra": column(30, 2), "offset": column(42, 4)}
-    wide = (columns["packed"] == 0xFFFFFFFF) | (columns["size"] == 0xFFFFFFFF) | (columns["offset"] == 0xFFFFFFFF)
+    wide = (
+        (columns["packed"] == 0xFFFFFFFF)
+        | (columns["size"] == 0xFFFFFFFF)
+        | (columns["offset"] == 0xFFFFFFFF)
+    )
     for member in np.flatnonzero(wide).tolist():
         begin = int(positions[member]) + _CENTRAL_SIZE + int(columns["name"][member])
         _widen(columns, member, data[begin : begin + int(columns["extra"][member])], where)
@@ -255,7 +298,9 @@ def _widen(columns: dict[str, NDArray[np.int64]], member: int, extra: bytes, whe
     while position + 4 <= len(extra):
         kind, length = struct.unpack_from("<2H", extra, position)
         if kind == 1:  # the values that do not fit into 32 bits, in this order
-            names = [name for name in ("size", "packed", "offset") if columns[name][member] == 0xFFFFFFFF]
+            names = [
+                name for name in ("size", "packed", "offset") if columns[name][member] == 0xFFFFFFFF
+            ]
             if length < 8 * len(names) or position + 4 + 8 * len(names) > len(extra):
                 break
             values = struct.unpack_from(f"<{len(names)}Q", extra, position + 4)
@@ -279,10 +324,17 @@ def _add_folder(folders: dict[str, dict[str, int]], folder: str) -> None:
             return
 
 
-def _names(data: bytes, begins: NDArray[np.int64], columns: dict[str, NDArray[np.int64]]) -> list[str]:
-    """Return the names of the members. The whole directory is decoded at once; if it is not ASCII, each name separately."""
+def _names(
+    data: bytes, begins: NDArray[np.int64], columns: dict[str, NDArray[np.int64]]
+) -> list[str]:
+    """Return the names of the members.
+
+    The whole directory is decoded at once; if it is not ASCII, each name separately.
+    """
     text = data.decode("latin-1")
-    names = [text[a:b] for a, b in zip(begins.tolist(), (begins + columns["name"]).tolist(), strict=True)]
+    names = [
+        text[a:b] for a, b in zip(begins.tolist(), (begins + columns["name"]).tolist(), strict=True)
+    ]
     if not "".join(names).isascii():
         for member, name in enumerate(names):
             if not name.isascii():
@@ -292,7 +344,10 @@ def _names(data: bytes, begins: NDArray[np.int64], columns: dict[str, NDArray[np
 
 
 def _check_names(names: list[str], where: str) -> None:
-    """Check that no name leads out of the folder. For nearly every zip, one search in the joined names is enough."""
+    """Check that no name leads out of the folder.
+
+    For nearly every zip, one search in the joined names is enough.
+    """
     together = "\n" + "\n".join(names)
     if not any(sign in together for sign in ("..", "\\", "\0", ":", "\n/")):
         return
@@ -312,11 +367,16 @@ def _inflate(content: memoryview, size: int, where: str) -> bytes:
         return zlib.decompressobj(-15).decompress(content, size + 1)
     except zlib.error as error:
         raise FormatError(
-            where, problem=f"cannot be decompressed: {error}", advice="the zip is damaged: fetch it again"
+            where,
+            problem=f"cannot be decompressed: {error}",
+            advice="the zip is damaged: fetch it again",
         ) from error
 
 
 def _damaged(where: str, found: str) -> FormatError:
     return FormatError(
-        where, expected="a zip's central directory", found=found, advice="it is truncated or damaged: fetch it again"
+        where,
+        expected="a zip's central directory",
+        found=found,
+        advice="it is truncated or damaged: fetch it again",
     )

@@ -1,7 +1,7 @@
 """Writing blocks of frames of a field to a zarr store, from any number of processes.
 
-A block has one object per column and a table of its frames, which is written last. New frames are merged with an existing object, so
-frames of other processes are not lost.
+A block has one object per column and a table of its frames, which is written last. New frames are
+merged with an existing object, so frames of other processes are not lost.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ from carlasc.storage.zarr.shards import (
 )
 
 BLOCKS = "blocks"  # folder of the tables
-_ASKED_ONE_BY_ONE = 4  # up to this many blocks are looked up singly; after that, all blocks are listed
+_ASKED_ONE_BY_ONE = (
+    4  # up to this many blocks are looked up singly; after that, all blocks are listed
+)
 _FRESH_S = 1.0  # maximum age of a listing that is used for the answer "does not exist"
 
 
@@ -51,7 +53,11 @@ def encode_frame(field_layout: FieldLayout, array: NDArray[np.generic]) -> Encod
     counts, chunks = field_layout.divide(array)
     encodings = {name: field_layout.columns[name].encoding for name in chunks}
     return EncodedFrame(
-        counts, {name: [encode_chunk(chunk, encodings[name]) for chunk in parts] for name, parts in chunks.items()}
+        counts,
+        {
+            name: [encode_chunk(chunk, encodings[name]) for chunk in parts]
+            for name, parts in chunks.items()
+        },
     )
 
 
@@ -86,7 +92,9 @@ class StoredField:
         return self._layout
 
     def create(self, typical: Callable[[], tuple[int, ...]]) -> FieldLayout:
-        """Return the layout of the field. A new field is created; if several processes create it, the first one decides the layout.
+        """Return the layout of the field.
+
+        A new field is created; if several processes create it, the first one decides the layout.
 
         Args:
             typical: returns the shape of a grid, or (number of elements of a typical frame,).
@@ -94,19 +102,24 @@ class StoredField:
         if (found := self.layout()) is not None:
             return found
         planned = FieldLayout.plan(self.field, self.options, typical())
-        self.target.put(f"{self.node}/{METADATA}", to_json(group_metadata(planned.attributes)), create=True)
+        self.target.put(
+            f"{self.node}/{METADATA}", to_json(group_metadata(planned.attributes)), create=True
+        )
         return self._known_layout()
 
     def _known_layout(self) -> FieldLayout:
         if (found := self.layout()) is None:
-            raise FormatError(self.where, expected="the field", found="none", advice="another program removed it")
+            raise FormatError(
+                self.where, expected="the field", found="none", advice="another program removed it"
+            )
         return found
 
     def has(self, frame: int) -> bool:
         """Whether a frame exists.
 
-        The first few blocks are looked up singly, then all blocks are listed. A listing is used for "no" at most once per frame and for
-        at most a second, because other processes write meanwhile.
+        The first few blocks are looked up singly, then all blocks are listed. A listing is used for
+        "no" at most once per frame and for at most a second, because other processes write
+        meanwhile.
         """
         block = frame // self.options.block
         if self._exists(frame):
@@ -114,7 +127,9 @@ class StoredField:
         if self._listed_s is not None:
             outdated = frame in self._denied or time.monotonic() - self._listed_s > _FRESH_S
         else:
-            outdated = frame in self._denied or (block not in self._tables and self._asked >= _ASKED_ONE_BY_ONE)
+            outdated = frame in self._denied or (
+                block not in self._tables and self._asked >= _ASKED_ONE_BY_ONE
+            )
         if outdated:
             self._list()
         elif self._listed_s is None and block not in self._tables:
@@ -127,7 +142,11 @@ class StoredField:
 
     def refresh(self) -> None:
         """Discard the cached lists of missing frames."""
-        whole = {block: table for block, table in self._tables.items() if len(table or {}) == self.options.block}
+        whole = {
+            block: table
+            for block, table in self._tables.items()
+            if len(table or {}) == self.options.block
+        }
         self._tables, self._listed_s, self._denied, self._asked = dict(whole), None, set(), 0
 
     def _exists(self, frame: int) -> bool:
@@ -136,9 +155,15 @@ class StoredField:
     def _list(self) -> None:
         """Read the tables of all blocks that may have changed."""
         found = {
-            path: block for path in self.target.paths(f"{self.node}/{BLOCKS}") if (block := block_of(path)) is not None
+            path: block
+            for path in self.target.paths(f"{self.node}/{BLOCKS}")
+            if (block := block_of(path)) is not None
         }
-        changed = [path for path, block in found.items() if len(self._tables.get(block) or {}) < self.options.block]
+        changed = [
+            path
+            for path, block in found.items()
+            if len(self._tables.get(block) or {}) < self.options.block
+        ]
         for path, data in zip(changed, self.target.tree.read_many(changed), strict=True):
             self._tables[found[path]] = self._parse(data, path)
         self._listed_s = time.monotonic()
@@ -151,7 +176,10 @@ class StoredField:
         return None if data is None else self._parse(data, path)
 
     def _parse(self, data: bytes | memoryview, path: str) -> FrameTable | None:
-        """Return a table; None for an empty file, which a power failure can leave. The block is then written again."""
+        """Return a table; None for an empty file, which a power failure can leave.
+
+        The block is then written again.
+        """
         return parse_table(bytes(data), self.target.tree.where(path)) if data else None
 
     def read(self, frame: int) -> NDArray[np.generic] | None:
@@ -168,7 +196,12 @@ class StoredField:
         counts = {name: np.array([needed.get(name, 0)]) for name in found.columns}
         local = isinstance(self.target, LocalTarget)
         field = ArrayField(
-            self.where, found, np.array([frame]), counts, lambda name: self._array(found, name, block), local=local
+            self.where,
+            found,
+            np.array([frame]),
+            counts,
+            lambda name: self._array(found, name, block),
+            local=local,
         )
         return field.read([frame])[0]
 
@@ -178,19 +211,32 @@ class StoredField:
         return ZarrArray.from_metadata(self.target.tree, f"{self.node}/{name}", metadata)
 
     def columns(self, block: int, frames: Mapping[int, EncodedFrame]) -> list[str]:
-        """Return the columns whose object changes when frames are written to a block: columns that they use, or used before."""
+        """Return the columns whose object changes when frames are written to a block: columns that
+        they use, or used before.
+        """
         before = self._tables.get(block) or {}
-        needed = {name for frame, encoded in frames.items() for name in (*encoded.chunks, *before.get(frame, {}))}
+        needed = {
+            name
+            for frame, encoded in frames.items()
+            for name in (*encoded.chunks, *before.get(frame, {}))
+        }
         return sorted(needed)
 
     def put_column(self, name: str, block: int, frames: Mapping[int, EncodedFrame]) -> None:
-        """Write the object of one column of a block. Existing frames are kept, unless `frames` replaces them."""
+        """Write the object of one column of a block.
+
+        Existing frames are kept, unless `frames` replaces them.
+        """
         found = self._known_layout()
         array = self._array(found, name, block)
         slots = array.slots
         path, room = array.file(block), array.per_shard or 1
         places = {frame: frame % self.options.block * slots for frame in frames}
-        new = {places[f] + k: chunk for f, e in frames.items() for k, chunk in enumerate(e.chunks.get(name, ()))}
+        new = {
+            places[f] + k: chunk
+            for f, e in frames.items()
+            for k, chunk in enumerate(e.chunks.get(name, ()))
+        }
         data = join_shard(new, room)
         if self.target.put(path, data, create=True):
             return
@@ -198,11 +244,18 @@ class StoredField:
         there = bytes(self.target.tree.read(path))
         while (merged := _merge(there, new, taken, room, self.target.tree.where(path))) != there:
             self.target.put(path, merged)
-            there = bytes(self.target.tree.read(path))  # read again, because another process may have replaced it
+            # read again, because another process may have replaced it
+            there = bytes(self.target.tree.read(path))
 
     def put_table(self, block: int, frames: Mapping[int, EncodedFrame]) -> None:
-        """Write the table of a block, including its existing frames. Its objects must be complete."""
-        path, ours = table_path(self.node, block), {frame: encoded.counts for frame, encoded in frames.items()}
+        """Write the table of a block, including its existing frames.
+
+        Its objects must be complete.
+        """
+        path, ours = (
+            table_path(self.node, block),
+            {frame: encoded.counts for frame, encoded in frames.items()},
+        )
         if not self.target.put(path, format_table(ours), create=True):
             there = self.table(block) or {}
             while there | ours != there:
@@ -213,8 +266,11 @@ class StoredField:
 
 
 def _merge(there: bytes, new: Mapping[int, bytes], taken: set[int], room: int, where: str) -> bytes:
-    """Return the bytes of a shard with new chunks, and with the existing chunks whose slots are not in `taken`."""
-    there_now = split_shard(there, room, where) if there else {}  # a power failure can leave an empty file
+    """Return the bytes of a shard with new chunks, and with the existing chunks whose slots are not
+    in `taken`.
+    """
+    # a power failure can leave an empty file
+    there_now = split_shard(there, room, where) if there else {}
     kept = {slot: chunk for slot, chunk in there_now.items() if slot not in taken}
     return join_shard({**kept, **new}, room)
 
@@ -225,16 +281,24 @@ def table_path(node: str, block: int) -> str:
 
 
 def block_of(path: str) -> int | None:
-    """Return the number of the block whose table is at a path; None if the path is not that of a table."""
+    """Return the number of the block whose table is at a path; None if the path is not that of a
+    table.
+    """
     folder, _, name = path.rpartition("/")
     stem = name.removesuffix(".json")
-    is_table = folder.rpartition("/")[2] == BLOCKS and name != stem and stem.isascii() and stem.isdigit()
+    is_table = (
+        folder.rpartition("/")[2] == BLOCKS and name != stem and stem.isascii() and stem.isdigit()
+    )
     return int(stem) if is_table else None
 
 
 def format_table(table: FrameTable) -> bytes:
-    """Return the bytes of a table: {"frames": {"17": {"xyz": 120800}, ...}}, with sorted frames and columns."""
-    return to_json({"frames": {str(frame): dict(sorted(table[frame].items())) for frame in sorted(table)}})
+    """Return the bytes of a table: {"frames": {"17": {"xyz": 120800}, ...}}, with sorted frames and
+    columns.
+    """
+    return to_json(
+        {"frames": {str(frame): dict(sorted(table[frame].items())) for frame in sorted(table)}}
+    )
 
 
 def parse_table(data: bytes, where: str) -> FrameTable:
@@ -246,7 +310,8 @@ def parse_table(data: bytes, where: str) -> FrameTable:
     try:
         frames = parse_json(data, where)["frames"]
         return {
-            int(frame): {str(name): int(count) for name, count in counts.items()} for frame, counts in frames.items()
+            int(frame): {str(name): int(count) for name, count in counts.items()}
+            for frame, counts in frames.items()
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise FormatError(

@@ -1,4 +1,7 @@
-"""The root of a zarr store, with its options and whether it is finished. Exactly one of several processes creates it."""
+"""The root of a zarr store, with its options and whether it is finished.
+
+Exactly one of several processes creates it.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +19,19 @@ _OPTIONS = ("block", "lossy_mm", "small")
 
 
 class StoreRoot:
-    """The root of a store that is being written, shared by its writers. A new root is created before the first write.
+    """The root of a store that is being written, shared by its writers.
+
+    A new root is created before the first write.
 
     Attributes:
-        is_finished: whether a finished store with the same options exists, and frames are added to it.
+        is_finished: whether a finished store with the same options exists, and frames are added to
+            it.
     """
 
     def __init__(self, target: Target, options: PackOptions, overwrite: bool) -> None:
-        """Check that the store may be written. Nothing is written yet, but a store to replace is moved away.
+        """Check that the store may be written.
+
+        Nothing is written yet, but a store to replace is moved away.
 
         Raises:
             ArgumentError: the target has no name.
@@ -31,7 +39,12 @@ class StoreRoot:
         """
         if isinstance(target, LocalTarget) and not target.folder.name:
             raise ArgumentError("out", expected="the name of a store", found=f"{target.location!r}")
-        self._target, self._options, self._overwrite, self._begun = target, options, overwrite, False
+        self._target, self._options, self._overwrite, self._begun = (
+            target,
+            options,
+            overwrite,
+            False,
+        )
         root = read_root(target)
         if root is None:
             _refuse_other(target)
@@ -41,7 +54,9 @@ class StoreRoot:
         self.is_finished = root is not None and root.get("complete") is True
 
     def begin(self) -> None:
-        """Create the root unless it exists. Exactly one of several processes creates it, and the others use it.
+        """Create the root unless it exists.
+
+        Exactly one of several processes creates it, and the others use it.
 
         Raises:
             ConflictError: other data, or a store with other options, exist at the target.
@@ -52,7 +67,9 @@ class StoreRoot:
             root = read_root(self._target)
             if root is None:
                 _refuse_other(self._target)
-                self._begun = self._target.put(METADATA, to_json(group_metadata(self._wanted)), create=True)
+                self._begun = self._target.put(
+                    METADATA, to_json(group_metadata(self._wanted)), create=True
+                )
             elif self._joins(root):
                 self._begun = True
             else:
@@ -60,7 +77,9 @@ class StoreRoot:
             if self._begun:
                 return
         raise ConflictError(
-            self._target.location, problem="other processes keep replacing it", advice="wait until they have ended"
+            self._target.location,
+            problem="other processes keep replacing it",
+            advice="wait until they have ended",
         )
 
     @property
@@ -75,20 +94,25 @@ class StoreRoot:
             ConflictError: neither is allowed.
         """
         wanted = self._wanted
-        differs = [name for name in ("type", "version", *_OPTIONS) if root.get(name) != wanted[name]]
+        differs = [
+            name for name in ("type", "version", *_OPTIONS) if root.get(name) != wanted[name]
+        ]
         if not differs:
             return not (self._overwrite and root.get("complete") is True)
         if root.get("type") not in (STORE, "carlasc.unfinished"):
             raise ConflictError(
-                self._target.location, expected="a packed store to overwrite", found="another zarr store",
+                self._target.location, expected="a packed store to overwrite", found="another "
+                                                                                     "zarr store",
                 advice="choose another name",
             )  # fmt: skip
         if not self._overwrite:
             raise ConflictError(
                 self._target.location,
                 expected="a new path, or a store with the same options",
-                found=f"one with {', '.join(f'{name} {root.get(name)}' for name in differs if name != 'type')}",
-                advice="choose another name, remove it, or give `overwrite=True` if the command has this option",
+                found=f"one with "
+                f"{', '.join(f'{name} {root.get(name)}' for name in differs if name != 'type')}",
+                advice="choose another name, remove it, or give `overwrite=True` if the command "
+                "has this option",
             )
         return False
 
@@ -118,7 +142,9 @@ def read_root(target: Target) -> dict[str, Any] | None:
 
 
 def remove_replaced(target: Target) -> None:
-    """Remove the older store that a finished store replaces, if it exists, even if an interrupted run has moved it away."""
+    """Remove the older store that a finished store replaces, if it exists, even if an interrupted
+    run has moved it away.
+    """
     if isinstance(target, LocalTarget):
         remove(replaced(target.folder))
 
@@ -131,12 +157,18 @@ def _refuse_other(target: Target) -> None:
         found = next(iter(target.paths()), None)
     if found is not None and read_root(target) is None:
         raise ConflictError(
-            target.location, expected="a new path, or a packed store", found=found, advice="choose another name"
+            target.location,
+            expected="a new path, or a packed store",
+            found=found,
+            advice="choose another name",
         )
 
 
 def _move_away(target: Target, *, finished: bool) -> None:
-    """Move a finished local store away until the new one is finished. Remove any other store, root first."""
+    """Move a finished local store away until the new one is finished.
+
+    Remove any other store, root first.
+    """
     if not (isinstance(target, LocalTarget) and finished):
         target.remove(METADATA)
         target.remove("")
@@ -146,4 +178,6 @@ def _move_away(target: Target, *, finished: bool) -> None:
         remove(old)
         rename(target.folder, old)
     except OSError as error:
-        raise StorageError(target.location, problem=f"cannot be replaced: {error.strerror or error}") from error
+        raise StorageError(
+            target.location, problem=f"cannot be replaced: {error.strerror or error}"
+        ) from error

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, reading
 from carlasc.storage.packed.array_layout import FieldLayout
-from carlasc.storage.packed.chunks import BITSHUFFLE, BLOCK, NO_SHUFFLE, SHUFFLE, Encoding, StoredArray, crc32c
+from carlasc.storage.packed.chunks import (
+    BITSHUFFLE,
+    BLOCK,
+    NO_SHUFFLE,
+    SHUFFLE,
+    Encoding,
+    StoredArray,
+    crc32c,
+)
 from carlasc.storage.packed.columns import Column
 from carlasc.storage.transport.trees import Tree
 
@@ -29,7 +37,8 @@ _ABSENT = 2**64 - 1  # offset and length of a missing chunk
 
 
 class ZarrArray(StoredArray):
-    """A zarr array whose codecs are bytes or PCodec, Blosc, and crc32c, in shards along its first axis or in one chunk.
+    """A zarr array whose codecs are bytes or PCodec, Blosc, and crc32c, in shards along its first
+    axis or in one chunk.
 
     Attributes:
         per_shard: number of chunks of a shard; None if the array is not sharded.
@@ -45,7 +54,10 @@ class ZarrArray(StoredArray):
             FormatError: carlasc does not write such codecs or chunks.
         """
         with reading(tree.where(node), "the codecs and chunks that carlasc writes"):
-            shape, dtype = _numbers(metadata["shape"], 0), np.dtype(metadata["data_type"]).newbyteorder("<")
+            shape, dtype = (
+                _numbers(metadata["shape"], 0),
+                np.dtype(metadata["data_type"]).newbyteorder("<"),
+            )
             if dtype.kind not in "uif":
                 raise ValueError(f"elements of {dtype.name}")
             outer = _numbers(metadata["chunk_grid"]["configuration"]["chunk_shape"], 1)
@@ -57,10 +69,14 @@ class ZarrArray(StoredArray):
                 raise ValueError(f"shape {shape}, chunks {outer} of {chunk}")
             encoding = encoding_of(codecs)
             if any(n > limit for n, limit in zip(shape[1:], outer[1:], strict=True)):
-                raise ValueError(f"shape {shape} in shards of {outer}, which divide other axes than the first")
+                raise ValueError(
+                    f"shape {shape} in shards of {outer}, which divide other axes than the first"
+                )
             found = cls(tree, node, dtype, shape, chunk, encoding)
             found.per_shard = outer[0] // chunk[0] * found.slots if sharded else None
-            found._index_first = sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
+            found._index_first = (
+                sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
+            )
         found._indices = {}
         return found
 
@@ -68,7 +84,10 @@ class ZarrArray(StoredArray):
     _indices: dict[int, ShardIndex]
 
     def locate(self, numbers: Sequence[int]) -> list[tuple[str, int, int]]:
-        """Look up chunks in the indices of their shards. Each index is read once; all indices of one call are read together."""
+        """Look up chunks in the indices of their shards.
+
+        Each index is read once; all indices of one call are read together.
+        """
         per_shard = self.per_shard
         if per_shard is None:
             return [(self.file(number), 0, -1) for number in numbers]
@@ -92,16 +111,25 @@ class ZarrArray(StoredArray):
         """Read encoded chunks."""
         try:
             if self.per_shard is None:
-                return [memoryview(data) for data in self.tree.read_many([self.file(number) for number in numbers])]
+                return [
+                    memoryview(data)
+                    for data in self.tree.read_many([self.file(number) for number in numbers])
+                ]
             return super().fetch(numbers)
         except MissingDataError as error:
             raise FormatError(
-                error.where, expected=error.expected, found=error.found, advice="the store is damaged"
+                error.where,
+                expected=error.expected,
+                found=error.found,
+                advice="the store is damaged",
             ) from error
 
     def files(self, numbers: Sequence[int]) -> list[str]:
         """Return the shards that hold some chunks."""
-        return [self.file(shard) for shard in dict.fromkeys(number // (self.per_shard or 1) for number in numbers)]
+        return [
+            self.file(shard)
+            for shard in dict.fromkeys(number // (self.per_shard or 1) for number in numbers)
+        ]
 
     def verify(self, data: memoryview, number: int) -> memoryview:
         """Verify the crc32c at the end of a chunk."""
@@ -120,7 +148,9 @@ class ZarrArray(StoredArray):
         files = [self.file(shard) for shard in missing]
         found = self.tree.read_ranges([(file, start, end) for file in files])
         for shard, file, data in zip(missing, files, found, strict=True):
-            self._indices[shard] = ShardIndex(memoryview(data), self.per_shard or 1, f"the index of {file}")
+            self._indices[shard] = ShardIndex(
+                memoryview(data), self.per_shard or 1, f"the index of {file}"
+            )
 
 
 class ShardIndex:
@@ -139,15 +169,23 @@ class ShardIndex:
         """
         if len(data) != index_bytes(per_shard):
             raise FormatError(
-                what, expected=f"{index_bytes(per_shard)} bytes", found=str(len(data)), advice="the store is damaged"
+                what,
+                expected=f"{index_bytes(per_shard)} bytes",
+                found=str(len(data)),
+                advice="the store is damaged",
             )
         table = np.frombuffer(without_checksum(data, what), "<u8").reshape(-1, 2)
         slots = np.flatnonzero(table[:, 0] != _ABSENT)
-        self.slots = array("q", slots.astype("=i8").tobytes())  # access to one number is faster than in a NumPy array
-        self._offsets, self._lengths = (array("Q", column.astype("=u8").tobytes()) for column in table[slots].T)
+        # access to one number is faster than in a NumPy array
+        self.slots = array("q", slots.astype("=i8").tobytes())
+        self._offsets, self._lengths = (
+            array("Q", column.astype("=u8").tobytes()) for column in table[slots].T
+        )
 
     def place(self, slot: int) -> tuple[int, int] | None:
-        """Return the first byte and the end of a chunk in the file; None if the chunk does not exist."""
+        """Return the first byte and the end of a chunk in the file; None if the chunk does not
+        exist.
+        """
         position = bisect_left(self.slots, slot)
         if position == len(self.slots) or self.slots[position] != slot:
             return None
@@ -186,7 +224,10 @@ def split_shard(data: bytes | memoryview, per_shard: int, what: str) -> dict[int
     found = {slot: place for slot in index.slots if (place := index.place(slot)) is not None}
     if any(end > len(view) for _, end in found.values()):
         raise FormatError(
-            what, expected="chunks inside the file", found="a chunk outside of it", advice="the store is damaged"
+            what,
+            expected="chunks inside the file",
+            found="a chunk outside of it",
+            advice="the store is damaged",
         )
     return {slot: view[start:end] for slot, (start, end) in found.items()}
 
@@ -204,7 +245,9 @@ def without_checksum(data: memoryview, what: str) -> memoryview:
     """
     if len(data) < _CHECKSUM or crc32c(data, "zarr") != _RESIDUE:
         raise FormatError(
-            what, problem="the checksum does not match", advice="the store is corrupted: fetch or pack it again"
+            what,
+            problem="the checksum does not match",
+            advice="the store is corrupted: fetch or pack it again",
         )
     return data[:-_CHECKSUM]
 
@@ -213,9 +256,12 @@ def _numbers(values: Any, least: int) -> tuple[int, ...]:
     """Return a list of integers from JSON.
 
     Raises:
-        ValueError: it is not a list of integers, or a number is below `least` or does not fit into an int64.
+        ValueError: it is not a list of integers, or a number is below `least` or does not fit into
+            an int64.
     """
-    if not isinstance(values, list) or not all(type(value) is int and least <= value < 2**63 for value in values):
+    if not isinstance(values, list) or not all(
+        type(value) is int and least <= value < 2**63 for value in values
+    ):
         raise ValueError(f"{values!r} for a shape")
     return tuple(values)
 
@@ -224,16 +270,27 @@ def _with_checksum(data: bytes) -> bytes:
     return data + crc32c(data, "zarr").to_bytes(_CHECKSUM, "little")
 
 
-def group_metadata(attributes: Mapping[str, Any], nodes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def group_metadata(
+    attributes: Mapping[str, Any], nodes: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Return the metadata of a group.
 
     Args:
         attributes: the group's attributes.
-        nodes: the metadata of all nodes below it by path, to consolidate in this group; None does not consolidate.
+        nodes: the metadata of all nodes below it by path, to consolidate in this group; None does
+            not consolidate.
     """
-    metadata: dict[str, Any] = {"attributes": dict(attributes), "zarr_format": 3, "node_type": "group"}
+    metadata: dict[str, Any] = {
+        "attributes": dict(attributes),
+        "zarr_format": 3,
+        "node_type": "group",
+    }
     if nodes is not None:
-        metadata["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": dict(nodes)}
+        metadata["consolidated_metadata"] = {
+            "kind": "inline",
+            "must_understand": False,
+            "metadata": dict(nodes),
+        }
     return metadata
 
 
@@ -290,7 +347,11 @@ def codecs_of(encoding: Encoding, dtype: np.dtype[Any]) -> list[dict[str, Any]]:
         "shuffle": shuffle,
         "blocksize": BLOCK,
     }
-    return [_LITTLE if dtype.itemsize > 1 else {"name": "bytes"}, {"name": "blosc", "configuration": blosc}, _CRC]
+    return [
+        _LITTLE if dtype.itemsize > 1 else {"name": "bytes"},
+        {"name": "blosc", "configuration": blosc},
+        _CRC,
+    ]
 
 
 def encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
@@ -302,13 +363,18 @@ def encoding_of(codecs: list[dict[str, Any]]) -> Encoding:
     names = [codec["name"] for codec in codecs]
     if names == ["numcodecs.pcodec", "crc32c"]:
         return Encoding("pcodec", codecs[0]["configuration"]["level"])
-    if names == ["bytes", "blosc", "crc32c"] and codecs[0].get("configuration", {}).get("endian", "little") == "little":
+    if (
+        names == ["bytes", "blosc", "crc32c"]
+        and codecs[0].get("configuration", {}).get("endian", "little") == "little"
+    ):
         settings = codecs[1]["configuration"]
         return Encoding("blosc", settings["clevel"], _SHUFFLES[settings["shuffle"]])
     raise ValueError(f"codecs {', '.join(names)}")
 
 
-def column_metadata(field_layout: FieldLayout, column: Column, block: int, frames: int) -> dict[str, Any]:
+def column_metadata(
+    field_layout: FieldLayout, column: Column, block: int, frames: int
+) -> dict[str, Any]:
     """Return the metadata of a column's array.
 
     Args:

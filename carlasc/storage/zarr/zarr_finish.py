@@ -1,6 +1,8 @@
-"""Finishing a zarr store: block tables are joined to one table per sequence, and the metadata are written, the root last.
+"""Finishing a zarr store: block tables are joined to one table per sequence, and the metadata are
+written, the root last.
 
-The result depends only on the existing objects, so any process can finish a store, and finishing can be interrupted and repeated.
+The result depends only on the existing objects, so any process can finish a store, and finishing
+can be interrupted and repeated.
 """
 
 from __future__ import annotations
@@ -29,7 +31,13 @@ from carlasc.storage.packed.stores import STORE, VERSION, check_names
 from carlasc.storage.transport.targets import LocalTarget, Target, target_of
 from carlasc.storage.zarr.block_tables import block_of, parse_table
 from carlasc.storage.zarr.root import read_root, remove_replaced
-from carlasc.storage.zarr.shards import METADATA, array_metadata, column_metadata, encode_chunk, group_metadata
+from carlasc.storage.zarr.shards import (
+    METADATA,
+    array_metadata,
+    column_metadata,
+    encode_chunk,
+    group_metadata,
+)
 
 EXPECTED = "expected.json"  # the frames that a run has announced
 _SMALL = Encoding(shuffle=SHUFFLE)
@@ -74,11 +82,13 @@ class StoreNodes:
             self.files[f"{node}/c/{'/'.join('0' * values.ndim)}"] = data
 
 
-def finish(out: str | os.PathLike[str] | Target, *, incomplete: bool = False, **storage_options: Any) -> FinishedStore:
+def finish(
+    out: str | os.PathLike[str] | Target, *, incomplete: bool = False, **storage_options: Any
+) -> FinishedStore:
     """Write the metadata of a zarr store, so that it can be opened.
 
-    The last part of a run does this automatically. Use this function if a part failed or was never run. A finished store is updated with
-    the frames that were added to it.
+    The last part of a run does this automatically. Use this function if a part failed or was never
+    run. A finished store is updated with the frames that were added to it.
 
     Args:
         out: the store: a path, or a URL of an object store.
@@ -112,10 +122,15 @@ def _tables_of(paths: list[str]) -> list[str]:
 def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> FinishedStore:
     root = read_root(target)
     if root is None or root.get("type") != STORE or root.get("version") != VERSION:
-        raise MissingDataError(target.location, expected=f"a zarr store of version {VERSION}", found="none")
+        raise MissingDataError(
+            target.location, expected=f"a zarr store of version {VERSION}", found="none"
+        )
     if not isinstance(block := root.get("block"), int) or block < 1:
         raise FormatError(
-            target.location, expected="a number of frames in block", found=repr(block), advice="the store is damaged"
+            target.location,
+            expected="a number of frames in block",
+            found=repr(block),
+            advice="the store is damaged",
         )
     groups = _groups(target, paths)
     result, nodes, sequences = FinishedStore(target.location), StoreNodes(), dict[str, str]()
@@ -133,7 +148,8 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
             fields = {
                 name: about
                 for name, about in groups.items()
-                if about.get("type") == FIELD and name == f"{node}/{field_node(about.get('field', ''))}"
+                if about.get("type") == FIELD
+                and name == f"{node}/{field_node(about.get('field', ''))}"
             }
             _finish_sequence(target, node, attributes, inside, fields, block, nodes, result)
     check_names([*sequences, *sequences.values()], target.location)
@@ -141,11 +157,13 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
         raise _missing(result)
     about = root | {"complete": True}
     sequences = dict(sorted(sequences.items()))
-    if (
-        root.get("complete") is True
-    ):  # a store that is updated cannot be opened while its tables and its root do not fit
+    # a store that is updated cannot be opened while its tables and its root do not fit
+    if root.get("complete") is True:
         target.put(METADATA, to_json(group_metadata(root | {"complete": False})))
-    target.put_many(nodes.files | {f"{node}/{METADATA}": to_json(found) for node, found in nodes.metadata.items()})
+    target.put_many(
+        nodes.files
+        | {f"{node}/{METADATA}": to_json(found) for node, found in nodes.metadata.items()}
+    )
     all_nodes = dict(sorted(nodes.metadata.items()))
     target.put(METADATA, to_json(group_metadata(about | {"sequences": sequences}, all_nodes)))
     remove_replaced(target)
@@ -198,10 +216,14 @@ def _finish_sequence(
     )
     nodes.group(node, {**attributes, "fields": sorted(frames_by_field), "documents": documents})
     nodes.small(f"{node}/frames", frames, {"type": "carlasc.frames", "unit": "frame"})
-    nodes.small(f"{node}/counts", counts, {"type": "carlasc.counts", "unit": "element", "columns": columns})
+    nodes.small(
+        f"{node}/counts", counts, {"type": "carlasc.counts", "unit": "element", "columns": columns}
+    )
 
     def read_document(name: str) -> bytes | None:
-        return bytes(target.tree.read(f"{node}/{document_node(name)}")) if name in documents else None
+        return (
+            bytes(target.tree.read(f"{node}/{document_node(name)}")) if name in documents else None
+        )
 
     for name, numbers, about in number_arrays(read_document):
         nodes.small(f"{node}/{name}", numbers, about)
@@ -218,7 +240,12 @@ def _read_tables(target: Target, paths: Iterable[str]) -> dict[str, FrameTable]:
 
 
 def _count(
-    target: Target, node: str, path: str, paths: list[str], tables: Mapping[str, FrameTable], result: FinishedStore
+    target: Target,
+    node: str,
+    path: str,
+    paths: list[str],
+    tables: Mapping[str, FrameTable],
+    result: FinishedStore,
 ) -> None:
     """Count the frames of a sequence, and its missing announced frames."""
     result.sequences[path] = {name: len(table) for name, table in tables.items()}
@@ -252,10 +279,16 @@ def parse_expected(data: bytes, where: str) -> dict[str, set[int]]:
     """
     try:
         found = parse_json(data, where).items()
-        return {name: {frame for first, end in ranges for frame in range(first, end)} for name, ranges in found}
+        return {
+            name: {frame for first, end in ranges for frame in range(first, end)}
+            for name, ranges in found
+        }
     except (TypeError, ValueError) as error:
         raise FormatError(
-            where, expected="ranges of frames", found="something else", advice="remove this file and run again"
+            where,
+            expected="ranges of frames",
+            found="something else",
+            advice="remove this file and run again",
         ) from error
 
 

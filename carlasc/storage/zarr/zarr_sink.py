@@ -35,24 +35,30 @@ _T = TypeVar("_T")
 class ZarrSink(Sink):
     """Writes a packed zarr store in place, on a local disk or in an object store.
 
-    Several processes may write one store at the same time, each with its own sink, or with pickled copies of one writer. The store cannot
-    be opened until `finish` has written its metadata.
+    Several processes may write one store at the same time, each with its own sink, or with pickled
+    copies of one writer. The store cannot be opened until `finish` has written its metadata.
     """
 
     is_readable = True
 
     def __init__(
-        self, out: str | os.PathLike[str] | Target, options: PackOptions | None = None, overwrite: bool = False
+        self,
+        out: str | os.PathLike[str] | Target,
+        options: PackOptions | None = None,
+        overwrite: bool = False,
     ) -> None:
         """Start a store, or continue an unfinished store with the same options.
 
-        Frames may be added to a finished store. It can be read meanwhile, and shows the new frames after `finish`.
+        Frames may be added to a finished store. It can be read meanwhile, and shows the new frames
+        after `finish`.
 
         Args:
             out: the store.
-            options: options of the store; None takes those of an existing store unless `overwrite` is given, otherwise the defaults.
-            overwrite: replace a finished store, or a store with other options. A finished local store is kept as `<name>.replaced` until
-                the new store is finished; in an object store it is removed first.
+            options: options of the store; None takes those of an existing store unless `overwrite`
+                is given, otherwise the defaults.
+            overwrite: replace a finished store, or a store with other options. A finished local
+                store is kept as `<name>.replaced` until the new store is finished; in an object
+                store it is removed first.
 
         Raises:
             ConflictError: other data exist at `out`.
@@ -62,7 +68,11 @@ class ZarrSink(Sink):
             import_extra(module, "zarr")
         self.target = out if isinstance(out, Target) else LocalTarget(Path(out))
         self.location = self.target.location
-        self.options = options or (PackOptions() if overwrite else existing_options(self.target)) or PackOptions()
+        self.options = (
+            options
+            or (PackOptions() if overwrite else existing_options(self.target))
+            or PackOptions()
+        )
         if self.options.small:
             import_extra("pcodec", "zarr")
         self._root = StoreRoot(self.target, self.options, overwrite)
@@ -76,7 +86,8 @@ class ZarrSink(Sink):
         """Write the metadata of the store, so that it can be opened.
 
         Raises:
-            ConflictError: announced frames (`SequenceWriter.expect`) are missing, and `incomplete` is not given.
+            ConflictError: announced frames (`SequenceWriter.expect`) are missing, and `incomplete`
+                is not given.
         """
         self._root.begin()
         finish(self.target, incomplete=incomplete)
@@ -90,8 +101,9 @@ class ZarrSink(Sink):
 class ZarrWriter(SequenceWriter):
     """Writes one sequence of a zarr store.
 
-    `write_frames` writes blocks of frames at once. `write` keeps the frames of a block in memory until the first frame of another block, or
-    until the writer is closed. In a pickled copy, which is never closed, it writes each frame immediately.
+    `write_frames` writes blocks of frames at once. `write` keeps the frames of a block in memory
+    until the first frame of another block, or until the writer is closed. In a pickled copy, which
+    is never closed, it writes each frame immediately.
 
     Attributes:
         identity: split, name and coordinates; by default those of the path.
@@ -99,7 +111,9 @@ class ZarrWriter(SequenceWriter):
 
     concurrent = True
 
-    def __init__(self, target: Target, group: str, path: str, options: PackOptions, root: StoreRoot) -> None:
+    def __init__(
+        self, target: Target, group: str, path: str, options: PackOptions, root: StoreRoot
+    ) -> None:
         self.target = target
         self.group = group
         self.path = path
@@ -114,13 +128,18 @@ class ZarrWriter(SequenceWriter):
         self._fields: dict[str, StoredField] = {}
         self._held: dict[str, dict[int, EncodedFrame]] = {}  # frames of one block, by field
 
-    def expect(self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None) -> None:
+    def expect(
+        self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None
+    ) -> None:
         """Record the announced frames, so that the store is not finished without them by accident."""
         self._rows.update(rows or {})
         path = f"{self.group}/{EXPECTED}"
         there = self.target.read(path)
         known = {} if there is None else parse_expected(there, self.target.tree.where(path))
-        merged = known | {name: known.get(name, set()) | set(map(int, numbers)) for name, numbers in frames.items()}
+        merged = known | {
+            name: known.get(name, set()) | set(map(int, numbers))
+            for name, numbers in frames.items()
+        }
         if merged != known:
             self._start()
             self.target.put(path, format_expected(merged))
@@ -147,7 +166,11 @@ class ZarrWriter(SequenceWriter):
         if not self._keeps:
             self._put(frame // self.block, encoded)
             return
-        if any(other // self.block != frame // self.block for frames in self._held.values() for other in frames):
+        if any(
+            other // self.block != frame // self.block
+            for frames in self._held.values()
+            for other in frames
+        ):
             self._flush()
         self._held.setdefault(field, {}).update(encoded[field])
 
@@ -155,7 +178,12 @@ class ZarrWriter(SequenceWriter):
         """Write the fields of several frames, block by block."""
         self._flush()
         for block in sorted({frame // self.block for frame in frames}):
-            self._put(block, self._encode({frame: frames[frame] for frame in frames if frame // self.block == block}))
+            self._put(
+                block,
+                self._encode(
+                    {frame: frames[frame] for frame in frames if frame // self.block == block}
+                ),
+            )
 
     def write_document(self, name: str, data: bytes) -> None:
         """Write a text file."""
@@ -182,7 +210,9 @@ class ZarrWriter(SequenceWriter):
         self.target.remove(f"{self.group}/{document_node(layout.report_file(grid))}")
         self.target.remove(f"{self.group}/grids/{grid}")
         self.target.remove(f"{self.group}/{document_node(layout.params_file(grid))}")
-        self._fields = {name: field for name, field in self._fields.items() if not name.startswith(f"{grid}/")}
+        self._fields = {
+            name: field for name, field in self._fields.items() if not name.startswith(f"{grid}/")
+        }
 
     def close(self) -> None:
         """Write the frames that are kept in memory."""
@@ -194,7 +224,13 @@ class ZarrWriter(SequenceWriter):
         if not self._begun:
             self._root.begin()
             split, name, coordinates = self.identity
-            about = {"type": SEQUENCE, "version": VERSION, "path": self.path, "split": split, "name": name}
+            about = {
+                "type": SEQUENCE,
+                "version": VERSION,
+                "path": self.path,
+                "split": split,
+                "name": name,
+            }
             data = to_json(group_metadata(about | {"coordinates": coordinates}))
             self.target.put(f"{self.group}/{METADATA}", data, create=True)
             self._begun = True
@@ -202,13 +238,21 @@ class ZarrWriter(SequenceWriter):
     def _field(self, field: str) -> StoredField:
         if field not in self._fields:
             check_names([field], self.location)
-            self._fields[field] = StoredField(self.target, f"{self.group}/{field_node(field)}", field, self.options)
+            self._fields[field] = StoredField(
+                self.target, f"{self.group}/{field_node(field)}", field, self.options
+            )
         return self._fields[field]
 
-    def _encode(self, frames: Mapping[int, Mapping[str, NDArray[Any]]]) -> dict[str, dict[int, EncodedFrame]]:
+    def _encode(
+        self, frames: Mapping[int, Mapping[str, NDArray[Any]]]
+    ) -> dict[str, dict[int, EncodedFrame]]:
         """Encode frames in threads, and create new fields."""
         self._start()
-        items = [(field, frame, array) for frame, fields in frames.items() for field, array in fields.items()]
+        items = [
+            (field, frame, array)
+            for frame, fields in frames.items()
+            for field, array in fields.items()
+        ]
         arrays: dict[str, list[NDArray[Any]]] = {}
         for name, frame, array in items:
             with _naming(self.location, name, frame):
@@ -216,7 +260,9 @@ class ZarrWriter(SequenceWriter):
             arrays.setdefault(name, []).append(array)
         layouts = {
             name: self._field(name).create(
-                partial(typical_size, layout.field_named(name), found, self._rows, self.read_document)
+                partial(
+                    typical_size, layout.field_named(name), found, self._rows, self.read_document
+                )
             )
             for name, found in arrays.items()
         }
@@ -232,16 +278,27 @@ class ZarrWriter(SequenceWriter):
         return result
 
     def _put(self, block: int, encoded: Mapping[str, Mapping[int, EncodedFrame]]) -> None:
-        """Write the objects of a block, then the tables that mark them as complete, in the order of the fields."""
+        """Write the objects of a block, then the tables that mark them as complete, in the order of
+        the fields.
+        """
         fields = {name: self._field(name) for name in encoded}
-        objects = [(name, column) for name, field in fields.items() for column in field.columns(block, encoded[name])]
-        self._each(lambda part: fields[part[0]].put_column(part[1], block, encoded[part[0]]), objects)
+        objects = [
+            (name, column)
+            for name, field in fields.items()
+            for column in field.columns(block, encoded[name])
+        ]
+        self._each(
+            lambda part: fields[part[0]].put_column(part[1], block, encoded[part[0]]), objects
+        )
         *others, last = encoded
         self._each(lambda name: fields[name].put_table(block, encoded[name]), others)
         fields[last].put_table(block, encoded[last])
 
     def _each(self, function: Callable[[_T], None], items: list[_T]) -> None:
-        """Call a function with several items in threads. The function mostly waits for an object store or a disk."""
+        """Call a function with several items in threads.
+
+        The function mostly waits for an object store or a disk.
+        """
         with ThreadPoolExecutor(_PUTS) as pool:
             list(pool.map(function, items))
 

@@ -1,6 +1,8 @@
-"""Reading packed stores in zarr v3: sharded arrays, consolidated metadata, codecs of the core specification.
+"""Reading packed stores in zarr v3: sharded arrays, consolidated metadata, codecs of the core
+specification.
 
-Any zarr v3 library can read them. This module reads indices and chunks directly, which takes a tenth of the time of zarr-python per chunk.
+Any zarr v3 library can read them. This module reads indices and chunks directly, which takes a
+tenth of the time of zarr-python per chunk.
 """
 
 from __future__ import annotations
@@ -81,7 +83,10 @@ class ZarrStore(ArrayStore):
             return bytes(self.tree.read(node))
         except MissingDataError as error:
             raise FormatError(
-                error.where, expected=error.expected, found=error.found, advice="the store is damaged"
+                error.where,
+                expected=error.expected,
+                found=error.found,
+                advice="the store is damaged",
             ) from error
 
     def array(self, node: str) -> ZarrArray:
@@ -102,7 +107,9 @@ class ZarrStore(ArrayStore):
             prefix = f"{node}/" if node else ""
             return sum(size for path, size in self._sizes.items() if path.startswith(prefix))
         files = os.walk(f"{self.location}/{node}")
-        return sum((Path(folder) / name).stat().st_size for folder, _, names in files for name in names)
+        return sum(
+            (Path(folder) / name).stat().st_size for folder, _, names in files for name in names
+        )
 
     def _metadata(self, node: str) -> dict[str, Any] | None:
         if not node:
@@ -110,18 +117,35 @@ class ZarrStore(ArrayStore):
         consolidated = self._root.get("consolidated_metadata")
         if consolidated:
             where = self.tree.where(METADATA)
-            nodes = _mapping(_mapping(consolidated, where, "consolidated_metadata").get("metadata"), where, "metadata")
-            return None if node not in nodes else _mapping(nodes[node], f"{self.location}/{node}", "metadata")
+            nodes = _mapping(
+                _mapping(consolidated, where, "consolidated_metadata").get("metadata"),
+                where,
+                "metadata",
+            )
+            return (
+                None
+                if node not in nodes
+                else _mapping(nodes[node], f"{self.location}/{node}", "metadata")
+            )
         path = f"{node}/{METADATA}"
-        return parse_json(bytes(self.tree.read(path)), self.tree.where(path)) if self.tree.is_file(path) else None
+        return (
+            parse_json(bytes(self.tree.read(path)), self.tree.where(path))
+            if self.tree.is_file(path)
+            else None
+        )
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("_root", "_sizes")}
+        return {
+            key: value for key, value in self.__dict__.items() if key not in ("_root", "_sizes")
+        }
 
 
 def _mapping(value: Any, where: str, name: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise FormatError(
-            where, expected=f"an object in {name}", found=type(value).__name__, advice="the store is damaged"
+            where,
+            expected=f"an object in {name}",
+            found=type(value).__name__,
+            advice="the store is damaged",
         )
     return value

@@ -1,4 +1,5 @@
-"""The contents of a page: grids of one run or of two beside each other, with trajectory, evidence and scores, in a compact encoding.
+"""The contents of a page: grids of one run or of two beside each other, with trajectory, evidence
+and scores, in a compact encoding.
 
 A frame consists of sparse voxels and thinned points, delta-coded, in byte planes, deflated.
 """
@@ -36,17 +37,18 @@ from carlasc.viewing.trails import Trail, Trails
 
 Arrays = dict[str, NDArray[Any]]
 
-OFFSET_STEPS = (
-    8  # positions of a point within its cell, per axis: 2.5 cm in a 0.2 m cell, about the noise of the sensor
-)
+# positions of a point within its cell, per axis: 2.5 cm in a 0.2 m cell, about the noise of the
+# sensor
+OFFSET_STEPS = 8
 
 
 def encode_grid(grid: Grid) -> Arrays:
     """Encode the occupied voxels of a grid.
 
     Returns:
-        `index`: differences of the rising C-order indices of the voxels. `label`: of each voxel. If the grid has counts, also
-        `votes` of each voxel, and `unknown`: lengths of the alternating runs of known and unknown cells, known ones first.
+        `index`: differences of the rising C-order indices of the voxels. `label`: of each voxel. If
+        the grid has counts, also `votes` of each voxel, and `unknown`: lengths of the alternating
+        runs of known and unknown cells, known ones first.
     """
     flat = grid.labels.reshape(-1)
     occupied = np.flatnonzero(flat)
@@ -55,7 +57,9 @@ def encode_grid(grid: Grid) -> Arrays:
         votes = grid.counts.reshape(-1)[occupied]
         whole = (votes == np.round(votes)).all() and votes.max(initial=0) < 2**32
         arrays["votes"] = _narrow(votes.astype(np.uint32)) if whole else votes.astype(np.float32)
-        arrays["unknown"] = _narrow(_gaps(np.flatnonzero(np.diff(~grid.known.reshape(-1), prepend=False))))
+        arrays["unknown"] = _narrow(
+            _gaps(np.flatnonzero(np.diff(~grid.known.reshape(-1), prepend=False)))
+        )
     return arrays
 
 
@@ -67,12 +71,15 @@ def encode_evidence(grid: Grid, fields: Mapping[str, NDArray[Any]]) -> Arrays:
         fields: those of "occupied", "views" and "flags" that it has, each (X, Y, Z).
 
     Returns:
-        For each of these fields an array with a value of each occupied voxel. `occupied` is in 1/255: 255 is the probability 1.
+        For each of these fields an array with a value of each occupied voxel. `occupied` is in
+        1/255: 255 is the probability 1.
     """
     chosen = np.flatnonzero(grid.labels.reshape(-1))
     arrays = {name: field.reshape(-1)[chosen] for name, field in fields.items()}
     if "occupied" in arrays:
-        arrays["occupied"] = np.round(255 * np.clip(arrays["occupied"].astype(np.float32), 0, 1)).astype(np.uint8)
+        arrays["occupied"] = np.round(
+            255 * np.clip(arrays["occupied"].astype(np.float32), 0, 1)
+        ).astype(np.uint8)
     return {name: _narrow(values) for name, values in arrays.items()}
 
 
@@ -80,13 +87,17 @@ def encode_scan(scan: Scan, cell_m: float) -> Arrays:
     """Encode a scan, thinned to one point per cell.
 
     Returns:
-        `box` (6,) int32: first cell and number of cells along each axis. `index`: differences of the rising C-order indices of the cells
-        in the box. `offset` (3 N,): position within the cell in steps, axis by axis. `label` of each point, if the scan has labels.
+        `box` (6,) int32: first cell and number of cells along each axis. `index`: differences of
+        the rising C-order indices of the cells in the box. `offset` (3 N,): position within the
+        cell in steps, axis by axis. `label` of each point, if the scan has labels.
     """
-    cells = np.floor(scan.points.T.astype(np.float64, order="C") / cell_m).astype(np.int64)  # by axis, which is fast
+    # by axis, which is fast
+    cells = np.floor(scan.points.T.astype(np.float64, order="C") / cell_m).astype(np.int64)
     lower = cells.min(1) if len(scan) else np.zeros(3, np.int64)
     size = cells.max(1) - lower + 1 if len(scan) else np.ones(3, np.int64)
-    index, first = np.unique(np.ravel_multi_index(tuple(cells - lower[:, None]), tuple(size)), return_index=True)
+    index, first = np.unique(
+        np.ravel_multi_index(tuple(cells - lower[:, None]), tuple(size)), return_index=True
+    )
     inside = scan.points[first].T / cell_m - cells[:, first]
     offset = np.clip(np.floor(inside * OFFSET_STEPS), 0, OFFSET_STEPS - 1).astype(np.uint8)
     arrays: Arrays = {
@@ -108,27 +119,39 @@ def encode_actors(content: FrameContent, moving: Scan | None, trails: Sequence[T
         trails: the tracks of the actors.
 
     Returns:
-        Flat float32 arrays: `arrows`, start point and vector (m/s) of an arrow per moving actor, unless `moving` is None; `boxes` and
-        `tracks`, both ends of each line, if there are any.
+        Flat float32 arrays: `arrows`, start point and vector (m/s) of an arrow per moving actor,
+        unless `moving` is None; `boxes` and `tracks`, both ends of each line, if there are any.
     """
     arrays: Arrays = {}
     if moving is not None:
-        arrays["arrows"] = np.concatenate(motion_arrows(moving), axis=1).astype(np.float32).reshape(-1)
+        arrays["arrows"] = (
+            np.concatenate(motion_arrows(moving), axis=1).astype(np.float32).reshape(-1)
+        )
     if content.boxes is not None and len(content.boxes.tracks):
         arrays["boxes"] = box_lines(content.boxes).astype(np.float32).reshape(-1)
     if trails and content.pose is not None:
-        lines = [np.stack([trail.points[:-1], trail.points[1:]], axis=1).reshape(-1, 3) for trail in trails]
-        arrays["tracks"] = transform_points(invert(content.pose), np.concatenate(lines)).astype(np.float32).reshape(-1)
+        lines = [
+            np.stack([trail.points[:-1], trail.points[1:]], axis=1).reshape(-1, 3)
+            for trail in trails
+        ]
+        arrays["tracks"] = (
+            transform_points(invert(content.pose), np.concatenate(lines))
+            .astype(np.float32)
+            .reshape(-1)
+        )
     return arrays
 
 
 def pack_arrays(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Return named flat arrays as one deflated block.
 
-    The block holds the length of a JSON header (uint32, little-endian), the header ([name, type, length], ...) and the arrays one after
-    the other. An array is stored as the first bytes of all its values, then the second bytes, and so on, which compresses better.
+    The block holds the length of a JSON header (uint32, little-endian), the header ([name, type,
+    length], ...) and the arrays one after the other. An array is stored as the first bytes of all
+    its values, then the second bytes, and so on, which compresses better.
     """
-    header = json.dumps([[name, array.dtype.name, array.size] for name, array in arrays.items()]).encode()
+    header = json.dumps(
+        [[name, array.dtype.name, array.size] for name, array in arrays.items()]
+    ).encode()
     parts = [struct.pack("<I", len(header)), header]
     for array in arrays.values():
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
@@ -143,12 +166,22 @@ def _gaps(rising: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
 
 
 def _narrow(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
-    """Return non-negative integers in the narrowest unsigned type of at most 32 bits that holds them."""
+    """Return non-negative integers in the narrowest unsigned type of at most 32 bits that holds
+    them.
+    """
     largest = int(values.max(initial=0))
-    return values.astype(next(t for t in (np.uint8, np.uint16, np.uint32) if largest <= np.iinfo(t).max))
+    return values.astype(
+        next(t for t in (np.uint8, np.uint16, np.uint32) if largest <= np.iinfo(t).max)
+    )
 
 
-EVIDENCE = ("occupied", "views", "flags", "instance")  # the fields of a grid that a page shows, if they exist
+# the fields of a grid that a page shows, if they exist
+EVIDENCE = (
+    "occupied",
+    "views",
+    "flags",
+    "instance",
+)
 
 
 @dataclass(frozen=True)
@@ -157,7 +190,8 @@ class PagePanel:
 
     Attributes:
         name: "prediction", "truth", "errors", or "grid" if there is only one.
-        title: text above it: the name, the size of the grid if there is only one, or the name of the run if two are compared.
+        title: text above it: the name, the size of the grid if there is only one, or the name of
+            the run if two are compared.
         spec: geometry.
         colors: colours of its labels.
         run: number of the run that it belongs to: 0, or 1 for the run beside it.
@@ -208,7 +242,13 @@ class PageContent:
         """The grids of the page: those of the first run, then those of the run beside it."""
         own = self._fields_of(self.reader)
         panels = [
-            PagePanel(p.name, p.title, p.spec, p.colors, evidence=() if p.name in ("truth", "errors") else own)
+            PagePanel(
+                p.name,
+                p.title,
+                p.spec,
+                p.colors,
+                evidence=() if p.name in ("truth", "errors") else own,
+            )
             for p in self.reader.panels
         ]
         if self.beside is None:
@@ -218,13 +258,22 @@ class PageContent:
             prefix = "errors of " if panel.name == "errors" else ""
             first = panels.index(panel)
             panels[first] = replace(panel, title=prefix + self.runs[0], beside=number)
-            spec, evidence = (panel.spec, ()) if prefix else (self.beside.data.spec, self._fields_of(self.beside))
-            panels.append(replace(panel, title=prefix + self.runs[1], spec=spec, run=1, evidence=evidence))
+            spec, evidence = (
+                (panel.spec, ())
+                if prefix
+                else (self.beside.data.spec, self._fields_of(self.beside))
+            )
+            panels.append(
+                replace(panel, title=prefix + self.runs[1], spec=spec, run=1, evidence=evidence)
+            )
         return tuple(panels)
 
     @cached_property
     def runs(self) -> tuple[str, ...]:
-        """The names of the runs. Two runs are named by their grids, or by the last folders in which their paths differ."""
+        """The names of the runs.
+
+        Two runs are named by their grids, or by the last folders in which their paths differ.
+        """
         parts = [
             (*PurePath(reader.data.sequence.location).parts, reader.data.grid)
             for reader in (self.reader, self.beside)
@@ -239,19 +288,27 @@ class PageContent:
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """The names of the cameras with images of these frames; empty without Pillow, which scales the images."""
+        """The names of the cameras with images of these frames; empty without Pillow, which scales
+        the images.
+        """
         sequence = self.reader.data.sequence
         if find_spec("PIL") is None:
             return ()
         own = cameras_of(sequence).values()
-        return tuple(camera.name for camera in own if any(has_image(sequence, camera, frame) for frame in self.frames))
+        return tuple(
+            camera.name
+            for camera in own
+            if any(has_image(sequence, camera, frame) for frame in self.frames)
+        )
 
     def read(self, frame: int, trails: Trails | None = None) -> tuple[Arrays, FrameScores | None]:
-        """Return the arrays of a frame, named `panel0/index`, `scan/index`, `actors/boxes`, ..., and its scores if there is a truth.
+        """Return the arrays of a frame, named `panel0/index`, `scan/index`, `actors/boxes`, ...,
+        and its scores if there is a truth.
 
         Args:
             frame: frame number.
-            trails: the tracks of the actors, for which frames must be read in order; None shows no tracks.
+            trails: the tracks of the actors, for which frames must be read in order; None shows no
+                tracks.
 
         Raises:
             FormatError: the data do not have the format.
@@ -266,14 +323,25 @@ class PageContent:
         arrays: Arrays = {}
         for number, (panel, grid) in enumerate(zip(self.panels, grids, strict=True)):
             data = (self.reader if panel.run == 0 or self.beside is None else self.beside).data
-            names = [name for name in panel.evidence if frame in data.frames_with(f"{data.grid}/{name}")]
-            found = encode_grid(grid) | encode_evidence(grid, {name: data.read_part(name, frame) for name in names})
+            names = [
+                name for name in panel.evidence if frame in data.frames_with(f"{data.grid}/{name}")
+            ]
+            found = encode_grid(grid) | encode_evidence(
+                grid, {name: data.read_part(name, frame) for name in names}
+            )
             arrays |= {f"panel{number}/{name}": array for name, array in found.items()}
         moving = self.reader.read_motion(frame, content.scan)
         if content.scan is not None:
-            arrays |= {f"scan/{name}": array for name, array in encode_scan(content.scan, self.thin_m).items()}
-        ways = trails.follow(self.frames.index(frame), content, moving) if trails is not None else ()
-        arrays |= {f"actors/{name}": array for name, array in encode_actors(content, moving, ways).items()}
+            arrays |= {
+                f"scan/{name}": array
+                for name, array in encode_scan(content.scan, self.thin_m).items()
+            }
+        ways = (
+            trails.follow(self.frames.index(frame), content, moving) if trails is not None else ()
+        )
+        arrays |= {
+            f"actors/{name}": array for name, array in encode_actors(content, moving, ways).items()
+        }
         if self.cameras:
             arrays |= encode_photos(self.reader.read_photos(frame))
         return arrays, self._score(grids)
@@ -282,7 +350,10 @@ class PageContent:
         """Return the values for the scripts of the page, except the frames and their scores."""
         reader = self.reader
         poses = [pose for pose in map(reader.read_pose, self.frames) if pose is not None]
-        tables = {colors.table.name: colors for colors in (reader.colors, *(panel.colors for panel in self.panels))}
+        tables = {
+            colors.table.name: colors
+            for colors in (reader.colors, *(panel.colors for panel in self.panels))
+        }
         return {
             "name": reader.name,
             "leftHanded": reader.left_handed,
@@ -293,18 +364,22 @@ class PageContent:
             "runs": list(self.runs),
             "frames": list(self.frames),
             "times": [reader.read_time(frame) for frame in self.frames],
-            "poses": [np.round(pose[:3].reshape(-1), 5).tolist() for pose in poses] or None,  # first_T_sensor
+            "poses": [np.round(pose[:3].reshape(-1), 5).tolist() for pose in poses]
+            or None,  # first_T_sensor
             "hasPoints": reader.has("points"),
             "hasFlow": reader.has_motion,
             "hasBoxes": reader.has("boxes"),
-            "hasTracks": bool(poses) and any(map(reader.has, ("boxes", "instances", f"{reader.data.grid}/instance"))),
+            "hasTracks": bool(poses)
+            and any(map(reader.has, ("boxes", "instances", f"{reader.data.grid}/instance"))),
             "cameras": list(self.cameras),
             "pointCell": self.thin_m,
             "offsetSteps": OFFSET_STEPS,
         }
 
     def _has_classes(self) -> bool:
-        """Whether the first frame has classes, so that colours by class are more useful than colours by height."""
+        """Whether the first frame has classes, so that colours by class are more useful than
+        colours by height.
+        """
         content = self.reader.read(self.frames[0])
         labels = [grid.labels for grid in content.grids]
         if content.scan is not None and content.scan.labels is not None:
@@ -317,13 +392,20 @@ class PageContent:
         return tuple(name for name in EVIDENCE if reader.has(f"{reader.data.grid}/{name}"))
 
     def _score(self, grids: list[Grid]) -> FrameScores | None:
-        """Return the scores of the predictions of the runs, in the shown classes and in voxels that the ground truth knows."""
+        """Return the scores of the predictions of the runs, in the shown classes and in voxels that
+        the ground truth knows.
+        """
         if self.reader.truth is None:
             return None
         truth = grids[1]
-        predictions = [grids[n] for n, panel in enumerate(self.panels) if panel.name == "prediction"]
+        predictions = [
+            grids[n] for n, panel in enumerate(self.panels) if panel.name == "prediction"
+        ]
         classes = self.reader.table.num_channels
-        found = [ConfusionMatrix(classes).update(grid.labels, truth.labels, truth.known) for grid in predictions]
+        found = [
+            ConfusionMatrix(classes).update(grid.labels, truth.labels, truth.known)
+            for grid in predictions
+        ]
         return FrameScores(
             tuple(matrix.mean_iou(with_free=False, absent="skip") for matrix in found),
             tuple(matrix.completeness().iou for matrix in found),
@@ -333,20 +415,32 @@ class PageContent:
 def open_content(
     scene: Scene, thin_m: float, beside: SceneSource | None = None, beside_grid: str | None = None
 ) -> PageContent:
-    """Find the runs of a page and the frames that both have; see `carlasc.viewing.view` for the arguments and errors."""
+    """Find the runs of a page and the frames that both have; see `carlasc.viewing.view` for the
+    arguments and errors.
+    """
     reader = scene.open()
     if beside is None and beside_grid is None:
         return PageContent(reader, None, reader.frames, thin_m)
     if not reader.data.grid:
-        raise ArgumentError("beside", problem="only grids can be compared", advice="choose a source that has a grid")
+        raise ArgumentError(
+            "beside", problem="only grids can be compared", advice="choose a source that has a grid"
+        )
     found = None if beside is None else find_truth(beside, reader.data.sequence)
     sequence = reader.data.sequence if found is None else found.sequence
     grid = beside_grid or (None if found is None else found.grid) or scene.grid
     classes = scene.classes or reader.table
-    second = Scene(sequence, grid=grid, classes=classes, source_classes=scene.source_classes, palette=scene.palette)
+    second = Scene(
+        sequence,
+        grid=grid,
+        classes=classes,
+        source_classes=scene.source_classes,
+        palette=scene.palette,
+    )
     other = second.open("grid")
     if other.left_handed != reader.left_handed:
-        raise ArgumentError("beside", expected="a run in the same axes", found="one in the other axes")
+        raise ArgumentError(
+            "beside", expected="a run in the same axes", found="one in the other axes"
+        )
     if reader.truth is not None:
         check_same_geometry(other.data.spec, reader.truth.spec)
     frames = tuple(sorted({*reader.frames} & {*other.frames}))

@@ -1,4 +1,6 @@
-"""A scene as a page for any browser: one self-contained HTML file, or a folder from which the browser fetches frames."""
+"""A scene as a page for any browser: one self-contained HTML file, or a folder from which the
+browser fetches frames.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,13 @@ from carlasc.running.spreading import StepCounter
 from carlasc.storage.files import make_folder, sync_all, write_output, writing
 from carlasc.storage.packed.output import remove
 from carlasc.viewing.finding import SceneSource
-from carlasc.viewing.page.contents import FrameScores, PageContent, json_number, open_content, pack_arrays
+from carlasc.viewing.page.contents import (
+    FrameScores,
+    PageContent,
+    json_number,
+    open_content,
+    pack_arrays,
+)
 from carlasc.viewing.scene import Scene
 from carlasc.viewing.targets import ViewResult, check_target, first_frames
 from carlasc.viewing.trails import Trails
@@ -44,13 +52,16 @@ PAGES = (".html", ".htm")
 """Endings of the names of pages in one file."""
 
 
-def compose(name: str, describe: Callable[[], Mapping[str, Any]], blocks: Iterator[bytes] | None) -> Iterator[bytes]:
+def compose(
+    name: str, describe: Callable[[], Mapping[str, Any]], blocks: Iterator[bytes] | None
+) -> Iterator[bytes]:
     """Yield a page piece by piece.
 
     Args:
         name: title of the page.
         describe: returns the description of the scene. It is called after the last block.
-        blocks: the frames, which become part of the page; None if the browser fetches them from the folder of the page.
+        blocks: the frames, which become part of the page; None if the browser fetches them from the
+            folder of the page.
     """
     assets = files("carlasc.viewing.page").joinpath("assets")
 
@@ -87,7 +98,8 @@ def compose(name: str, describe: Callable[[], Mapping[str, Any]], blocks: Iterat
 
 
 def check_folder(out: Path, overwrite: bool) -> None:
-    """Check that the folder of a page can be written: it does not exist, is empty, or is a page that may be replaced.
+    """Check that the folder of a page can be written: it does not exist, is empty, or is a page
+    that may be replaced.
 
     Raises:
         ConflictError: something else exists there, or `overwrite` is not given.
@@ -98,10 +110,14 @@ def check_folder(out: Path, overwrite: bool) -> None:
     if not (index.is_file() and _MARK in index.read_bytes()[:2000] and (out / FRAMES).is_dir()):
         found = "a folder with other files" if out.is_dir() else "a file"
         advice = "choose another name; one that ends in .html writes a page in one file"
-        raise ConflictError(out, expected="the folder of a page, or a new one", found=found, advice=advice)
+        raise ConflictError(
+            out, expected="the folder of a page, or a new one", found=found, advice=advice
+        )
     if not overwrite:
         raise ConflictError(
-            out, problem="the page exists", advice="choose another name, or replace it with `overwrite=True`"
+            out,
+            problem="the page exists",
+            advice="choose another name, or replace it with `overwrite=True`",
         )
 
 
@@ -133,7 +149,8 @@ class NewFolder:
 
 @contextmanager
 def writing_folder(out: Path) -> Iterator[NewFolder]:
-    """Yield a temporary folder, which is renamed at the end of the block, and removed if the block fails.
+    """Yield a temporary folder, which is renamed at the end of the block, and removed if the block
+    fails.
 
     An existing folder is replaced at the end of the block. Call `check_folder` before.
 
@@ -211,7 +228,9 @@ class _Writer:
         with writing_folder(out) as folder:
             for number, block in enumerate(self.blocks()):
                 folder.write(f"{FRAMES}/{number:06d}.bin", block)
-            folder.write("index.html", b"".join(compose(self.content.reader.name, self.describe, None)))
+            folder.write(
+                "index.html", b"".join(compose(self.content.reader.name, self.describe, None))
+            )
         return folder.size_bytes
 
     def blocks(self) -> Iterator[bytes]:

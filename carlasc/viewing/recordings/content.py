@@ -1,4 +1,6 @@
-"""The contents of a recording frame by frame, for all formats: right-handed, thinned, with the track of each actor."""
+"""The contents of a recording frame by frame, for all formats: right-handed, thinned, with the
+track of each actor.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,9 @@ from carlasc.viewing.trails import Trail, Trails
 MAX_POINTS = 30_000
 """Default number of points per frame, so that a frame is smaller than half a megabyte."""
 
-_GOLDEN = (
-    2654435769  # 2**32 over the golden ratio: multiples of it, modulo 2**32, are spread evenly, however many are taken
-)
+# 2**32 over the golden ratio: multiples of it, modulo 2**32, are spread evenly, however many are
+# taken
+_GOLDEN = 2654435769
 
 
 class Triangles(NamedTuple):
@@ -44,9 +46,11 @@ class Triangles(NamedTuple):
 
 
 def class_surfaces(grid: Grid) -> Iterator[tuple[int, Triangles]]:
-    """Yield each class of a cylindrical grid with the surface of its voxels, without the faces that two voxels share.
+    """Yield each class of a cylindrical grid with the surface of its voxels, without the faces that
+    two voxels share.
 
-    The lowest faces of the lowest cells are left out, because they are visible only from below the ground.
+    The lowest faces of the lowest cells are left out, because they are visible only from below the
+    ground.
     """
     spec, labels = split_arcs(grid.spec, grid.labels)
     parts = [_faces(spec, labels, axis, side) for axis in range(3) for side in (0, 1)]
@@ -55,13 +59,20 @@ def class_surfaces(grid: Grid) -> Iterator[tuple[int, Triangles]]:
         chosen = owners == label
         first = 4 * np.arange(np.count_nonzero(chosen), dtype=np.uint32)[:, None, None]
         indices = (first + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
-        yield label, Triangles(corners[chosen].reshape(-1, 3), np.repeat(normals[chosen], 4, axis=0), indices)
+        yield (
+            label,
+            Triangles(
+                corners[chosen].reshape(-1, 3), np.repeat(normals[chosen], 4, axis=0), indices
+            ),
+        )
 
 
 def _faces(
     spec: GridSpec, labels: NDArray[np.unsignedinteger], axis: int, side: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.unsignedinteger]]:
-    """Return the (Q, 4, 3) corners, the (Q, 3) normals and the (Q,) classes of the exposed faces towards one side of one axis."""
+    """Return the (Q, 4, 3) corners, the (Q, 3) normals and the (Q,) classes of the exposed faces
+    towards one side of one axis.
+    """
     solid = surrounded(spec, labels > 0)
     behind = np.roll(solid, 1 - 2 * side, axis)[1:-1, 1:-1, 1:-1]
     shown = np.where(behind, 0, labels)
@@ -81,7 +92,10 @@ def _faces(
         moved = np.argwhere(np.moveaxis(mask, along, 2))
         return np.insert(moved[:, :2], along, moved[:, 2], axis=1)
 
-    first, last = in_lines((shown > 0) & (shown != before)), in_lines((shown > 0) & (shown != after))
+    first, last = (
+        in_lines((shown > 0) & (shown != before)),
+        in_lines((shown > 0) & (shown != after)),
+    )
     edges = [spec.edges(a) for a in range(3)]
     across, up = (axis + 1) % 3, (axis + 2) % 3
     corners: NDArray[np.floating] = np.empty((len(first), 4, 3))
@@ -99,7 +113,8 @@ def _faces(
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One frame, in right-handed axes: x forward, y to the left, z up; in the frame of the sensor, unless noted.
+    """One frame, in right-handed axes: x forward, y to the left, z up; in the frame of the sensor,
+    unless noted.
 
     Attributes:
         number: frame number.
@@ -109,7 +124,8 @@ class RecordedFrame:
         tails: (M, 3) start points of the arrows that show how actors move, metres.
         vectors: (M, 3) vectors of the arrows, metres per second.
         boxes: tracked boxes; None if the frame was not annotated.
-        pose: (4, 4) world_T_sensor; the world is the frame of the first scan; None if the sequence has no poses.
+        pose: (4, 4) world_T_sensor; the world is the frame of the first scan; None if the sequence
+            has no poses.
         trails: the tracks of the actors up to this frame, in the world.
         picture: the bird's-eye camera picture as its JPEG bytes, or None.
         photos: the images of the cameras.
@@ -174,7 +190,9 @@ def record_frames(reader: SceneReader, max_points: int | None) -> Iterator[Recor
 
 
 def thin_scan(scan: Scan, most: int) -> Scan:
-    """Return at most `most` points of a scan, spread evenly over their order in the file: the same ones in each call."""
+    """Return at most `most` points of a scan, spread evenly over their order in the file: the same
+    ones in each call.
+    """
     if len(scan) <= most:
         return scan
     order = np.arange(len(scan), dtype=np.uint64) * np.uint64(_GOLDEN) % np.uint64(2**32)
@@ -182,7 +200,9 @@ def thin_scan(scan: Scan, most: int) -> Scan:
 
 
 def point_colors(scan: Scan, by_id: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return (N, 3) uint8 RGB of the points of a scan, in the colours of their classes, (num_channels, 3)."""
+    """Return (N, 3) uint8 RGB of the points of a scan, in the colours of their classes,
+    (num_channels, 3).
+    """
     colors = by_id.copy()
     colors[0] = palette.UNLABELLED
     return colors[np.zeros(len(scan), np.int64) if scan.labels is None else scan.labels]

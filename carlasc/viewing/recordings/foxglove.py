@@ -2,15 +2,17 @@
 
 Topics, all in right-handed axes with z up; times are seconds since the first frame:
 
-    /tf                      FrameTransforms: `ego`, the sensor, in `world`, the frame of the first scan
-    /points                  PointCloud: colours, class ids, and numbers of actors if they exist
-    /grid                    VoxelGrid, or SceneUpdate with meshes for a cylindrical grid; with a ground truth
+    /tf                      FrameTransforms: `ego`, the sensor, in `world`, the frame of the first
+    scan /points                  PointCloud: colours, class ids, and numbers of actors if they
+    exist /grid                    VoxelGrid, or SceneUpdate with meshes for a cylindrical grid;
+    with a ground truth
                              /prediction, /truth and /errors; /actors: its voxels by actor
     /flow, /boxes, /tracks   SceneUpdate: arrows, boxes, the tracks of the actors
     /path                    SceneUpdate: the trajectory of the vehicle in the whole recording
     /picture                 CompressedImage: the bird's-eye camera picture
     /cameras/NAME/image, /cameras/NAME/calibration
-                             CompressedImage and CameraCalibration of each camera, whose frame is NAME
+                             CompressedImage and CameraCalibration of each camera, whose frame is
+                             NAME
 """
 
 from __future__ import annotations
@@ -56,8 +58,14 @@ class FoxgloveWriter:
         self._context = foxglove.Context()
         self._output = PatientFile(path, None)
         self._writer = foxglove.open_mcap(self._output, context=self._context)
-        self._writer.write_metadata("carlasc", {"sequence": reader.name, "classes": reader.table.name})
-        tables = {panel.colors.table.name: panel.colors for panel in reader.panels if panel.colors is not reader.colors}
+        self._writer.write_metadata(
+            "carlasc", {"sequence": reader.name, "classes": reader.table.name}
+        )
+        tables = {
+            panel.colors.table.name: panel.colors
+            for panel in reader.panels
+            if panel.colors is not reader.colors
+        }
         for name, colors in {"classes": reader.colors, **tables}.items():
             names = {str(entry.order): entry.name for entry in colors.entries(colors.table.names)}
             self._writer.write_metadata(name, names)
@@ -70,7 +78,9 @@ class FoxgloveWriter:
 
         def log(topic: str, kind: str, **content: Any) -> None:
             if topic not in self._channels:
-                self._channels[topic] = getattr(self._types, f"{kind}Channel")(topic, context=self._context)
+                self._channels[topic] = getattr(self._types, f"{kind}Channel")(
+                    topic, context=self._context
+                )
             self._channels[topic].log(getattr(m, kind)(**content), log_time=nanoseconds)
 
         def log_scene(topic: str, entities: list[Any]) -> None:
@@ -81,7 +91,9 @@ class FoxgloveWriter:
             return m.SceneEntity(timestamp=stamp, frame_id=frame_id, id=name, **content)
 
         pose = np.eye(4) if frame.pose is None else frame.pose
-        places = {(WORLD, EGO): pose} | {(EGO, photo.camera.name): photo.ego_T_camera for photo in frame.photos}
+        places = {(WORLD, EGO): pose} | {
+            (EGO, photo.camera.name): photo.ego_T_camera for photo in frame.photos
+        }
         transforms = [
             m.FrameTransform(
                 timestamp=stamp,
@@ -95,16 +107,30 @@ class FoxgloveWriter:
         log("/tf", "FrameTransforms", transforms=transforms)
         for panel, grid in zip(self._reader.panels, frame.grids, strict=True):
             if grid.spec.coordinates == "cylindrical":
-                log_scene(f"/{panel.name}", [entity(n, EGO, triangles=[t]) for n, t in self._wedges(panel, grid)])
+                log_scene(
+                    f"/{panel.name}",
+                    [entity(n, EGO, triangles=[t]) for n, t in self._wedges(panel, grid)],
+                )
             else:
-                log(f"/{panel.name}", "VoxelGrid", timestamp=stamp, frame_id=EGO, **self._voxels(panel, grid))
+                log(
+                    f"/{panel.name}",
+                    "VoxelGrid",
+                    timestamp=stamp,
+                    frame_id=EGO,
+                    **self._voxels(panel, grid),
+                )
         if frame.scan is not None:
             log("/points", "PointCloud", timestamp=stamp, frame_id=EGO, **self._points(frame.scan))
         if self._reader.has_motion:
-            arrows = [self._arrow(tail, vector) for tail, vector in zip(frame.tails, frame.vectors, strict=True)]
+            arrows = [
+                self._arrow(tail, vector)
+                for tail, vector in zip(frame.tails, frame.vectors, strict=True)
+            ]
             log_scene("/flow", [entity("flow", EGO, arrows=arrows)])
         if self._reader.has("boxes"):
-            log_scene("/boxes", [] if frame.boxes is None else list(self._boxes(frame.boxes, entity)))
+            log_scene(
+                "/boxes", [] if frame.boxes is None else list(self._boxes(frame.boxes, entity))
+            )
         if frame.pose is not None:
             lines = [self._line(trail.points, self._color(trail.label)) for trail in frame.trails]
             log_scene("/tracks", [entity("tracks", WORLD, lines=lines)])
@@ -113,9 +139,19 @@ class FoxgloveWriter:
             log_scene("/path", [entity("path", WORLD, lines=[line])])
         self._path = None  # once
         if frame.picture is not None:
-            log("/picture", "CompressedImage", timestamp=stamp, frame_id=EGO, data=frame.picture, format="jpeg")
+            log(
+                "/picture",
+                "CompressedImage",
+                timestamp=stamp,
+                frame_id=EGO,
+                data=frame.picture,
+                format="jpeg",
+            )
         for photo in frame.photos:
-            topic, own = f"/cameras/{photo.camera.name}", {"timestamp": stamp, "frame_id": photo.camera.name}
+            topic, own = (
+                f"/cameras/{photo.camera.name}",
+                {"timestamp": stamp, "frame_id": photo.camera.name},
+            )
             log(f"{topic}/image", "CompressedImage", data=photo.data, format=photo.kind, **own)
             log(f"{topic}/calibration", "CameraCalibration", **own, **_calibration(photo.camera))
         self._output.check()
@@ -131,12 +167,17 @@ class FoxgloveWriter:
         self._output.check()
 
     def _voxels(self, panel: GridPanel, grid: Grid) -> dict[str, Any]:
-        """Return a grid as the content of a VoxelGrid: colours, transparent where free, and class ids, in the order z, y, x."""
+        """Return a grid as the content of a VoxelGrid: colours, transparent where free, and class
+        ids, in the order z, y, x.
+        """
         m = self._messages
         columns, rows, slices = grid.spec.size
         labels = grid.labels.transpose(2, 1, 0)
         cells = np.zeros((slices, rows, columns), _CELL)
-        cells["rgba"][..., :3], cells["rgba"][..., 3] = panel.colors.by_id[labels], np.where(labels, 255, 0)
+        cells["rgba"][..., :3], cells["rgba"][..., 3] = (
+            panel.colors.by_id[labels],
+            np.where(labels, 255, 0),
+        )
         cells["label"] = labels
         cells["rgba"][labels == 0] = 0
         corner = np.eye(4)
@@ -149,7 +190,10 @@ class FoxgloveWriter:
             "cell_stride": _CELL.itemsize,
             "row_stride": _CELL.itemsize * columns,
             "slice_stride": _CELL.itemsize * columns * rows,
-            "fields": [*self._color_fields(0), m.PackedElementField(name="label", offset=4, type=self._uint(2))],
+            "fields": [
+                *self._color_fields(0),
+                m.PackedElementField(name="label", offset=4, type=self._uint(2)),
+            ],
             "data": cells.tobytes(),
         }
 
@@ -164,9 +208,16 @@ class FoxgloveWriter:
         points["rgba"][:, :3] = point_colors(scan, self._reader.colors.by_id)
         points["label"] = 0 if scan.labels is None else scan.labels
         float32 = m.PackedElementFieldNumericType.Float32
-        axes = [m.PackedElementField(name=name, offset=4 * i, type=float32) for i, name in enumerate("xyz")]
+        axes = [
+            m.PackedElementField(name=name, offset=4 * i, type=float32)
+            for i, name in enumerate("xyz")
+        ]
         label = m.PackedElementField(name="label", offset=16, type=self._uint(2))
-        numbers = [m.PackedElementField(name="instance", offset=18, type=self._uint(4))] if numbered else []
+        numbers = (
+            [m.PackedElementField(name="instance", offset=18, type=self._uint(4))]
+            if numbered
+            else []
+        )
         return {
             "pose": self._pose(np.eye(4)),
             "point_stride": points.itemsize,
@@ -184,7 +235,10 @@ class FoxgloveWriter:
             yield (
                 name,
                 m.TriangleListPrimitive(
-                    pose=self._pose(np.eye(4)), points=points, color=color, indices=surface.indices.reshape(-1).tolist()
+                    pose=self._pose(np.eye(4)),
+                    points=points,
+                    color=color,
+                    indices=surface.indices.reshape(-1).tolist(),
                 ),
             )
 
@@ -195,9 +249,14 @@ class FoxgloveWriter:
             label, track = int(boxes.labels[row]), str(boxes.tracks[row])
             name = self._reader.table.names.get(label, f"class {label}")
             cube = m.CubePrimitive(
-                pose=self._pose(pose), size=self._vector(boxes.sizes[row]), color=self._color(label, _BOX_ALPHA)
+                pose=self._pose(pose),
+                size=self._vector(boxes.sizes[row]),
+                color=self._color(label, _BOX_ALPHA),
             )
-            metadata = [m.KeyValuePair(key="class", value=name), m.KeyValuePair(key="track", value=track)]
+            metadata = [
+                m.KeyValuePair(key="class", value=name),
+                m.KeyValuePair(key="track", value=track),
+            ]
             yield entity(track, EGO, cubes=[cube], metadata=metadata)
 
     def _arrow(self, tail: NDArray[np.float64], vector: NDArray[np.float64]) -> Any:
@@ -229,7 +288,9 @@ class FoxgloveWriter:
         )
 
     def _pose(self, dst_T_src: Transform) -> Any:
-        return self._messages.Pose(position=self._vector(dst_T_src[:3, 3]), orientation=self._quaternion(dst_T_src))
+        return self._messages.Pose(
+            position=self._vector(dst_T_src[:3, 3]), orientation=self._quaternion(dst_T_src)
+        )
 
     def _quaternion(self, dst_T_src: Transform) -> Any:
         w, x, y, z = quaternions_of(dst_T_src[None, :3, :3])[0].tolist()
@@ -248,7 +309,9 @@ class FoxgloveWriter:
 
     def _color_fields(self, offset: int) -> list[Any]:
         field, byte = self._messages.PackedElementField, self._uint(1)
-        return [field(name=name, offset=offset + i, type=byte) for i, name in enumerate(_COLOR_FIELDS)]
+        return [
+            field(name=name, offset=offset + i, type=byte) for i, name in enumerate(_COLOR_FIELDS)
+        ]
 
     def _uint(self, size: int) -> Any:
         types = self._messages.PackedElementFieldNumericType
@@ -260,7 +323,9 @@ def _calibration(camera: CameraModel) -> dict[str, Any]:
     models = {"pinhole": "", "fisheye": "kannala_brandt"}
     distorted = "rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob"
     given = (
-        (*camera.distortion, 0.0) if len(camera.distortion) == 4 and camera.model != "fisheye" else camera.distortion
+        (*camera.distortion, 0.0)
+        if len(camera.distortion) == 4 and camera.model != "fisheye"
+        else camera.distortion
     )
     return {
         "width": camera.width,

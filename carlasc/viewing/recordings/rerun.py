@@ -1,4 +1,5 @@
-"""A recording for the Rerun viewer (.rrd): entities, a blueprint, and two timelines, `frame` and `time`.
+"""A recording for the Rerun viewer (.rrd): entities, a blueprint, and two timelines, `frame` and
+`time`.
 
 Entities, all in right-handed axes with z up:
 
@@ -10,8 +11,8 @@ Entities, all in right-handed axes with z up:
     world/ego/points, flow, boxes
     world/ego/instances          the points of actors, in a colour for each actor
     world/ego/cameras/NAME       the image of a camera, in its frustum
-    world/ego/PANEL/CLASS        the voxels of each class: `grid`, or `prediction`, `truth` and `errors`; `actors`: by actor
-    picture                      the bird's-eye camera picture
+    world/ego/PANEL/CLASS        the voxels of each class: `grid`, or `prediction`, `truth` and
+    `errors`; `actors`: by actor picture                      the bird's-eye camera picture
 """
 
 from __future__ import annotations
@@ -48,14 +49,19 @@ _TRAIL_RADIUS_M = 0.08
 _IMAGES = 2  # cameras whose images have views of their own
 _FRUSTUM_M = 2.0  # from a camera to where its image is drawn
 _BACKGROUND = (246, 247, 249)
-_EYE, _TARGET = (-49.0, 0.0, 35.0), (-3.0, 0.0, -3.0)  # behind and above: a published grid fits in a square view
+# behind and above: a published grid fits in a square view
+_EYE, _TARGET = (
+    (-49.0, 0.0, 35.0),
+    (-3.0, 0.0, -3.0),
+)
 
 
 class PipedFile:
     """Copies the data that is written to a pipe into a file.
 
-    On a full disk, Rerun's own thread ends, and a call that waits for the thread hangs. This class always reads the pipe, so that the library
-    sees no error, and keeps the first error of writing for `check`.
+    On a full disk, Rerun's own thread ends, and a call that waits for the thread hangs. This class
+    always reads the pipe, so that the library sees no error, and keeps the first error of writing
+    for `check`.
     """
 
     def __init__(self, path: Path, begin: Callable[[str], object]) -> None:
@@ -73,7 +79,8 @@ class PipedFile:
         with TemporaryDirectory(prefix="carlasc-") as folder:
             pipe = str(Path(folder) / path.name)
             os.mkfifo(pipe)
-            descriptor = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)  # the other end can be opened from now on
+            # the other end can be opened from now on
+            descriptor = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
             try:
                 begin(pipe)
             except BaseException:
@@ -130,12 +137,17 @@ class RerunWriter:
         self._rr: Any = import_extra("rerun", "rerun")
         self._reader = reader
         self._drawn: dict[str, set[int]] = {panel.name: set() for panel in reader.panels}
-        batches = self._rr.ChunkBatcherConfig(flush_tick=timedelta(days=1))  # batches end by frames, not by time
+        # batches end by frames, not by time
+        batches = self._rr.ChunkBatcherConfig(flush_tick=timedelta(days=1))
         self._waiting = 0
-        self._recording = self._rr.RecordingStream("carlasc", recording_id=uuid4(), batcher_config=batches)
+        self._recording = self._rr.RecordingStream(
+            "carlasc", recording_id=uuid4(), batcher_config=batches
+        )
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
-        self._file = PipedFile(path, partial(self._recording.save, default_blueprint=self._blueprint()))
+        self._file = PipedFile(
+            path, partial(self._recording.save, default_blueprint=self._blueprint())
+        )
         self._recording.send_recording_name(reader.name)
         self._write_static()
 
@@ -147,21 +159,42 @@ class RerunWriter:
         for panel, grid in zip(self._reader.panels, frame.grids, strict=True):
             self._write_grid(panel, grid)
         if frame.scan is not None:
-            labels = np.zeros(len(frame.scan), np.uint16) if frame.scan.labels is None else frame.scan.labels
-            log("world/ego/points", rr.Points3D(frame.scan.points, class_ids=labels, radii=[_POINT_RADIUS_M]))
+            labels = (
+                np.zeros(len(frame.scan), np.uint16)
+                if frame.scan.labels is None
+                else frame.scan.labels
+            )
+            log(
+                "world/ego/points",
+                rr.Points3D(frame.scan.points, class_ids=labels, radii=[_POINT_RADIUS_M]),
+            )
             if (numbers := frame.scan.instances) is not None:
                 colors = palette.ACTORS.palette[palette.actor_ids(numbers[numbers > 0])]
                 points = frame.scan.points[numbers > 0]
-                log("world/ego/instances", rr.Points3D(points, colors=colors, radii=[_POINT_RADIUS_M]))
+                log(
+                    "world/ego/instances",
+                    rr.Points3D(points, colors=colors, radii=[_POINT_RADIUS_M]),
+                )
         if self._reader.has_motion:
-            log("world/ego/flow", rr.Arrows3D(origins=frame.tails, vectors=frame.vectors, colors=[palette.ARROW]))
+            log(
+                "world/ego/flow",
+                rr.Arrows3D(origins=frame.tails, vectors=frame.vectors, colors=[palette.ARROW]),
+            )
         if self._reader.has("boxes"):
             self._write_boxes(frame.boxes)
         if frame.pose is not None:
             rotation = np.roll(quaternions_of(frame.pose[None, :3, :3])[0], -1)  # x, y, z, w
             log("world/ego", rr.Transform3D(translation=frame.pose[:3, 3], quaternion=rotation))
-            ways, classes = [trail.points for trail in frame.trails], [trail.label for trail in frame.trails]
-            log("world/tracks", rr.LineStrips3D(ways, class_ids=classes, radii=[_TRAIL_RADIUS_M], show_labels=False))
+            ways, classes = (
+                [trail.points for trail in frame.trails],
+                [trail.label for trail in frame.trails],
+            )
+            log(
+                "world/tracks",
+                rr.LineStrips3D(
+                    ways, class_ids=classes, radii=[_TRAIL_RADIUS_M], show_labels=False
+                ),
+            )
         if frame.picture is not None:
             log("picture", rr.EncodedImage(contents=frame.picture, media_type="image/jpeg"))
         for photo in frame.photos:
@@ -196,22 +229,34 @@ class RerunWriter:
         car = ego_vehicle()
         corners, triangles = car.triangles()
         surface = Triangles(corners, np.repeat(car.normals, 4, axis=0), triangles.astype(np.uint32))
-        log("world/ego/vehicle", self._mesh(surface, vertex_colors=np.repeat(car.colors, 4, axis=0)))
+        log(
+            "world/ego/vehicle", self._mesh(surface, vertex_colors=np.repeat(car.colors, 4, axis=0))
+        )
         path = reader.path_of_ego()
         if len(path) > 1:
-            log("world/path", rr.LineStrips3D([path], colors=[palette.PATH], radii=[_TRAIL_RADIUS_M]))
+            log(
+                "world/path",
+                rr.LineStrips3D([path], colors=[palette.PATH], radii=[_TRAIL_RADIUS_M]),
+            )
 
     def _write_grid(self, panel: GridPanel, grid: Grid) -> None:
         """Write the voxels of each class, and clear classes that only the previous frame had."""
         rr, colors = self._rr, panel.colors.by_id
         if grid.spec.coordinates == "cylindrical":
-            drawn = {label: self._mesh(surface, albedo_factor=colors[label]) for label, surface in class_surfaces(grid)}
+            drawn = {
+                label: self._mesh(surface, albedo_factor=colors[label])
+                for label, surface in class_surfaces(grid)
+            }
         else:
             drawn = {
-                label: rr.VoxelGridMap(cells, grid.spec.voxel_size, colors=[colors[label]], translation=grid.spec.lower)
+                label: rr.VoxelGridMap(
+                    cells, grid.spec.voxel_size, colors=[colors[label]], translation=grid.spec.lower
+                )
                 for label, cells in class_cells(grid)
             }
-        drawn |= {label: rr.Clear(recursive=False) for label in self._drawn[panel.name] - set(drawn)}
+        drawn |= {
+            label: rr.Clear(recursive=False) for label in self._drawn[panel.name] - set(drawn)
+        }
         for label, content in drawn.items():
             part = rr.escape_entity_path_part(panel.colors.table.names.get(label, f"class {label}"))
             self._recording.log(f"world/ego/{panel.name}/{part}", content)
@@ -237,7 +282,9 @@ class RerunWriter:
         self._recording.log("world/ego/boxes", content)
 
     def _write_photo(self, photo: Photo) -> None:
-        """Write the image and the pose of a camera; distortion is left out, because Rerun has no model of it."""
+        """Write the image and the pose of a camera; distortion is left out, because Rerun has no
+        model of it.
+        """
         rr, camera, place = self._rr, photo.camera, photo.ego_T_camera
         name = f"world/ego/cameras/{rr.escape_entity_path_part(camera.name)}"
         lens = rr.Pinhole(
@@ -247,28 +294,42 @@ class RerunWriter:
             image_plane_distance=_FRUSTUM_M,
         )
         image = rr.EncodedImage(contents=photo.data, media_type=f"image/{photo.kind}")
-        self._recording.log(name, rr.Transform3D(translation=place[:3, 3], mat3x3=place[:3, :3]), lens, image)
+        self._recording.log(
+            name, rr.Transform3D(translation=place[:3, 3], mat3x3=place[:3, :3]), lens, image
+        )
 
     def _mesh(self, surface: Triangles, **colors: Any) -> Any:
         return self._rr.Mesh3D(
-            vertex_positions=surface.corners, vertex_normals=surface.normals, triangle_indices=surface.indices, **colors
+            vertex_positions=surface.corners,
+            vertex_normals=surface.normals,
+            triangle_indices=surface.indices,
+            **colors,
         )
 
     def _classes(self, colors: ClassColors) -> Any:
         entries = colors.entries(colors.table.names)
         unlabelled = (0, "unlabelled", palette.UNLABELLED)
-        return self._rr.AnnotationContext([unlabelled, *((entry.order, entry.name, entry.color) for entry in entries)])
+        return self._rr.AnnotationContext(
+            [unlabelled, *((entry.order, entry.name, entry.color) for entry in entries)]
+        )
 
     def _blueprint(self) -> Any:
-        """Return the views at the start: the grids side by side, the points and the picture beside or below them."""
+        """Return the views at the start: the grids side by side, the points and the picture beside
+        or below them.
+        """
         blueprint, reader = self._rr.blueprint, self._reader
         names = [panel.name for panel in reader.panels]
         grids = [
-            self._view(panel.title, ["points", "instances", *(f"{n}/**" for n in names if n != panel.name)])
+            self._view(
+                panel.title, ["points", "instances", *(f"{n}/**" for n in names if n != panel.name)]
+            )
             for panel in reader.panels
         ]
         clouds = [name for name in ("points", "instances") if reader.has(name)]
-        others = [self._view(name, [*(f"{n}/**" for n in names), *(n for n in clouds if n != name)]) for name in clouds]
+        others = [
+            self._view(name, [*(f"{n}/**" for n in names), *(n for n in clouds if n != name)])
+            for name in clouds
+        ]
         if reader.has("bev"):
             others.append(blueprint.Spatial2DView(origin="/picture", name="picture"))
         for photo in reader.read_photos(reader.frames[0])[:_IMAGES]:
@@ -285,7 +346,9 @@ class RerunWriter:
             layout,
             blueprint.BlueprintPanel(state="collapsed"),
             blueprint.SelectionPanel(state="collapsed"),
-            blueprint.TimePanel(state="collapsed", timeline="frame", play_state="paused", fps=1 / FRAME_PERIOD_S),
+            blueprint.TimePanel(
+                state="collapsed", timeline="frame", play_state="paused", fps=1 / FRAME_PERIOD_S
+            ),
         )
 
     def _view(self, name: str, hidden: list[str]) -> Any:
@@ -297,5 +360,7 @@ class RerunWriter:
             contents=["+ /world/**", *(f"- /world/ego/{entity}" for entity in hidden)],
             background=_BACKGROUND,
             line_grid=False,
-            eye_controls=blueprint.EyeControls3D(position=_EYE, look_target=_TARGET, eye_up=(0, 0, 1)),
+            eye_controls=blueprint.EyeControls3D(
+                position=_EYE, look_target=_TARGET, eye_up=(0, 0, 1)
+            ),
         )

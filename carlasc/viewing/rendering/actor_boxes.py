@@ -1,4 +1,6 @@
-"""Boxes around actors: the annotated boxes of a frame, or the tightest boxes around the points of actors; and their drawings."""
+"""Boxes around actors: the annotated boxes of a frame, or the tightest boxes around the points of
+actors; and their drawings.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ _CLOSE_M = 0.05  # nearer points count as on the side
 _ANGLES = np.deg2rad(np.arange(0, 90, 2.0))
 
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.sum(_CORNERS[a] != _CORNERS[b]) == 1]
+_EDGES = [
+    (a, b) for a in range(8) for b in range(a + 1, 8) if np.sum(_CORNERS[a] != _CORNERS[b]) == 1
+]
 
 
 def check_boxes(data: RemappedSequence) -> None:
@@ -47,7 +51,8 @@ def check_boxes(data: RemappedSequence) -> None:
 
 
 def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
-    """Return the boxes of a frame: those of the field `boxes`, or else the tightest ones around the points of each actor.
+    """Return the boxes of a frame: those of the field `boxes`, or else the tightest ones around the
+    points of each actor.
 
     Raises:
         FormatError: the boxes or the scan do not have the format.
@@ -60,10 +65,11 @@ def boxes_in(data: RemappedSequence, frame: int) -> Boxes:
 
 
 def tight_boxes(scan: Scan) -> Boxes:
-    """Return the tightest upright box around the points of each numbered actor that has at least five.
+    """Return the tightest upright box around the points of each numbered actor that has at least
+    five.
 
-    A box points in the direction of motion of its actor. The box of a static actor points along the longer side of the rectangle whose sides
-    are closest to the points, to one of its two ends.
+    A box points in the direction of motion of its actor. The box of a static actor points along the
+    longer side of the rectangle whose sides are closest to the points, to one of its two ends.
 
     Args:
         scan: with instances; with flow, boxes of moving actors have the right direction.
@@ -75,7 +81,9 @@ def tight_boxes(scan: Scan) -> Boxes:
         if len(members) < _FEWEST_POINTS:
             continue
         points = scan.points[members].astype(np.float64)
-        velocity = np.zeros(3) if scan.flow is None else scan.flow[members].astype(np.float64).mean(axis=0)
+        velocity = (
+            np.zeros(3) if scan.flow is None else scan.flow[members].astype(np.float64).mean(axis=0)
+        )
         yaw = _direction(points[:, :2], velocity)
         turned = _turned(points, yaw)
         lower, upper = turned.min(axis=0), turned.max(axis=0)
@@ -95,7 +103,9 @@ def tight_boxes(scan: Scan) -> Boxes:
 
 
 def with_boxes(drawing: Drawing, boxes: Boxes) -> Drawing:
-    """Return a drawing with the edges of boxes, and a bar on the floor of each from its middle to its front."""
+    """Return a drawing with the edges of boxes, and a bar on the floor of each from its middle to
+    its front.
+    """
     if not len(boxes.tracks):
         return drawing
     mesh = box_edges(boxes)
@@ -114,7 +124,9 @@ def _lines_of(size: NDArray[np.floating]) -> list[tuple[NDArray[np.float64], NDA
 
 
 def box_lines(boxes: Boxes) -> NDArray[np.float64]:
-    """Return (L, 2, 3) both ends of the edges of boxes, and of a bar from the middle of each to its front, metres, sensor frame."""
+    """Return (L, 2, 3) both ends of the edges of boxes, and of a bar from the middle of each to its
+    front, metres, sensor frame.
+    """
     found = [
         transform_points(pose, np.array(_lines_of(size)).reshape(-1, 3))
         for pose, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True)
@@ -142,10 +154,12 @@ def box_edges(boxes: Boxes) -> QuadMesh:
 
 
 def _direction(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
-    """Return the yaw of an actor, in radians: that of its velocity, or of the rectangle whose sides are closest to its points.
+    """Return the yaw of an actor, in radians: that of its velocity, or of the rectangle whose sides
+    are closest to its points.
 
-    A LiDAR sees one or two sides of a vehicle. The smallest rectangle around them is often tilted; the closest one is not (Zhang, Xu, Dong
-    and Dolan, "Efficient L-shape fitting for vehicle detection using laser scanners", 2017).
+    A LiDAR sees one or two sides of a vehicle. The smallest rectangle around them is often tilted;
+    the closest one is not (Zhang, Xu, Dong and Dolan, "Efficient L-shape fitting for vehicle
+    detection using laser scanners", 2017).
     """
     if np.linalg.norm(velocity[:2]) > _MIN_SPEED_M_S:
         return float(np.arctan2(velocity[1], velocity[0]))
@@ -157,7 +171,11 @@ def _direction(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> fl
         to_side = np.minimum(rectangle - lower, upper - rectangle).min(axis=1)
         closeness = float((1 / np.maximum(to_side, _CLOSE_M)).sum())
         if closeness > most:
-            best, longest, most = float(angle), bool(upper[0] - lower[0] >= upper[1] - lower[1]), closeness
+            best, longest, most = (
+                float(angle),
+                bool(upper[0] - lower[0] >= upper[1] - lower[1]),
+                closeness,
+            )
     return best if longest else best + float(np.pi / 2)
 
 

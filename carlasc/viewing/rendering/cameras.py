@@ -1,8 +1,9 @@
 """Cameras: the viewpoints of pictures.
 
-All coordinates are in the frame of the data. Only the camera depends on the handedness of that frame: in CarlaSC's left-handed frame
-(y right) the camera's right is `up x forward`, in a right-handed one (y left) it is `forward x up`. In both, the left of the vehicle is on
-the left of the picture, and no geometry is mirrored.
+All coordinates are in the frame of the data. Only the camera depends on the handedness of that
+frame: in CarlaSC's left-handed frame (y right) the camera's right is `up x forward`, in a
+right-handed one (y left) it is `forward x up`. In both, the left of the vehicle is on the left of
+the picture, and no geometry is mirrored.
 """
 
 from __future__ import annotations
@@ -32,14 +33,19 @@ _NEAREST_M = 1.0
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The viewpoint of a perspective view. Values that are None are chosen so that the whole drawing is in the picture.
+    """The viewpoint of a perspective view.
+
+    Values that are None are chosen so that the whole drawing is in the picture.
 
     Attributes:
-        azimuth_rad: direction from the target to the camera: 0 is behind the ego vehicle, positive is towards its right.
+        azimuth_rad: direction from the target to the camera: 0 is behind the ego vehicle, positive
+            is towards its right.
         elevation_rad: angle of the camera above the horizon, seen from the target.
-        distance_m: distance from the target; None takes the least distance from which everything is visible.
+        distance_m: distance from the target; None takes the least distance from which everything is
+            visible.
         target: (3,) point that the camera looks at, metres; None takes the middle of the drawing.
-        position: (3,) position of the camera, metres; azimuth, elevation and distance are then ignored.
+        position: (3,) position of the camera, metres; azimuth, elevation and distance are then
+            ignored.
         fov_rad: vertical field of view.
 
     Raises:
@@ -60,25 +66,37 @@ class Viewpoint:
             raise ArgumentError("viewpoint", expected="finite numbers", found=str(self))
         if not 0 < self.fov_rad < np.pi:
             raise ArgumentError(
-                "viewpoint", expected="a field of view between 0 and 180 degrees", found=f"{np.rad2deg(self.fov_rad):g}"
+                "viewpoint",
+                expected="a field of view between 0 and 180 degrees",
+                found=f"{np.rad2deg(self.fov_rad):g}",
             )
         if abs(self.elevation_rad) > np.pi / 2:
             raise ArgumentError(
-                "viewpoint", expected="an elevation of -90 to 90 degrees", found=f"{np.rad2deg(self.elevation_rad):g}"
+                "viewpoint",
+                expected="an elevation of -90 to 90 degrees",
+                found=f"{np.rad2deg(self.elevation_rad):g}",
             )
         if self.distance_m is not None and self.distance_m <= 0:
-            raise ArgumentError("viewpoint", expected="a distance above 0 m", found=f"{self.distance_m:g}")
+            raise ArgumentError(
+                "viewpoint", expected="a distance above 0 m", found=f"{self.distance_m:g}"
+            )
 
     @classmethod
     def parse(cls, text: str) -> Viewpoint:
         """Read "azimuth=30 elevation=20": words `key=value`, separated by spaces.
 
-        Keys are azimuth, elevation and fov (degrees), distance (metres), position and target (x,y,z in metres).
+        Keys are azimuth, elevation and fov (degrees), distance (metres), position and target (x,y,z
+        in metres).
 
         Raises:
             ArgumentError: an unknown key, or a value that is not a number.
         """
-        names = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "fov": "fov_rad", "distance": "distance_m"}
+        names = {
+            "azimuth": "azimuth_rad",
+            "elevation": "elevation_rad",
+            "fov": "fov_rad",
+            "distance": "distance_m",
+        }
         values: dict[str, Any] = {}
         for word in text.replace(";", " ").split():
             key, _, value = word.partition("=")
@@ -89,34 +107,44 @@ class Viewpoint:
             if key in ("position", "target") and len(numbers) == 3:
                 values[key] = tuple(numbers)
             elif key in names and len(numbers) == 1:
-                values[names[key]] = numbers[0] if key == "distance" else float(np.deg2rad(numbers[0]))
+                values[names[key]] = (
+                    numbers[0] if key == "distance" else float(np.deg2rad(numbers[0]))
+                )
             else:
                 raise ArgumentError(
                     "viewpoint",
-                    expected="azimuth=DEG, elevation=DEG, fov=DEG, distance=M, position=X,Y,Z or target=X,Y,Z",
+                    expected="azimuth=DEG, elevation=DEG, fov=DEG, distance=M, position=X,Y,Z or "
+                    "target=X,Y,Z",
                     found=repr(word),
                 )
         return cls(**values)
 
     def turned(self, angle_rad: float) -> Viewpoint:
-        """Return the viewpoint turned around the target by an angle, positive towards the vehicle's right.
+        """Return the viewpoint turned around the target by an angle, positive towards the vehicle's
+        right.
 
         Raises:
             ArgumentError: the viewpoint has a fixed position.
         """
         if self.position is not None:
-            raise ArgumentError("viewpoint", expected="an azimuth for an orbit", found="a fixed position")
+            raise ArgumentError(
+                "viewpoint", expected="an azimuth for an orbit", found="a fixed position"
+            )
         return replace(self, azimuth_rad=self.azimuth_rad + angle_rad)
 
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """The camera of the pictures of a scene. Without `still`, the camera moves with the ego vehicle.
+    """The camera of the pictures of a scene.
+
+    Without `still`, the camera moves with the ego vehicle.
 
     Attributes:
         view: "perspective", "bev" (bird's-eye view) or "both", side by side.
-        viewpoint: where perspective views are taken from; the default is a point behind and above the ego vehicle.
-        orbit: whether the camera circles the scene once: while the frames follow each other, or around a single frame.
+        viewpoint: where perspective views are taken from; the default is a point behind and above
+            the ego vehicle.
+        orbit: whether the camera circles the scene once: while the frames follow each other, or
+            around a single frame.
         still: whether the camera stays at one place in the world; needs poses.
 
     Raises:
@@ -130,7 +158,9 @@ class CameraOptions:
 
     def __post_init__(self) -> None:
         if self.view not in (*VIEWS, "both"):
-            raise ArgumentError("view", expected=f"{', '.join(VIEWS)} or both", found=repr(self.view))
+            raise ArgumentError(
+                "view", expected=f"{', '.join(VIEWS)} or both", found=repr(self.view)
+            )
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -145,7 +175,8 @@ class Camera:
     Attributes:
         position: (3,) metres.
         axes: (3, 3) rows right, up, forward: unit vectors in the data's frame.
-        half_height: tangent of half the vertical field of view; for an orthographic camera half the visible height, metres.
+        half_height: tangent of half the vertical field of view; for an orthographic camera half the
+            visible height, metres.
         orthographic: whether rays are parallel.
     """
 
@@ -154,18 +185,34 @@ class Camera:
     half_height: float
     orthographic: bool = False
 
-    def rays(self, width: int, height: int, rows: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return origins and directions, (n, 3) float32 each, of the rays through the pixels of some rows, row by row.
+    def rays(
+        self, width: int, height: int, rows: slice
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return origins and directions, (n, 3) float32 each, of the rays through the pixels of
+        some rows, row by row.
 
-        Directions have length 1 along the camera's forward axis, so that the distance along a ray is the depth.
+        Directions have length 1 along the camera's forward axis, so that the distance along a ray
+        is the depth.
         """
         origins, directions = np.empty((2, (rows.stop - rows.start) * width, 3), np.float32)
         step = self.footprint(height)
-        _write_rays(self.position, self.axes, step, self.orthographic, width, height, rows.start, origins, directions)
+        _write_rays(
+            self.position,
+            self.axes,
+            step,
+            self.orthographic,
+            width,
+            height,
+            rows.start,
+            origins,
+            directions,
+        )
         return origins, directions
 
     def project(self, points: ArrayLike, width: int, height: int) -> tuple[Floats, Floats, Floats]:
-        """Return pixel column, row and depth of (N, 3) points; a pinhole camera shows only points with a depth above 0."""
+        """Return pixel column, row and depth of (N, 3) points; a pinhole camera shows only points
+        with a depth above 0.
+        """
         x, y, depth = self.axes @ (np.asarray(points, np.float64) - self.position).T
         scale = height / (2 * self.half_height)
         with np.errstate(divide="ignore", invalid="ignore"):  # points with depth 0
@@ -173,18 +220,27 @@ class Camera:
             return width / 2 + x * zoom, height / 2 - y * zoom, depth
 
     def footprint(self, height: int) -> float:
-        """Return the width of a pixel in metres, at depth 1 (pinhole) or at any depth (orthographic)."""
+        """Return the width of a pixel in metres, at depth 1 (pinhole) or at any depth
+        (orthographic).
+        """
         return 2 * self.half_height / height
 
     def moved(self, dst_T_src: Transform) -> Camera:
         """Return the same camera in another frame."""
         return replace(
-            self, position=transform_points(dst_T_src, self.position), axes=rotate_vectors(dst_T_src, self.axes)
+            self,
+            position=transform_points(dst_T_src, self.position),
+            axes=rotate_vectors(dst_T_src, self.axes),
         )
 
 
 def perspective_camera(
-    extent: Floats, viewpoint: Viewpoint, aspect: float, *, axes: Axes = "left", margin: float = 0.02
+    extent: Floats,
+    viewpoint: Viewpoint,
+    aspect: float,
+    *,
+    axes: Axes = "left",
+    margin: float = 0.02,
 ) -> Camera:
     """Return the camera of a viewpoint; values that are not given are fitted to the extent.
 
@@ -199,19 +255,27 @@ def perspective_camera(
         ArgumentError: position and target of the viewpoint are equal.
     """
     tan_y = float(np.tan(viewpoint.fov_rad / 2))
-    target = np.asarray(viewpoint.target if viewpoint.target is not None else (extent.min(0) + extent.max(0)) / 2)
+    target = np.asarray(
+        viewpoint.target if viewpoint.target is not None else (extent.min(0) + extent.max(0)) / 2
+    )
     if viewpoint.position is not None:
         position = np.asarray(viewpoint.position, np.float64)
         if np.allclose(position, target):
             raise ArgumentError(
-                "viewpoint", expected="a target away from the position", found=f"both at {target.tolist()}"
+                "viewpoint",
+                expected="a target away from the position",
+                found=f"both at {target.tolist()}",
             )
         return Camera(position, _upright(target - position, axes), tan_y)
 
     side = 1.0 if axes == "left" else -1.0
     azimuth, elevation = viewpoint.azimuth_rad, viewpoint.elevation_rad
     forward = np.array(
-        [np.cos(azimuth) * np.cos(elevation), -side * np.sin(azimuth) * np.cos(elevation), -np.sin(elevation)]
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            -side * np.sin(azimuth) * np.cos(elevation),
+            -np.sin(elevation),
+        ]
     )
     rows = _upright(forward, axes, azimuth)
     if viewpoint.distance_m is not None:
@@ -225,18 +289,31 @@ def perspective_camera(
     return Camera(target - distance * rows[2], rows, tan_y)
 
 
-def birdseye_camera(extent: Floats, aspect: float, *, axes: Axes = "left", margin: float = 0.01) -> Camera:
-    """Return an orthographic camera above the extent: x points up in the picture, the vehicle's right is on the right."""
+def birdseye_camera(
+    extent: Floats, aspect: float, *, axes: Axes = "left", margin: float = 0.01
+) -> Camera:
+    """Return an orthographic camera above the extent: x points up in the picture, the vehicle's
+    right is on the right.
+    """
     lower, upper = extent.min(0), extent.max(0)
     size = np.maximum(upper - lower, 1e-3)
-    rows = np.array([[0.0, 1.0 if axes == "left" else -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    rows = np.array(
+        [[0.0, 1.0 if axes == "left" else -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
+    )
     half_height = max(size[0], size[1] / aspect) / 2 / (1 - 2 * margin)
     middle = (lower + upper) / 2
-    return Camera(np.array([middle[0], middle[1], upper[2] + 10.0]), rows, float(half_height), orthographic=True)
+    return Camera(
+        np.array([middle[0], middle[1], upper[2] + 10.0]),
+        rows,
+        float(half_height),
+        orthographic=True,
+    )
 
 
 def _upright(forward: Floats, axes: Axes, azimuth: float = 0.0) -> Floats:
-    """Return rows right, up, forward of an upright camera; if it looks straight down, its top points along `azimuth`."""
+    """Return rows right, up, forward of an upright camera; if it looks straight down, its top
+    points along `azimuth`.
+    """
     forward = forward / np.linalg.norm(forward)
     side = 1.0 if axes == "left" else -1.0
     right = side * np.cross((0.0, 0.0, 1.0), forward)
@@ -246,11 +323,15 @@ def _upright(forward: Floats, axes: Axes, azimuth: float = 0.0) -> Floats:
     return np.array([right, side * np.cross(forward, right), forward])
 
 
-def _fit(points: Floats, axes: Floats, tan_x: float, tan_y: float) -> tuple[float, tuple[float, float]]:
-    """Return the least distance, and the shift along right and up, from which all points are inside the picture.
+def _fit(
+    points: Floats, axes: Floats, tan_x: float, tan_y: float
+) -> tuple[float, tuple[float, float]]:
+    """Return the least distance, and the shift along right and up, from which all points are inside
+    the picture.
 
-    No point is nearer than `_NEAREST_M`: with a very wide field of view the camera would otherwise be at a corner of the points.
-    A point at (x, y, z) along right, up and forward is inside if |y - shift| <= tan_y (distance + z): two lines per axis.
+    No point is nearer than `_NEAREST_M`: with a very wide field of view the camera would otherwise
+    be at a corner of the points. A point at (x, y, z) along right, up and forward is inside if |y -
+    shift| <= tan_y (distance + z): two lines per axis.
     """
     x, y, z = axes @ points.T
     distances, shifts = [], []

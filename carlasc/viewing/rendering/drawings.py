@@ -1,4 +1,6 @@
-"""Drawings, the parts of a picture: a grid in the colours of its classes or of its evidence, a scan, scene flow or the errors of a prediction."""
+"""Drawings, the parts of a picture: a grid in the colours of its classes or of its evidence, a
+scan, scene flow or the errors of a prediction.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,25 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_c
 from carlasc.metrics.grids import VoxelOutcome, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
-from carlasc.viewing.colors import AFTER_CLASSES, ERRORS, ClassColors, Entry, as_color, height_colors
+from carlasc.viewing.colors import (
+    AFTER_CLASSES,
+    ERRORS,
+    ClassColors,
+    Entry,
+    as_color,
+    height_colors,
+)
 from carlasc.viewing.finding import RemappedSequence, without_invalid_points
 from carlasc.viewing.rendering.cameras import Camera
-from carlasc.viewing.rendering.meshes import QuadMesh, arrows, box, footprint, grid_mesh, join, quads
+from carlasc.viewing.rendering.meshes import (
+    QuadMesh,
+    arrows,
+    box,
+    footprint,
+    grid_mesh,
+    join,
+    quads,
+)
 from carlasc.viewing.rendering.raycasting import cast, empty_canvas, splat
 from carlasc.viewing.scene import SceneReader
 
@@ -33,7 +50,15 @@ GRID_COLORS: tuple[str, ...] = get_args(GridColor)
 _PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags"}
 _PARTS |= {"actor": "instance", "seen": "seen"}
 _KEPT_BY = {"actor": "actors", "seen": "seen"}  # options of regrid
-_SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # upper bounds of the classes of probabilities, except for the last one
+# upper bounds of the classes of probabilities, except for the last one
+_SHARES = (
+    0.6,
+    0.7,
+    0.8,
+    0.9,
+    0.95,
+    0.99,
+)
 _POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
 VELOCITY = Entry("velocity (distance in 1 s)", palette.ARROW, AFTER_CLASSES)
 _ORIGINS = (
@@ -69,7 +94,9 @@ class Drawing:
     legend: list[Entry] = field(default_factory=list)
     note: str | None = None
 
-    def render(self, camera: Camera, width: int, height: int, *, axes: Axes = "left") -> NDArray[np.uint8]:
+    def render(
+        self, camera: Camera, width: int, height: int, *, axes: Axes = "left"
+    ) -> NDArray[np.uint8]:
         """Return the picture, (H, W, 3) uint8, without legend or title.
 
         Args:
@@ -88,24 +115,30 @@ class Drawing:
 
 def grid_extent(spec: GridSpec) -> Extent:
     """Return the corners of the floor and of the ceiling of a grid."""
-    return np.concatenate([footprint(spec, height).reshape(-1, 3) for height in (spec.lower[2], spec.upper[2])]).astype(
-        np.float64
-    )
+    return np.concatenate(
+        [footprint(spec, height).reshape(-1, 3) for height in (spec.lower[2], spec.upper[2])]
+    ).astype(np.float64)
 
 
 def scan_extent(scan: Scan) -> Extent:
-    """Return the corners of a box that contains the sensor and most points, at most 40 m from the sensor."""
+    """Return the corners of a box that contains the sensor and most points, at most 40 m from the
+    sensor.
+    """
     lower, upper = np.array([-5.0, -5.0, -2.0]), np.array([5.0, 5.0, 0.0])
     if len(scan):
         lower, upper = (np.quantile(scan.points, share, axis=0) for share in (0.03, 0.97))
     side = np.array([5.0, 5.0, 0.0])  # the sensor and its surroundings are always in the picture
-    lower, upper = np.clip(np.minimum(lower, -side), -40, 40), np.clip(np.maximum(upper, side), -40, 40)
+    lower, upper = (
+        np.clip(np.minimum(lower, -side), -40, 40),
+        np.clip(np.maximum(upper, side), -40, 40),
+    )
     corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     return lower + corners * (upper - lower)
 
 
 def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawing:
-    """Return the occupied voxels of a grid, without free and unknown ones: coloured by class; by height if the data have no classes.
+    """Return the occupied voxels of a grid, without free and unknown ones: coloured by class; by
+    height if the data have no classes.
 
     Args:
         grid: the grid.
@@ -121,14 +154,18 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
     if not colors.tell_shapes(ids):
         low, high = grid.spec.lower[2], grid.spec.upper[2]
         layers = palette.height_colors(grid.spec.centers()[0, 0, :, 2], low, high)
-        voxel_colors, legend = np.broadcast_to(layers, (*grid.spec.size, 3)), palette.height_entries(low, high)
+        voxel_colors, legend = (
+            np.broadcast_to(layers, (*grid.spec.size, 3)),
+            palette.height_entries(low, high),
+        )
     else:
         voxel_colors, legend = colors.by_id[grid.labels], colors.entries(ids.tolist())
     return voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
 
 
 def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing:
-    """Return the errors of a prediction, in voxels that the ground truth knows: right, wrong class, missed or invented.
+    """Return the errors of a prediction, in voxels that the ground truth knows: right, wrong class,
+    missed or invented.
 
     Args:
         prediction: the predicted grid.
@@ -140,13 +177,25 @@ def error_drawing(prediction: Grid, truth: Grid, *, ego: bool = True) -> Drawing
     """
     outcomes = compare_grids(prediction, truth)
     colors = ClassColors(ERRORS)
-    legend = [entry._replace(order=AFTER_CLASSES + entry.order) for entry in colors.entries(ERRORS.names)]
+    legend = [
+        entry._replace(order=AFTER_CLASSES + entry.order) for entry in colors.entries(ERRORS.names)
+    ]
     empty = "no known voxel is occupied in either"
-    return voxel_drawing(truth.spec, colors.by_id[outcomes], outcomes != VoxelOutcome.NOT_COMPARED, legend, empty, ego)
+    return voxel_drawing(
+        truth.spec,
+        colors.by_id[outcomes],
+        outcomes != VoxelOutcome.NOT_COMPARED,
+        legend,
+        empty,
+        ego,
+    )
 
 
-def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Drawing:
-    """Return the points of a scan, coloured by class; by height if the data have no classes, or the palette is "height".
+def scan_drawing(
+    scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True
+) -> Drawing:
+    """Return the points of a scan, coloured by class; by height if the data have no classes, or the
+    palette is "height".
 
     Args:
         scan: the scan.
@@ -159,7 +208,11 @@ def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
     """
     points = without_invalid_points(scan)
     extent = scan_extent(points) if extent is None else extent
-    ids = np.zeros(0, np.int64) if points.labels is None else np.flatnonzero(np.bincount(points.labels))
+    ids = (
+        np.zeros(0, np.int64)
+        if points.labels is None
+        else np.flatnonzero(np.bincount(points.labels))
+    )
     if points.labels is None or not colors.tell_shapes(ids):
         low, high = float(extent[:, 2].min()), float(extent[:, 2].max())
         point_colors = palette.height_colors(points.points[:, 2], low, high)
@@ -171,11 +224,16 @@ def scan_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
         unlabelled = [Entry("unlabelled", palette.UNLABELLED, -1)] if 0 in ids else []
         point_colors, legend = by_id[points.labels], unlabelled + colors.entries(ids.tolist())
     note = None if len(points) else "the scan has no point"
-    return Drawing(extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note)
+    return Drawing(
+        extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note
+    )
 
 
-def flow_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True) -> Drawing:
-    """Return a scan with moving points in the colour of their class, static ones in grey, and an arrow for each moving actor.
+def flow_drawing(
+    scan: Scan, colors: ClassColors, *, extent: Extent | None = None, ego: bool = True
+) -> Drawing:
+    """Return a scan with moving points in the colour of their class, static ones in grey, and an
+    arrow for each moving actor.
 
     An arrow is as long as the distance that its actor moves in one second.
 
@@ -189,7 +247,12 @@ def flow_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
         FormatError: the scan has no flow, or a label is not in the class table.
     """
     if scan.flow is None:
-        raise FormatError("scan", expected="the field flow", found="none", advice="choose other contents with `what`")
+        raise FormatError(
+            "scan",
+            expected="the field flow",
+            found="none",
+            advice="choose other contents with `what`",
+        )
     points = without_invalid_points(scan)
     extent = scan_extent(points) if extent is None else extent
     flow = np.asarray(points.flow)
@@ -201,7 +264,9 @@ def flow_drawing(scan: Scan, colors: ClassColors, *, extent: Extent | None = Non
         point_colors[moving] = colors.by_id[points.labels[moving]]
         legend += colors.entries(np.unique(points.labels[moving]).tolist())
     note = None if moving.any() else "nothing moves"
-    drawing = Drawing(extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note)
+    drawing = Drawing(
+        extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note
+    )
     return with_arrows(drawing, points.select(moving))
 
 
@@ -215,10 +280,11 @@ def with_arrows(drawing: Drawing, moving: Scan | None) -> Drawing:
 
 
 def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (M, 3) start points and (M, 3) vectors of the arrows that show how actors move, in metres.
+    """Return (M, 3) start points and (M, 3) vectors of the arrows that show how actors move, in
+    metres.
 
-    There is one arrow per instance, and one per cell of 3 m for points without an instance. An arrow starts above the middle of its
-    points and is as long as the distance moved in one second.
+    There is one arrow per instance, and one per cell of 3 m for points without an instance. An
+    arrow starts above the middle of its points and is as long as the distance moved in one second.
 
     Args:
         moving: the points that move, with flow.
@@ -229,7 +295,9 @@ def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64
     keys = np.floor(moving.points[:, :2] / _ARROW_CELL_M).astype(np.int64)
     if moving.instances is not None:
         known = moving.instances > 0
-        keys[known] = np.column_stack([moving.instances[known], np.full(int(known.sum()), np.iinfo(np.int64).max)])
+        keys[known] = np.column_stack(
+            [moving.instances[known], np.full(int(known.sum()), np.iinfo(np.int64).max)]
+        )
     _, group = np.unique(keys, axis=0, return_inverse=True)
     group = group.reshape(-1)
     count = np.bincount(group)
@@ -263,12 +331,19 @@ def voxel_drawing(
         ego: whether the ego vehicle is drawn.
     """
     floor = quads(footprint(spec, spec.lower[2] - 2e-3), _FLOOR, open_sky=True)
-    meshes = [grid_mesh(spec, voxel_colors, occupied, on_floor=True), floor, *([ego_vehicle()] if ego else [])]
-    return Drawing(grid_extent(spec), join(meshes), legend=legend, note=None if occupied.any() else empty)
+    meshes = [
+        grid_mesh(spec, voxel_colors, occupied, on_floor=True),
+        floor,
+        *([ego_vehicle()] if ego else []),
+    ]
+    return Drawing(
+        grid_extent(spec), join(meshes), legend=legend, note=None if occupied.any() else empty
+    )
 
 
 def ego_vehicle() -> QuadMesh:
-    """Return a plain car under the sensor, which is mounted 0.5 m behind the middle of the car, 1.8 m above the ground.
+    """Return a plain car under the sensor, which is mounted 0.5 m behind the middle of the car, 1.8
+    m above the ground.
 
     See the format page, `docs/format.md#coordinate-frame`.
     """
@@ -300,11 +375,14 @@ def check_color(color: GridColor, reader: SceneReader) -> None:
             found=f"none in {len(missing)} of {len(frames)} frames, such as frame {missing[0]}",
             advice=""
             if color == "votes"
-            else f"make the grid again with `carlasc regrid --keep-{_KEPT_BY.get(color, 'evidence')}`",
+            else f"make the grid again with `carlasc regrid "
+            f"--keep-{_KEPT_BY.get(color, 'evidence')}`",
         )
 
 
-def evidence_drawing(data: RemappedSequence, frame: int, color: GridColor, *, ego: bool = True) -> Drawing:
+def evidence_drawing(
+    data: RemappedSequence, frame: int, color: GridColor, *, ego: bool = True
+) -> Drawing:
     """Return the occupied voxels of a grid, coloured by evidence.
 
     The legend has all classes of values, so that it is the same in all frames.
@@ -322,8 +400,14 @@ def evidence_drawing(data: RemappedSequence, frame: int, color: GridColor, *, eg
     grid = data.read_grid(frame)
     values = data.read_part(_PARTS[color], frame)
     numbers, legend = _classify(values, color)
-    colors = palette.ACTORS.palette if color == "actor" else np.array([entry.color for entry in legend], np.uint8)
-    return voxel_drawing(grid.spec, colors[numbers], grid.labels > 0, legend, "no voxel is occupied", ego)
+    colors = (
+        palette.ACTORS.palette
+        if color == "actor"
+        else np.array([entry.color for entry in legend], np.uint8)
+    )
+    return voxel_drawing(
+        grid.spec, colors[numbers], grid.labels > 0, legend, "no voxel is occupied", ego
+    )
 
 
 def evidence_legend(color: GridColor) -> list[Entry]:
@@ -334,7 +418,10 @@ def evidence_legend(color: GridColor) -> list[Entry]:
         return list(_SEEN)
     if color == "actor":
         first = palette.ACTORS.colors[2]
-        return [Entry("no actor", palette.STATIC), Entry("an actor, each in a colour of its own", first, 1)]
+        return [
+            Entry("no actor", palette.STATIC),
+            Entry("an actor, each in a colour of its own", first, 1),
+        ]
     if color == "confidence":
         names = [f"up to {_SHARES[0]:.0%}"]
         names += [f"{low * 100:.0f} to {high:.0%}" for low, high in pairwise(_SHARES)]
@@ -346,7 +433,10 @@ def evidence_legend(color: GridColor) -> list[Entry]:
         unit = "scans: " if color == "views" else "votes: "
     colors = height_colors(np.linspace(0.0, 1.0, len(names)), 0, 1)
     names[0] = unit + names[0]
-    return [Entry(name, as_color(rgb), number) for number, (name, rgb) in enumerate(zip(names, colors, strict=True))]
+    return [
+        Entry(name, as_color(rgb), number)
+        for number, (name, rgb) in enumerate(zip(names, colors, strict=True))
+    ]
 
 
 def _classify(values: NDArray[Any], color: GridColor) -> tuple[NDArray[np.int64], list[Entry]]:
@@ -354,7 +444,9 @@ def _classify(values: NDArray[Any], color: GridColor) -> tuple[NDArray[np.int64]
     legend = evidence_legend(color)
     if color == "inferred":
         seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)
-        return np.where(values & VoxelFlag.INFERRED, 3, np.where(values & VoxelFlag.CONTESTED, 2, seen)), legend
+        return np.where(
+            values & VoxelFlag.INFERRED, 3, np.where(values & VoxelFlag.CONTESTED, 2, seen)
+        ), legend
     if color == "seen":
         return np.minimum(np.bitwise_count(values), 2).astype(np.int64), legend
     if color == "actor":

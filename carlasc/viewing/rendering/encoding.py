@@ -1,4 +1,6 @@
-"""Writing pictures as PNG, GIF, MP4 and WebP (the last two with the encoder that imageio-ffmpeg includes). A file is written completely or not at all."""
+"""Writing pictures as PNG, GIF, MP4 and WebP (the last two with the encoder that imageio-ffmpeg
+includes). A file is written completely or not at all.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,18 @@ from carlasc.storage.files import write_output
 
 STILLS = (".png",)
 FILMS = (".gif", ".mp4", ".webp")
-_H264 = ("-c:v", "libx264", "-crf", "18", "-preset", "medium", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
+_H264 = (
+    "-c:v",
+    "libx264",
+    "-crf",
+    "18",
+    "-preset",
+    "medium",
+    "-pix_fmt",
+    "yuv420p",
+    "-movflags",
+    "+faststart",
+)
 _ENCODERS = {
     ".mp4": (*_H264, "-f", "mp4"),
     ".webp": ("-c:v", "libwebp_anim", "-quality", "72", "-loop", "0", "-f", "webp"),
@@ -29,12 +42,16 @@ def is_film(path: Path) -> bool:
 
 
 def encodable_size(path: Path, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the (width, height) of pictures for a file: H.264 in yuv420p needs even numbers, so odd ones grow by one pixel."""
+    """Return the (width, height) of pictures for a file: H.264 in yuv420p needs even numbers, so
+    odd ones grow by one pixel.
+    """
     width, height = size
     return (width + width % 2, height + height % 2) if path.suffix.lower() == ".mp4" else size
 
 
-def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float, dpi: float | None = None) -> None:
+def write_pictures(
+    path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float, dpi: float | None = None
+) -> None:
     """Write pictures one after the other: the first one into a PNG, all of them into a film.
 
     Args:
@@ -49,12 +66,22 @@ def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float
         CarlascError: the encoder failed; nothing is left behind.
     """
     if not 0 < fps <= 240:
-        raise ArgumentError("fps", expected="above 0 and at most 240 pictures per second", found=f"{fps:g}")
+        raise ArgumentError(
+            "fps", expected="above 0 and at most 240 pictures per second", found=f"{fps:g}"
+        )
     suffix = path.suffix.lower()
     if suffix in STILLS:
-        image, settings = import_extra("PIL.Image", "render"), {} if dpi is None else {"dpi": (dpi, dpi)}
+        image, settings = (
+            import_extra("PIL.Image", "render"),
+            {} if dpi is None else {"dpi": (dpi, dpi)},
+        )
         first = iter(pictures)
-        write_output(path, lambda f: image.fromarray(next(first)).save(f, format="PNG", compress_level=4, **settings))
+        write_output(
+            path,
+            lambda f: image.fromarray(next(first)).save(
+                f, format="PNG", compress_level=4, **settings
+            ),
+        )
     elif suffix == ".gif":
         write_output(path, lambda file: _write_gif(file, iter(pictures), fps))
     else:
@@ -64,11 +91,22 @@ def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: float
 def _write_gif(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float) -> None:
     first, rest = _to_palette(next(pictures)), (_to_palette(picture) for picture in pictures)
     hundredths = max(2, round(100 / fps))  # the unit of the format; viewers slow down below 2
-    first.save(file, format="GIF", save_all=True, append_images=rest, duration=10 * hundredths, loop=0, disposal=1)
+    first.save(
+        file,
+        format="GIF",
+        save_all=True,
+        append_images=rest,
+        duration=10 * hundredths,
+        loop=0,
+        disposal=1,
+    )
 
 
 def _to_palette(picture: NDArray[np.uint8]) -> Any:
-    """Return a picture in 256 colours. Rare colours have a weight above their frequency, so that small objects keep their colour."""
+    """Return a picture in 256 colours.
+
+    Rare colours have a weight above their frequency, so that small objects keep their colour.
+    """
     module = import_extra("PIL.Image", "render")
     packed = picture.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     colors, counts = np.unique(packed, return_counts=True)
@@ -78,15 +116,30 @@ def _to_palette(picture: NDArray[np.uint8]) -> Any:
     return module.fromarray(picture).quantize(palette=palette, dither=module.Dither.NONE)
 
 
-def _encode(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, settings: tuple[str, ...]) -> None:
-    """Encode a film into the file itself, by its name: a killed run leaves no other file, and the encoder can seek in it."""
+def _encode(
+    file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, settings: tuple[str, ...]
+) -> None:
+    """Encode a film into the file itself, by its name: a killed run leaves no other file, and the
+    encoder can seek in it.
+    """
     encoder = import_extra("imageio_ffmpeg", "render").get_ffmpeg_exe()
     with tempfile.TemporaryFile() as messages:
         picture = next(pictures)
         height, width, _ = picture.shape
         process = subprocess.Popen(
             [
-                *(encoder, "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"),
+                *(
+                    encoder,
+                    "-v",
+                    "error",
+                    "-y",
+                    "-f",
+                    "rawvideo",
+                    "-pix_fmt",
+                    "rgb24",
+                    "-s",
+                    f"{width}x{height}",
+                ),
                 *("-r", f"{fps:g}", "-i", "-", *settings, f"file:{file.name}"),
             ],
             stdin=subprocess.PIPE,
@@ -102,12 +155,21 @@ def _encode(file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, s
             raise
         if process.wait() != 0:
             messages.seek(0)
-            lines = messages.read().decode(errors="replace").strip().splitlines() or ["the encoder printed no message"]
-            raise CarlascError(encoder, problem=f"failed with exit code {process.returncode}", advice=lines[-1])
+            lines = messages.read().decode(errors="replace").strip().splitlines() or [
+                "the encoder printed no message"
+            ]
+            raise CarlascError(
+                encoder, problem=f"failed with exit code {process.returncode}", advice=lines[-1]
+            )
 
 
-def _feed(process: subprocess.Popen[bytes], first: NDArray[np.uint8], rest: Iterator[NDArray[np.uint8]]) -> None:
-    """Write pictures to the encoder's input. If the encoder ends early, its exit code is checked by the caller."""
+def _feed(
+    process: subprocess.Popen[bytes], first: NDArray[np.uint8], rest: Iterator[NDArray[np.uint8]]
+) -> None:
+    """Write pictures to the encoder's input.
+
+    If the encoder ends early, its exit code is checked by the caller.
+    """
     if process.stdin is None:
         raise CarlascError("the video encoder", expected="a pipe to its input", found="none")
     with process.stdin as pipe:

@@ -26,9 +26,11 @@ class QuadMesh:
         corners: (Q, 4, 3) float32, metres, in order around each face.
         normals: (Q, 3) float32 unit vectors, outward.
         colors: (Q, 3) uint8 RGB.
-        openness: (Q, 4) float32, 0 to 1: share of the sky that the adjacent voxels leave free at each corner.
+        openness: (Q, 4) float32, 0 to 1: share of the sky that the adjacent voxels leave free at
+            each corner.
         edges: (Q, 4) bool: whether the edge from corner i to i + 1 is drawn.
-        open_sky: (Q,) bool: whether the whole sky is assumed visible, because the face is too large for a single value.
+        open_sky: (Q,) bool: whether the whole sky is assumed visible, because the face is too large
+            for a single value.
     """
 
     corners: NDArray[np.float32]
@@ -44,18 +46,27 @@ class QuadMesh:
     def triangles(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Return vertices (4 Q, 3) and triangles (2 Q, 3): quad q is the triangles 2 q and 2 q + 1."""
         first = 4 * np.arange(len(self), dtype=np.int32)[:, None, None]
-        return self.corners.reshape(-1, 3), (first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)).reshape(-1, 3)
+        return self.corners.reshape(-1, 3), (
+            first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+        ).reshape(-1, 3)
 
 
 def join(meshes: Sequence[QuadMesh]) -> QuadMesh:
     """Return several meshes as one."""
     return QuadMesh(
-        *(np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in QuadMesh.__dataclass_fields__)
+        *(
+            np.concatenate([getattr(mesh, name) for mesh in meshes])
+            for name in QuadMesh.__dataclass_fields__
+        )
     )
 
 
-def quads(corners: ArrayLike, color: ArrayLike, *, edges: bool = False, open_sky: bool = False) -> QuadMesh:
-    """Return a mesh of (Q, 4, 3) faces with one colour or (Q, 3) colours; the order of the corners gives the normals."""
+def quads(
+    corners: ArrayLike, color: ArrayLike, *, edges: bool = False, open_sky: bool = False
+) -> QuadMesh:
+    """Return a mesh of (Q, 4, 3) faces with one colour or (Q, 3) colours; the order of the corners
+    gives the normals.
+    """
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
     normals = np.cross(points[:, 2] - points[:, 0], points[:, 3] - points[:, 1])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -71,7 +82,11 @@ def quads(corners: ArrayLike, color: ArrayLike, *, edges: bool = False, open_sky
 
 
 def grid_mesh(
-    spec: GridSpec, colors: NDArray[np.uint8], occupied: NDArray[np.bool_], *, on_floor: bool = False
+    spec: GridSpec,
+    colors: NDArray[np.uint8],
+    occupied: NDArray[np.bool_],
+    *,
+    on_floor: bool = False,
 ) -> QuadMesh:
     """Return the exposed faces of a grid's occupied cells: boxes, or wedges in a cylindrical grid.
 
@@ -79,7 +94,8 @@ def grid_mesh(
         spec: geometry of the grid.
         colors: (X, Y, Z, 3) uint8 RGB of each cell.
         occupied: (X, Y, Z) bool.
-        on_floor: whether a floor below the grid hides the lowest faces of the lowest cells, which are then left out.
+        on_floor: whether a floor below the grid hides the lowest faces of the lowest cells, which
+            are then left out.
     """
     whole = spec
     spec, occupied = split_arcs(whole, occupied)
@@ -91,7 +107,8 @@ def grid_mesh(
 
 
 def split_arcs(spec: GridSpec, values: NDArray[_Value]) -> tuple[GridSpec, NDArray[_Value]]:
-    """Return a grid with wide cylindrical cells divided into narrow ones, which are drawn flat; other grids are not changed.
+    """Return a grid with wide cylindrical cells divided into narrow ones, which are drawn flat;
+    other grids are not changed.
 
     Args:
         spec: geometry.
@@ -100,11 +117,15 @@ def split_arcs(spec: GridSpec, values: NDArray[_Value]) -> tuple[GridSpec, NDArr
     if spec.coordinates != "cylindrical":
         return spec, values
     pieces = int(np.ceil(spec.voxel_size[1] / _WIDEST_ARC_RAD))
-    return spec.with_size((spec.size[0], spec.size[1] * pieces, spec.size[2])), np.repeat(values, pieces, axis=1)
+    return spec.with_size((spec.size[0], spec.size[1] * pieces, spec.size[2])), np.repeat(
+        values, pieces, axis=1
+    )
 
 
 def surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the cells padded by one empty cell on each side; a full turn of azimuth continues on its other side."""
+    """Return the cells padded by one empty cell on each side; a full turn of azimuth continues on
+    its other side.
+    """
     solid = np.pad(occupied, 1)
     if spec.coordinates == "cylindrical" and spec.upper[1] - spec.lower[1] > 2 * np.pi - 1e-3:
         solid[:, 0], solid[:, -1] = solid[:, -2], solid[:, 1]
@@ -141,10 +162,14 @@ def _faces(
         offset[[axis, across, along]] = side, first, second
         lattice = cells + offset
         corners[:, number] = np.stack([edges[a][lattice[:, a]] for a in range(3)], axis=1)
-        openness[:, number] = _corner_openness(solid, cells + 1 + step, across, along, 2 * first - 1, 2 * second - 1)
+        openness[:, number] = _corner_openness(
+            solid, cells + 1 + step, across, along, 2 * first - 1, 2 * second - 1
+        )
     corners = spec.from_axes(corners)
 
-    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) * (2 * side - 1)
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) * (
+        2 * side - 1
+    )
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return QuadMesh(
         corners.astype(np.float32),
@@ -157,9 +182,16 @@ def _faces(
 
 
 def _corner_openness(
-    solid: NDArray[np.bool_], front: NDArray[np.int64], across: int, along: int, first: int, second: int
+    solid: NDArray[np.bool_],
+    front: NDArray[np.int64],
+    across: int,
+    along: int,
+    first: int,
+    second: int,
 ) -> NDArray[np.float32]:
-    """Return the openness of a corner of each face, from the three cells next to it in the layer in front of the face."""
+    """Return the openness of a corner of each face, from the three cells next to it in the layer in
+    front of the face.
+    """
     one, two = front.copy(), front.copy()
     one[:, across] += first
     two[:, along] += second
@@ -170,9 +202,14 @@ def _corner_openness(
     return np.array([1.0, 0.82, 0.68, 0.56], np.float32)[closed]
 
 
-def _drawn_edges(cells: NDArray[np.int64], across: int, along: int, pieces: int) -> NDArray[np.bool_]:
-    """Return which edges of a face are drawn: all except those between the flat pieces of one wide wedge."""
-    drawn = np.ones((len(cells), 4), np.bool_)  # edge 0: along low, 1: across high, 2: along high, 3: across low
+def _drawn_edges(
+    cells: NDArray[np.int64], across: int, along: int, pieces: int
+) -> NDArray[np.bool_]:
+    """Return which edges of a face are drawn: all except those between the flat pieces of one wide
+    wedge.
+    """
+    # edge 0: along low, 1: across high, 2: along high, 3: across low
+    drawn = np.ones((len(cells), 4), np.bool_)
     if pieces > 1:
         piece = cells[:, 1] % pieces
         if across == 1:
@@ -185,7 +222,8 @@ def _drawn_edges(cells: NDArray[np.int64], across: int, along: int, pieces: int)
 def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
     """Return (Q, 4, 3) faces, facing upwards, of the ground plan of a grid at a height in metres."""
     pieces = (1, 1)
-    if spec.coordinates == "cylindrical":  # several along the radius too: Embree is slow with very thin faces
+    # several along the radius too: Embree is slow with very thin faces
+    if spec.coordinates == "cylindrical":
         pieces = (16, int(np.ceil((spec.upper[1] - spec.lower[1]) / _WIDEST_ARC_RAD)))
     first, second = (np.linspace(spec.lower[a], spec.upper[a], pieces[a] + 1) for a in range(2))
     corners = [
@@ -212,14 +250,17 @@ def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 
     return quads(np.array(faces), color, edges=True, open_sky=True)
 
 
-def arrows(tails: NDArray[np.floating], vectors: NDArray[np.floating], color: ArrayLike, width: float) -> QuadMesh:
+def arrows(
+    tails: NDArray[np.floating], vectors: NDArray[np.floating], color: ArrayLike, width: float
+) -> QuadMesh:
     """Return arrows: shafts with six sides, and cones.
 
     Args:
         tails: (N, 3) start points, metres.
         vectors: (N, 3) from tail to tip, metres, none of length 0.
         color: RGB.
-        width: width of the shaft, metres; the head is three times as wide. Short arrows are thinner in proportion.
+        width: width of the shaft, metres; the head is three times as wide. Short arrows are thinner
+            in proportion.
     """
     lengths = np.linalg.norm(vectors, axis=1)[:, None]
     forward = vectors / lengths

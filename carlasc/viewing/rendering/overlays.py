@@ -1,4 +1,6 @@
-"""A grid over the photograph of a camera: for each pixel the first occupied voxel on its ray, half transparent."""
+"""A grid over the photograph of a camera: for each pixel the first occupied voxel on its ray, half
+transparent.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,13 @@ from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics import cast_rays
 from carlasc.storage.camera_files import camera_named, read_image, scan_T_camera
 from carlasc.viewing.finding import SceneSource
-from carlasc.viewing.rendering.encoding import FILMS, STILLS, encodable_size, is_film, write_pictures
+from carlasc.viewing.rendering.encoding import (
+    FILMS,
+    STILLS,
+    encodable_size,
+    is_film,
+    write_pictures,
+)
 from carlasc.viewing.rendering.render import RenderResult
 from carlasc.viewing.scene import Scene, SceneReader, as_scene
 from carlasc.viewing.targets import check_target
@@ -35,7 +43,8 @@ def overlay(
     """Draw the visible voxels of a grid over the images of a camera.
 
     Args:
-        source: a `Scene`, or anything that a scene's `source` may be. Without `frames`, a picture shows the first one, a film all.
+        source: a `Scene`, or anything that a scene's `source` may be. Without `frames`, a picture
+            shows the first one, a film all.
         camera: name of the camera.
         out: file name that ends in .png, .gif, .mp4 or .webp.
         opacity: 0 shows the photograph only, 1 the voxels only.
@@ -58,27 +67,50 @@ def overlay(
     if len(frames) > 1 and not is_film(out):
         found = f"{len(frames)} frames for {out.name}"
         raise ArgumentError(
-            "out", expected="a single frame for a PNG", found=found, advice="name a .gif, .mp4 or .webp"
+            "out",
+            expected="a single frame for a PNG",
+            found=found,
+            advice="name a .gif, .mp4 or .webp",
         )
     width, height = encodable_size(out, (model.width, model.height))
-    write_pictures(out, _pictures(reader, model, frames, opacity, (width, height)), 10.0 if fps is None else fps)
+    write_pictures(
+        out,
+        _pictures(reader, model, frames, opacity, (width, height)),
+        10.0 if fps is None else fps,
+    )
     took, path, table = time.monotonic() - started, reader.path, reader.table.name
-    return RenderResult(out, path, ("grid",), frames, len(frames), (width, height), table, took, reader.notes)
+    return RenderResult(
+        out, path, ("grid",), frames, len(frames), (width, height), table, took, reader.notes
+    )
 
 
 def _pictures(
-    reader: SceneReader, camera: CameraModel, frames: tuple[int, ...], opacity: float, size: tuple[int, int]
+    reader: SceneReader,
+    camera: CameraModel,
+    frames: tuple[int, ...],
+    opacity: float,
+    size: tuple[int, int],
 ) -> Iterator[NDArray[np.uint8]]:
     rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
     looks = camera.unproject(np.stack([columns, rows], axis=1))
     looks_somewhere = np.isfinite(looks).all(axis=1)
     for frame in frames:
-        place, grid = scan_T_camera(reader.data.sequence, camera, frame), reader.data.read_grid(frame)
+        place, grid = (
+            scan_T_camera(reader.data.sequence, camera, frame),
+            reader.data.read_grid(frame),
+        )
         if place is None:
             where, advice = f"{reader.path}: frame {frame}", "choose other frames with `frames`"
-            raise MissingDataError(where, expected=f"an image of {camera.name}", found="none", advice=advice)
+            raise MissingDataError(
+                where, expected=f"an image of {camera.name}", found="none", advice=advice
+            )
         picture, labels = read_image(reader.data.sequence, camera, frame), grid.labels.reshape(-1)
-        found, _ = cast_rays(grid.labels[None], grid.spec, place[:3, 3], rotate_vectors(place, looks[looks_somewhere]))
+        found, _ = cast_rays(
+            grid.labels[None],
+            grid.spec,
+            place[:3, 3],
+            rotate_vectors(place, looks[looks_somewhere]),
+        )
         voxels = np.full(len(looks), -1, np.int64)
         voxels[looks_somewhere] = found[0]
         voxels[(voxels >= 0) & (labels[voxels] == 0)] = -1
@@ -88,5 +120,9 @@ def _pictures(
         edge[:, 1:] |= shaped[:, 1:] != shaped[:, :-1]
         edge[1:] |= shaped[1:] != shaped[:-1]
         colors[edge] *= _EDGE
-        drawn = np.where((shaped >= 0)[..., None], picture * (1 - opacity) + colors * opacity, picture).astype(np.uint8)
-        yield np.pad(drawn, ((0, size[1] - camera.height), (0, size[0] - camera.width), (0, 0)), "edge")
+        drawn = np.where(
+            (shaped >= 0)[..., None], picture * (1 - opacity) + colors * opacity, picture
+        ).astype(np.uint8)
+        yield np.pad(
+            drawn, ((0, size[1] - camera.height), (0, size[0] - camera.width), (0, 0)), "edge"
+        )

@@ -1,8 +1,9 @@
-"""The layout of a picture: panels, their titles and the legend, without overlaps and without clipping.
+"""The layout of a picture: panels, their titles and the legend, without overlaps and without
+clipping.
 
-The layout is computed first, so that every panel is rendered at its final size. Titles are above the panels; the legend is in a column
-to the right of square panels, and in rows below wide ones. Captions, which replace titles, are below the panels.
-The font is the one that Pillow includes.
+The layout is computed first, so that every panel is rendered at its final size. Titles are above
+the panels; the legend is in a column to the right of square panels, and in rows below wide ones.
+Captions, which replace titles, are below the panels. The font is the one that Pillow includes.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class Page:
         panels: rectangle of each panel.
         titles: rectangle of each panel's title or caption; empty if there are none.
         entry_boxes: rectangle of each entry of the legend: a swatch and a name.
-        entries: the legend. Entries without space are left out; the last entry then gives their number.
+        entries: the legend. Entries without space are left out; the last entry then gives their
+            number.
     """
 
     size: tuple[int, int]
@@ -75,7 +77,8 @@ def plan_page(
         titled: whether they have titles.
         legend: entries of the legend; empty for no legend.
         aspect: preferred width over height of a panel.
-        captions: texts below the panels instead of titles, in as many lines as needed. Empty for none.
+        captions: texts below the panels instead of titles, in as many lines as needed. Empty for
+            none.
         columns: number of panels in a row; None takes the number with which panels are largest.
         font_size: pixels; None takes one by the size of the picture.
 
@@ -103,7 +106,10 @@ def plan_page(
             left, right = left + gap, left + max(gap + 1, area.width // columns - gap)
             bottom = top + area.height // rows
         else:
-            left, right = left + (gap if column else 0), right - (gap if column + 1 < columns else 0)
+            left, right = (
+                left + (gap if column else 0),
+                right - (gap if column + 1 < columns else 0),
+            )
         width, height = max(1, right - left), max(1, bottom - top - title_height)
         title, panel = (height, 0) if captions else (0, title_height)
         titles.append(Box(area.x + left, area.y + top + title, right - left, title_height))
@@ -142,7 +148,11 @@ def draw_page(
     for box, title in zip(page.titles, titles, strict=False):
         if wrapped:
             for number, text in enumerate(wrap_text(title, font, box.width)):
-                top = box.y + round(page.font_size * 0.4) + (number + 0.5) * line_height(page.font_size)
+                top = (
+                    box.y
+                    + round(page.font_size * 0.4)
+                    + (number + 0.5) * line_height(page.font_size)
+                )
                 draw.text((box.x + box.width / 2, top), text, INK, font, anchor="mm")
             continue
         text = shorten(title, font, box.width - 8)
@@ -150,14 +160,21 @@ def draw_page(
     for box, note in zip(page.panels, notes, strict=False):
         if note:
             text = shorten(note, font, box.width - 8)
-            draw.text((box.x + box.width / 2, box.y + box.height / 2), text, FAINT, font, anchor="mm")
+            draw.text(
+                (box.x + box.width / 2, box.y + box.height / 2), text, FAINT, font, anchor="mm"
+            )
     for entry, box in zip(page.entries, page.entry_boxes, strict=True):
         draw_entry(draw, font, page.font_size, entry, box.x, box.y + box.height / 2)
     return np.asarray(image)
 
 
 def _place_legend(
-    size: tuple[int, int], font_size: int, entries: list[Entry], panels: int, aspect: float, wanted: int | None
+    size: tuple[int, int],
+    font_size: int,
+    entries: list[Entry],
+    panels: int,
+    aspect: float,
+    wanted: int | None,
 ) -> tuple[list[Entry], list[tuple[int, int]], Box]:
     """Return the entries with space, their positions, and the rest of the page for the panels."""
     width, height = size
@@ -168,16 +185,28 @@ def _place_legend(
     font, pad = font_of(font_size), font_size
     widest = max(entry_width(entry, font, font_size) for entry in entries)
     if columns * rows > panels:  # the last cell of the tiling is free
-        room = Box(width - width // columns, height - height // rows, width // columns, height // rows)
-        if _legend_columns(len(entries), room.height - 2 * pad, font_size) * (widest + pad) + pad <= room.width:
+        room = Box(
+            width - width // columns, height - height // rows, width // columns, height // rows
+        )
+        if (
+            _legend_columns(len(entries), room.height - 2 * pad, font_size) * (widest + pad) + pad
+            <= room.width
+        ):
             return entries, _place_in_columns(room, font_size, len(entries), widest), page
-    picture = min(round(aspect * columns / rows * height), width)  # the largest width that the panels can have
+    # the largest width that the panels can have
+    picture = min(round(aspect * columns / rows * height), width)
     beside = _legend_columns(len(entries), height - 2 * pad, font_size) * (widest + pad) + pad
-    if picture + beside <= width or (aspect * columns / rows <= 1.2 and beside <= 0.3 * width < 0.5 * height):
+    if picture + beside <= width or (
+        aspect * columns / rows <= 1.2 and beside <= 0.3 * width < 0.5 * height
+    ):
         left = max(0, width - picture - beside) // 2
         picture = min(picture, width - beside)
         room = Box(left + picture, 0, beside, height)
-        return entries, _place_in_columns(room, font_size, len(entries), widest), Box(left, 0, picture, height)
+        return (
+            entries,
+            _place_in_columns(room, font_size, len(entries), widest),
+            Box(left, 0, picture, height),
+        )
     return _place_below(size, font_size, entries)
 
 
@@ -186,8 +215,12 @@ def _legend_columns(entries: int, height: int, font_size: int) -> int:
     return -(-entries // max(1, height // line_height(font_size)))
 
 
-def _place_in_columns(room: Box, font_size: int, entries: int, widest: int) -> list[tuple[int, int]]:
-    """Return positions of all entries, in columns in the middle of a rectangle that is large enough."""
+def _place_in_columns(
+    room: Box, font_size: int, entries: int, widest: int
+) -> list[tuple[int, int]]:
+    """Return positions of all entries, in columns in the middle of a rectangle that is large
+    enough.
+    """
     pad, line = font_size, line_height(font_size)
     columns = _legend_columns(entries, room.height - 2 * pad, font_size)
     rows = -(-entries // columns)
@@ -199,7 +232,9 @@ def _place_in_columns(room: Box, font_size: int, entries: int, widest: int) -> l
 def _place_below(
     size: tuple[int, int], font_size: int, entries: list[Entry]
 ) -> tuple[list[Entry], list[tuple[int, int]], Box]:
-    """Place entries in centred rows at the bottom, in at most 40 % of the page; the last entry counts those left out."""
+    """Place entries in centred rows at the bottom, in at most 40 % of the page; the last entry
+    counts those left out.
+    """
     width, height = size
     font, pad, line = font_of(font_size), font_size, line_height(font_size)
     rows_allowed = max(1, int(0.4 * height) // line)
@@ -222,8 +257,12 @@ def _place_below(
     return shown, positions, Box(0, 0, width, max(1, top - pad // 2))
 
 
-def _tiling(width: int, height: int, panels: int, aspect: float, wanted: int | None) -> tuple[int, int]:
-    """Return the given number of columns and its rows; by default those with the largest panels, and among equal ones the most columns."""
+def _tiling(
+    width: int, height: int, panels: int, aspect: float, wanted: int | None
+) -> tuple[int, int]:
+    """Return the given number of columns and its rows; by default those with the largest panels,
+    and among equal ones the most columns.
+    """
 
     def scale(columns: int) -> float:
         rows = -(-panels // columns)
@@ -258,7 +297,9 @@ def shorten(text: str, font: Any, room: float) -> str:
 
 
 def wrap_text(text: str, font: Any, room: float) -> list[str]:
-    """Return the lines of a text that fit into a width in pixels, at most `MOST_LINES`; the last one is shortened if needed."""
+    """Return the lines of a text that fit into a width in pixels, at most `MOST_LINES`; the last
+    one is shortened if needed.
+    """
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".strip()
@@ -285,7 +326,8 @@ def wrap_entries(widths: Sequence[int], room: int, gap: int) -> list[list[int]]:
     fewest = len(_fill(widths, room, gap))
     limits = range(max(widths), room, 4)
     return next(
-        (rows for limit in limits if len(rows := _fill(widths, limit, gap)) == fewest), _fill(widths, room, gap)
+        (rows for limit in limits if len(rows := _fill(widths, limit, gap)) == fewest),
+        _fill(widths, room, gap),
     )
 
 
@@ -302,12 +344,16 @@ def _fill(widths: Sequence[int], limit: int, gap: int) -> list[list[int]]:
 
 
 def draw_entry(draw: Any, font: Any, size: int, entry: Entry, left: int, middle: float) -> None:
-    """Draw an entry of a legend, with its left edge and its vertical middle at a position in pixels."""
+    """Draw an entry of a legend, with its left edge and its vertical middle at a position in
+    pixels.
+    """
     swatch = round(size * 0.95)
     top = round(middle - swatch / 2)
     if entry.color != NO_SWATCH:
         outline = tuple(round(value * 0.7) for value in entry.color)
-        draw.rounded_rectangle((left, top, left + swatch, top + swatch), max(2, size // 6), entry.color, outline)
+        draw.rounded_rectangle(
+            (left, top, left + swatch, top + swatch), max(2, size // 6), entry.color, outline
+        )
     draw.text((left + swatch + round(size * 0.45), middle), entry.name, INK, font, anchor="lm")
 
 
@@ -317,7 +363,8 @@ def draw_legend(entries: Sequence[Entry], font_size: int, most_width: int) -> ND
     Args:
         entries: at least one.
         font_size: pixels.
-        most_width: the width in pixels that rows may have. An entry that is wider has a row of its own.
+        most_width: the width in pixels that rows may have. An entry that is wider has a row of its
+            own.
 
     Returns:
         (height, width, 3) uint8 RGB.

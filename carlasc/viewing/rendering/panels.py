@@ -46,14 +46,14 @@ class FrameRenderer:
 
     Attributes:
         reader: reads the scene; its `contents` are drawn side by side.
-        camera: the camera for each of the contents. A camera that circles the scene has one distance, from which the whole scene is visible
-            from each side.
+        camera: the camera for each of the contents. A camera that circles the scene has one
+            distance, from which the whole scene is visible from each side.
         extent: the extent of pictures of scans, the same in all frames.
         ego: whether the ego vehicle is drawn.
         color: what the colours of the grid mean.
         boxes: whether boxes around actors are drawn.
-        fixed_view: for a camera that does not follow the vehicle: the extent to show, and `world_T_view`, the frame of that extent; or
-            None.
+        fixed_view: for a camera that does not follow the vehicle: the extent to show, and
+            `world_T_view`, the frame of that extent; or None.
     """
 
     reader: SceneReader
@@ -81,7 +81,15 @@ class FrameRenderer:
             MissingDataError: the camera stays in place, and the sequence has no poses.
         """
         extent = _scan_extent_in(reader)
-        return cls(reader, camera, extent, ego, color, boxes, _view_of_drive(reader, extent) if camera.still else None)
+        return cls(
+            reader,
+            camera,
+            extent,
+            ego,
+            color,
+            boxes,
+            _view_of_drive(reader, extent) if camera.still else None,
+        )
 
     def panels(self, frame: int) -> list[Panel]:
         """Return the panels of a frame: each of the scene's contents from each of the views."""
@@ -89,7 +97,10 @@ class FrameRenderer:
         for content in contents:
             drawing = self.draw(content, frame)
             title = self.title(content) if len(contents) > 1 else ""
-            panels += [Panel(drawing, view, title, self._view_of(drawing, view, frame)) for view in self.camera.views]
+            panels += [
+                Panel(drawing, view, title, self._view_of(drawing, view, frame))
+                for view in self.camera.views
+            ]
         return panels
 
     def draw(self, content: str, frame: int) -> Drawing:
@@ -105,14 +116,24 @@ class FrameRenderer:
     def _draw(self, content: str, frame: int) -> Drawing:
         reader, colors = self.reader, self.reader.colors
         if content == "scan":
-            return scan_drawing(reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego)
+            return scan_drawing(
+                reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego
+            )
         if content == "flow":
-            return flow_drawing(reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego)
+            return flow_drawing(
+                reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego
+            )
         if content == "errors":
-            return error_drawing(reader.data.read_grid(frame), self._grid_of("truth").read_grid(frame), ego=self.ego)
+            return error_drawing(
+                reader.data.read_grid(frame), self._grid_of("truth").read_grid(frame), ego=self.ego
+            )
         if content == "grid" and self.color != "class":
             drawing = evidence_drawing(reader.data, frame, self.color, ego=self.ego)
-            return with_arrows(drawing, reader.read_motion(frame, None)) if self.color == "actor" else drawing
+            return (
+                with_arrows(drawing, reader.read_motion(frame, None))
+                if self.color == "actor"
+                else drawing
+            )
         return grid_drawing(self._grid_of(content).read_grid(frame), colors, ego=self.ego)
 
     def legend_of(self, frame: int) -> list[Entry]:
@@ -123,9 +144,13 @@ class FrameRenderer:
                 legends.append(evidence_legend(self.color))
                 if self.color == "actor" and self.reader.has(f"{self.reader.data.grid}/velocity"):
                     legends.append([VELOCITY])
-            elif content in ("grid", "truth") and colors.palette != "height":  # without building the mesh
+            elif (
+                content in ("grid", "truth") and colors.palette != "height"
+            ):  # without building the mesh
                 labels = self._grid_of(content).read_grid(frame).labels
-                legends.append(colors.entries(np.flatnonzero(np.bincount(labels.reshape(-1))).tolist()))
+                legends.append(
+                    colors.entries(np.flatnonzero(np.bincount(labels.reshape(-1))).tolist())
+                )
             else:
                 legends.append(self._draw(content, frame).legend)
         if self.boxes:
@@ -137,7 +162,9 @@ class FrameRenderer:
         return self.reader.data if content == "grid" or truth is None else truth
 
     def _view_of(self, drawing: Drawing, view: View, frame: int) -> tuple[Extent, Transform] | None:
-        """Return the extent to show and `drawing_T_view`, or None if the camera is fitted to the drawing."""
+        """Return the extent to show and `drawing_T_view`, or None if the camera is fitted to the
+        drawing.
+        """
         orbits = self.camera.orbit and view == "perspective"
         if self.fixed_view is None:
             return (_swept_extent(drawing.extent), np.eye(4)) if orbits else None
@@ -153,7 +180,9 @@ class FrameRenderer:
 
 
 def _scan_extent_in(reader: SceneReader) -> Extent:
-    """Return the extent of pictures of scans in all frames: the grid beside them, or most of the first scan."""
+    """Return the extent of pictures of scans in all frames: the grid beside them, or most of the
+    first scan.
+    """
     if {"grid", "errors"} & set(reader.contents):
         return grid_extent(reader.data.spec)
     if "truth" in reader.contents and reader.truth is not None:
@@ -162,7 +191,8 @@ def _scan_extent_in(reader: SceneReader) -> Extent:
 
 
 def _view_of_drive(reader: SceneReader, extent: Extent) -> tuple[Extent, Transform]:
-    """Return the extent for a camera that does not follow the vehicle: a box around the extents of all frames.
+    """Return the extent for a camera that does not follow the vehicle: a box around the extents of
+    all frames.
 
     Returns:
         (8, 3) corners of the box in the frame of the middle pose, and `world_T_middle`.
@@ -173,10 +203,15 @@ def _view_of_drive(reader: SceneReader, extent: Extent) -> tuple[Extent, Transfo
     """
     world_T_middle = _pose_of(reader, reader.frames[len(reader.frames) // 2])
     middle_T_world = np.linalg.inv(world_T_middle)
-    seen = [transform_points(middle_T_world @ _pose_of(reader, frame), extent) for frame in reader.frames]
+    seen = [
+        transform_points(middle_T_world @ _pose_of(reader, frame), extent)
+        for frame in reader.frames
+    ]
     points = np.concatenate(seen)
     box = np.array([points.min(0), points.max(0)])
-    corners = np.array([(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    corners = np.array(
+        [(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    )
     return corners, world_T_middle
 
 
@@ -184,19 +219,26 @@ def _pose_of(reader: SceneReader, frame: int) -> Transform:
     pose = reader.read_pose(frame)
     if pose is None:
         raise MissingDataError(
-            reader.path, expected=layout.POSES, found="none", advice="let the camera follow the vehicle"
+            reader.path,
+            expected=layout.POSES,
+            found="none",
+            advice="let the camera follow the vehicle",
         )
     return pose
 
 
 def _swept_extent(extent: Extent) -> Extent:
-    """Return the rims of the upright cylinder around an extent, which looks the same from every side."""
+    """Return the rims of the upright cylinder around an extent, which looks the same from every
+    side.
+    """
     lower, upper = extent.min(0), extent.max(0)
     middle = (lower + upper) / 2
     radius = np.linalg.norm((extent - middle)[:, :2], axis=1).max()
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     rim = middle[:2] + radius * np.column_stack([np.cos(angles), np.sin(angles)])
-    return np.concatenate([np.column_stack([rim, np.full(len(rim), z)]) for z in (lower[2], upper[2])])
+    return np.concatenate(
+        [np.column_stack([rim, np.full(len(rim), z)]) for z in (lower[2], upper[2])]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +292,8 @@ class PictureRenderer:
 
 
 def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell]]:
-    """Return the cells of each picture: one frame of each source for a film, otherwise all frames of each source.
+    """Return the cells of each picture: one frame of each source for a film, otherwise all frames
+    of each source.
 
     Raises:
         ArgumentError: sources of different handedness, or too many panels.
@@ -258,25 +301,42 @@ def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell
     """
     axes = {renderer.reader.axes for renderer in renderers}
     if len(axes) > 1:
-        raise ArgumentError("source", expected="sources with the same axes", found="left-handed and right-handed ones")
+        raise ArgumentError(
+            "source",
+            expected="sources with the same axes",
+            found="left-handed and right-handed ones",
+        )
     if film:
-        frames = [frame for frame in renderers[0].reader.frames if all(frame in r.reader.frames for r in renderers)]
+        frames = [
+            frame
+            for frame in renderers[0].reader.frames
+            if all(frame in r.reader.frames for r in renderers)
+        ]
         if not frames:
             where, advice = renderers[0].reader.path, "choose others with `frames`"
-            raise MissingDataError(where, expected="frames that all sources have", found="none", advice=advice)
+            raise MissingDataError(
+                where, expected="frames that all sources have", found="none", advice=advice
+            )
         pictures = [[Cell(renderer, frame) for renderer in renderers] for frame in frames]
     else:
-        pictures = [[Cell(renderer, frame) for renderer in renderers for frame in renderer.reader.frames]]
+        pictures = [
+            [Cell(renderer, frame) for renderer in renderers for frame in renderer.reader.frames]
+        ]
     count = len(_parts_of(pictures[0]))
     if count > MOST_PANELS:
         raise ArgumentError(
-            "frames", expected=f"at most {MOST_PANELS} panels", found=str(count), advice="choose fewer with `every`"
+            "frames",
+            expected=f"at most {MOST_PANELS} panels",
+            found=str(count),
+            advice="choose fewer with `every`",
         )
     return pictures
 
 
 def columns_of(cells: Sequence[Cell]) -> int | None:
-    """Return the panels in a row: those of one source if there are several sources with several panels; otherwise None."""
+    """Return the panels in a row: those of one source if there are several sources with several
+    panels; otherwise None.
+    """
     sources = len({id(cell.renderer) for cell in cells})
     each = len(_parts_of(cells)) // sources
     return each if sources > 1 and each > 1 else None
@@ -287,7 +347,8 @@ def caption_panels(cells: Sequence[Cell], texts: Sequence[str], film: bool) -> t
 
     Args:
         cells: the cells of the panels.
-        texts: one for each panel; empty takes the differences between the panels: sequence, grid, frame, content and view.
+        texts: one for each panel; empty takes the differences between the panels: sequence, grid,
+            frame, content and view.
         film: whether the frames are those of a film, which are not named.
 
     Raises:
@@ -295,12 +356,20 @@ def caption_panels(cells: Sequence[Cell], texts: Sequence[str], film: bool) -> t
     """
     parts = _parts_of(cells)
     if texts and len(texts) != len(parts):
-        raise ArgumentError("captions", expected=f"one for each of the {len(parts)} panels", found=str(len(texts)))
+        raise ArgumentError(
+            "captions", expected=f"one for each of the {len(parts)} panels", found=str(len(texts))
+        )
     if not texts:
         rows = [row[:2] + row[3:] for row in parts] if film else parts
-        differing = [column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1]
+        differing = [
+            column for column in range(len(rows[0])) if len({row[column] for row in rows}) > 1
+        ]
         texts = [", ".join(row[column] for column in differing if row[column]) for row in rows]
-    letters = [*ascii_lowercase, *map("".join, product(ascii_lowercase, repeat=2))]  # a, b, ... z, aa, ab, ...
+    # a, b, ... z, aa, ab, ...
+    letters = [
+        *ascii_lowercase,
+        *map("".join, product(ascii_lowercase, repeat=2)),
+    ]
     return tuple(f"({letter}) {text}".strip() for letter, text in zip(letters, texts, strict=False))
 
 

@@ -17,7 +17,13 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, check_choice
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ClassColors, Entry, PaletteName, merge_legends
-from carlasc.viewing.rendering.cameras import VIEWS, View, Viewpoint, birdseye_camera, perspective_camera
+from carlasc.viewing.rendering.cameras import (
+    VIEWS,
+    View,
+    Viewpoint,
+    birdseye_camera,
+    perspective_camera,
+)
 from carlasc.viewing.rendering.drawings import (
     Drawing,
     Extent,
@@ -39,7 +45,8 @@ class Panel:
         drawing: the drawing.
         view: "perspective" or "bev" (bird's-eye view).
         title: line above the panel, or its caption; "" for none.
-        fixed_view: for a camera that is not fitted to the drawing: the extent to show, and `drawing_T_view`, the frame of that extent.
+        fixed_view: for a camera that is not fitted to the drawing: the extent to show, and
+            `drawing_T_view`, the frame of that extent.
     """
 
     drawing: Drawing
@@ -63,11 +70,15 @@ def draw_panels(
 
     Args:
         panels: the panels.
-        viewpoint: where perspective views are taken from; None takes a point behind and above the ego vehicle.
+        viewpoint: where perspective views are taken from; None takes a point behind and above the
+            ego vehicle.
         size: (width, height) of the whole picture, pixels.
-        legend: whether there is a legend; or its entries, so that all pictures of a film have the same legend.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
-        captioned: whether titles are captions: below the panels, in as many lines as needed. All panels then have one size.
+        legend: whether there is a legend; or its entries, so that all pictures of a film have the
+            same legend.
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
+            left).
+        captioned: whether titles are captions: below the panels, in as many lines as needed. All
+            panels then have one size.
         columns: number of panels in a row; None takes the number with which panels are largest.
         font_size: pixels; None takes one by the size of the picture.
 
@@ -85,7 +96,9 @@ def draw_panels(
     for panel in panels:
         check_choice("view", panel.view, VIEWS)
     entries = (
-        (merge_legends([p.drawing.legend for p in panels]) if legend else []) if isinstance(legend, bool) else legend
+        (merge_legends([p.drawing.legend for p in panels]) if legend else [])
+        if isinstance(legend, bool)
+        else legend
     )
     titles = [panel.title for panel in panels]
     page = plan_page(
@@ -98,8 +111,13 @@ def draw_panels(
         columns=columns,
         font_size=font_size,
     )
-    pictures = [_draw(panel, page, number, viewpoint or Viewpoint(), axes) for number, panel in enumerate(panels)]
-    return draw_page(page, pictures, titles, [panel.drawing.note for panel in panels], wrapped=captioned)
+    pictures = [
+        _draw(panel, page, number, viewpoint or Viewpoint(), axes)
+        for number, panel in enumerate(panels)
+    ]
+    return draw_page(
+        page, pictures, titles, [panel.drawing.note for panel in panels], wrapped=captioned
+    )
 
 
 def render_grid(
@@ -121,11 +139,13 @@ def render_grid(
         grid: Cartesian or cylindrical.
         table: class table of its labels.
         view: "perspective" or "bev" (bird's-eye view).
-        viewpoint: where a perspective view is taken from; None takes a point behind and above the ego vehicle.
+        viewpoint: where a perspective view is taken from; None takes a point behind and above the
+            ego vehicle.
         size: (width, height), pixels.
         palette: "class", "colorblind" or "height".
         legend: whether there is a legend, of the classes in the grid.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
+            left).
         title: a line above the picture; "" for none.
         ego: whether a plain car is drawn at the sensor.
 
@@ -138,7 +158,9 @@ def render_grid(
         DependencyError: Pillow or Embree is not installed.
     """
     drawing = grid_drawing(grid, ClassColors(table, palette), ego=ego)
-    return draw_panels([Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, axes=axes)
+    return draw_panels(
+        [Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, axes=axes
+    )
 
 
 def render_scan(
@@ -156,20 +178,24 @@ def render_scan(
     flow: bool = False,
     extent: Extent | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw the points of a scan, coloured by class (by height if they have no labels), or their scene flow.
+    """Draw the points of a scan, coloured by class (by height if they have no labels), or their
+    scene flow.
 
     Args:
         scan: in the frame of the sensor.
         table: class table of its labels.
         view: "perspective" or "bev" (bird's-eye view).
-        viewpoint: where a perspective view is taken from; None takes a point behind and above the ego vehicle.
+        viewpoint: where a perspective view is taken from; None takes a point behind and above the
+            ego vehicle.
         size: (width, height), pixels.
         palette: "class", "colorblind" or "height".
         legend: whether there is a legend.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
+            left).
         title: a line above the picture; "" for none.
         ego: whether a plain car is drawn at the sensor.
-        flow: draw static points in grey, moving ones in colour, with an arrow as long as the distance moved in one second.
+        flow: draw static points in grey, moving ones in colour, with an arrow as long as the
+            distance moved in one second.
         extent: (M, 3) points, metres, that the camera shows; None shows most of the scan.
 
     Returns:
@@ -182,7 +208,9 @@ def render_scan(
     """
     draw = flow_drawing if flow else scan_drawing
     drawing = draw(scan, ClassColors(table, palette), extent=extent, ego=ego)
-    return draw_panels([Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, axes=axes)
+    return draw_panels(
+        [Panel(drawing, view, title)], viewpoint=viewpoint, size=size, legend=legend, axes=axes
+    )
 
 
 def render_comparison(
@@ -199,7 +227,8 @@ def render_comparison(
     axes: Axes = "left",
     ego: bool = True,
 ) -> NDArray[np.uint8]:
-    """Draw a prediction beside the ground truth and, with `errors`, its errors: right, wrong class, missed or invented.
+    """Draw a prediction beside the ground truth and, with `errors`, its errors: right, wrong class,
+    missed or invented.
 
     Args:
         prediction: a grid with the geometry of the truth.
@@ -207,11 +236,13 @@ def render_comparison(
         table: class table of the labels of both grids.
         errors: whether a panel shows the errors.
         view: "perspective" or "bev" (bird's-eye view).
-        viewpoint: where perspective views are taken from; None takes a point behind and above the ego vehicle.
+        viewpoint: where perspective views are taken from; None takes a point behind and above the
+            ego vehicle.
         size: (width, height) of the whole picture, pixels.
         palette: "class", "colorblind" or "height".
         legend: whether there is a legend.
-        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the left).
+        axes: handedness of the data: "left" (CarlaSC: y to the right) or "right" (KITTI: y to the
+            left).
         ego: whether a plain car is drawn at the sensor.
 
     Returns:
@@ -219,7 +250,8 @@ def render_comparison(
 
     Raises:
         FormatError: a label is not in the class table.
-        ArgumentError: the grids differ in their geometry; or an impossible size, view, palette or value of `axes`.
+        ArgumentError: the grids differ in their geometry; or an impossible size, view, palette or
+            value of `axes`.
         DependencyError: Pillow or Embree is not installed.
     """
     colors = ClassColors(table, palette)
@@ -232,7 +264,9 @@ def render_comparison(
     return draw_panels(panels, viewpoint=viewpoint, size=size, legend=legend, axes=axes)
 
 
-def _draw(panel: Panel, page: Page, number: int, viewpoint: Viewpoint, axes: Axes) -> NDArray[np.uint8]:
+def _draw(
+    panel: Panel, page: Page, number: int, viewpoint: Viewpoint, axes: Axes
+) -> NDArray[np.uint8]:
     box = page.panels[number]
     aspect = box.width / box.height
     extent = panel.drawing.extent if panel.fixed_view is None else panel.fixed_view[0]

@@ -1,8 +1,10 @@
-"""Rasterizing: the visible face of a mesh at each sample of a picture, by filling triangles into a depth buffer.
+"""Rasterizing: the visible face of a mesh at each sample of a picture, by filling triangles into a
+depth buffer.
 
-The result equals that of a ray through each sample, at a fraction of its cost. The ray d hits the triangle (A, B, C), relative to the
-camera, if d = a A + b B + c C with a, b and c of one sign, also for triangles that reach behind the camera. Two triangles that share an
-edge compute the same number for it with opposite signs, so that no sample is between them.
+The result equals that of a ray through each sample, at a fraction of its cost. The ray d hits the
+triangle (A, B, C), relative to the camera, if d = a A + b B + c C with a, b and c of one sign, also
+for triangles that reach behind the camera. Two triangles that share an edge compute the same number
+for it with opposite signs, so that no sample is between them.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ _NEAR_M = 1e-3  # a pinhole camera shows nothing nearer
 
 
 def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -> NDArray[np.int32]:
-    """Return the number of the triangle that each sample shows, (height, width) int32; -1 where there is none.
+    """Return the number of the triangle that each sample shows, (height, width) int32; -1 where
+    there is none.
 
     A sample that is exactly on the edge of two faces shows the later one.
 
@@ -33,12 +36,16 @@ def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -
     nearness = np.full((height, width), -np.inf if camera.orthographic else 0.0, np.float32)
     corners = (mesh.corners.astype(np.float64) - camera.position) @ camera.axes.T
     step = camera.footprint(height)
-    x, y = (np.arange(width) + 0.5 - width / 2) * step, (height / 2 - np.arange(height) - 0.5) * step
-    if (
-        camera.orthographic
-    ):  # seen from above, whole rows of samples are on edges of voxels: their rays begin at float32 numbers
+    x, y = (
+        (np.arange(width) + 0.5 - width / 2) * step,
+        (height / 2 - np.arange(height) - 0.5) * step,
+    )
+    # seen from above, whole rows of samples are on edges of voxels: their rays begin at float32
+    # numbers
+    if camera.orthographic:
         x, y = (
-            ((camera.position + offsets[:, None] * axis).astype(np.float32) - camera.position) @ axis
+            ((camera.position + offsets[:, None] * axis).astype(np.float32) - camera.position)
+            @ axis
             for offsets, axis in ((x, camera.axes[0]), (y, camera.axes[1]))
         )
     _fill(corners, x, y, step, camera.orthographic, seen, nearness)
@@ -47,7 +54,10 @@ def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -
 
 @cached
 def _fill(corners, xs, ys, step, flat, seen, nearness):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    """Fill the triangles of quads. `nearness` is 1 / depth for a pinhole camera, -depth for an orthographic one: both are linear."""
+    """Fill the triangles of quads.
+
+    `nearness` is 1 / depth for a pinhole camera, -depth for an orthographic one: both are linear.
+    """
     height, width = seen.shape
     middle_x, middle_y = width / 2 - 0.5, height / 2 - 0.5
     for quad in range(len(corners)):
@@ -66,7 +76,11 @@ def _fill(corners, xs, ys, step, flat, seen, nearness):  # type: ignore[no-untyp
                 continue
             depths = first[2], second[2], third[2]
             if flat:
-                first, second, third = (first[0], first[1], 1.0), (second[0], second[1], 1.0), (third[0], third[1], 1.0)
+                first, second, third = (
+                    (first[0], first[1], 1.0),
+                    (second[0], second[1], 1.0),
+                    (third[0], third[1], 1.0),
+                )
             ax, ay, az = _cross(second, third)
             bx, by, bz = _cross(third, first)
             cx, cy, cz = _cross(first, second)
@@ -100,7 +114,9 @@ def _point(corner):  # type: ignore[no-untyped-def]  # pragma: no cover (compile
 
 @jit
 def _bounds(points, flat):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    """Return left, right, top and bottom of the part of a triangle before the camera; left > right where there is none."""
+    """Return left, right, top and bottom of the part of a triangle before the camera; left > right
+    where there is none.
+    """
     left, right, top, bottom = np.inf, -np.inf, -np.inf, np.inf
     for corner in range(3):
         x, y, z = points[corner]
@@ -109,9 +125,13 @@ def _bounds(points, flat):  # type: ignore[no-untyped-def]  # pragma: no cover (
             left, right = min(left, x * zoom), max(right, x * zoom)
             bottom, top = min(bottom, y * zoom), max(top, y * zoom)
         other_x, other_y, other_z = points[(corner + 1) % 3]
-        if not flat and (z < _NEAR_M) != (other_z < _NEAR_M):  # the edge crosses the plane in front of the camera
+        # the edge crosses the plane in front of the camera
+        if not flat and (z < _NEAR_M) != (other_z < _NEAR_M):
             share = (_NEAR_M - z) / (other_z - z)
-            cut_x, cut_y = (x + share * (other_x - x)) / _NEAR_M, (y + share * (other_y - y)) / _NEAR_M
+            cut_x, cut_y = (
+                (x + share * (other_x - x)) / _NEAR_M,
+                (y + share * (other_y - y)) / _NEAR_M,
+            )
             left, right = min(left, cut_x), max(right, cut_x)
             bottom, top = min(bottom, cut_y), max(top, cut_y)
     return left, right, top, bottom
@@ -122,11 +142,14 @@ def _cross(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def hits(corners: _Floats, triangle: NDArray[np.int32], origins: _Floats, directions: _Floats) -> _Floats:
-    """Return where rays hit given triangles, (3, n): the weights u and v of the second and third corner, and the depth.
+def hits(
+    corners: _Floats, triangle: NDArray[np.int32], origins: _Floats, directions: _Floats
+) -> _Floats:
+    """Return where rays hit given triangles, (3, n): the weights u and v of the second and third
+    corner, and the depth.
 
-    The steps are those of Embree in single precision: Pluecker coordinates with fused products. Values that depend only on the triangle
-    and the origin are kept for the next ray.
+    The steps are those of Embree in single precision: Pluecker coordinates with fused products.
+    Values that depend only on the triangle and the origin are kept for the next ray.
 
     Args:
         corners: (Q, 4, 3), metres.

@@ -1,7 +1,9 @@
-"""Pictures of meshes and points, with light from rays that Embree casts on the CPU: neither a screen nor a GPU is needed.
+"""Pictures of meshes and points, with light from rays that Embree casts on the CPU: neither a
+screen nor a GPU is needed.
 
-Light comes from a sun with soft shadows and from the sky: a few rays per face measure the visible share of the sky. Voxels have thin edges,
-which fade if a voxel is only a few pixels wide. Points are small balls: nearer ones hide farther ones, and points behind others are darker.
+Light comes from a sun with soft shadows and from the sky: a few rays per face measure the visible
+share of the sky. Voxels have thin edges, which fade if a voxel is only a few pixels wide. Points
+are small balls: nearer ones hide farther ones, and points behind others are darker.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ _SKY_RAYS = 12
 _SKY_RANGE_M = 6.0  # only nearer faces hide the sky
 _TO_SUN = np.array([-0.42, -0.62, 1.0])  # the sun is behind the vehicle, on its left
 _AMBIENT = 0.6
-_SUN = (1 - _AMBIENT) * float(np.linalg.norm(_TO_SUN))  # so that a level face in the sun has exactly its own colour
+# so that a level face in the sun has exactly its own colour
+_SUN = (1 - _AMBIENT) * float(np.linalg.norm(_TO_SUN))
 _EDGE_DARKNESS = 0.34
 _BAND = 1 << 19  # rays cast at a time, which bounds memory
 POINT_RADIUS_M = 0.07
@@ -47,7 +50,9 @@ class Canvas:
 
     def resolve(self) -> NDArray[np.uint8]:
         """Return the picture, (H, W, 3) uint8: the mean of the samples of each pixel."""
-        total = np.full((self.depth.shape[0] // SAMPLES, self.depth.shape[1] // SAMPLES, 3), SAMPLES, np.uint16)
+        total = np.full(
+            (self.depth.shape[0] // SAMPLES, self.depth.shape[1] // SAMPLES, 3), SAMPLES, np.uint16
+        )
         for row in range(SAMPLES):
             for column in range(SAMPLES):
                 total += self.colors[row::SAMPLES, column::SAMPLES]
@@ -67,7 +72,8 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
         mesh: the mesh.
         camera: the camera.
         canvas: the canvas; it changes where the mesh is nearer than its present content.
-        axes: handedness of the data: "left" or "right"; the sun is behind the vehicle on its left in both cases.
+        axes: handedness of the data: "left" or "right"; the sun is behind the vehicle on its left
+            in both cases.
 
     Raises:
         DependencyError: Embree is not installed.
@@ -75,7 +81,9 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
     if not len(mesh):
         return
     scene = import_extra("embreex.rtcore_scene", "render").EmbreeScene()
-    geometry = import_extra("embreex.mesh_construction", "render").TriangleMesh(scene, *mesh.triangles())
+    geometry = import_extra("embreex.mesh_construction", "render").TriangleMesh(
+        scene, *mesh.triangles()
+    )
     sky = _sky_visibility(scene, mesh)
     suns = _suns(axes)
     extents = np.linalg.norm(mesh.corners[:, [1, 3]] - mesh.corners[:, [0]], axis=2)
@@ -87,14 +95,19 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
         origins, directions = camera.rays(width, height, rows)
         triangle = seen[rows].reshape(-1)
         u, v, depth = hits(mesh.corners, triangle, origins, directions)
-        # Each sample of a pixel uses another point of the sun's disc, which gives soft shadows without more rays.
+        # Each sample of a pixel uses another point of the sun's disc, which gives soft shadows
+        # without more rays.
         columns = np.arange(width) % SAMPLES
-        which = (columns[None, :] * SAMPLES + (np.arange(rows.start, rows.stop) % SAMPLES)[:, None]).reshape(-1)
+        which = (
+            columns[None, :] * SAMPLES + (np.arange(rows.start, rows.stop) % SAMPLES)[:, None]
+        ).reshape(-1)
         facing = np.empty(len(triangle), np.int64)
         count = _aim_at_sun(mesh.normals, triangle, origins, directions, depth, suns, which, facing)
         shadowed = np.zeros(len(triangle), np.bool_)
         if count:
-            shadowed[facing[:count]] = scene.run(origins[:count], directions[:count], query="OCCLUDED") >= 0
+            shadowed[facing[:count]] = (
+                scene.run(origins[:count], directions[:count], query="OCCLUDED") >= 0
+            )
         _shade(
             extents,
             mesh.normals,
@@ -118,18 +131,26 @@ def cast(mesh: QuadMesh, camera: Camera, canvas: Canvas, *, axes: Axes = "left")
 
 
 def _suns(axes: Axes) -> NDArray[np.float32]:
-    """Return (SAMPLES^2, 3) unit vectors to points of the sun's disc, behind the vehicle on its left."""
+    """Return (SAMPLES^2, 3) unit vectors to points of the sun's disc, behind the vehicle on its
+    left.
+    """
     sun = _TO_SUN * (1.0, 1.0 if axes == "left" else -1.0, 1.0)
-    spread = 0.02 * np.array([(a, b) for a in np.linspace(-1, 1, SAMPLES) for b in np.linspace(-1, 1, SAMPLES)])
+    spread = 0.02 * np.array(
+        [(a, b) for a in np.linspace(-1, 1, SAMPLES) for b in np.linspace(-1, 1, SAMPLES)]
+    )
     suns = sun + np.column_stack([spread, np.zeros(len(spread))])
     return (suns / np.linalg.norm(suns, axis=1, keepdims=True)).astype(np.float32)
 
 
 def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
-    """Return (Q,) visible share of the sky of each face, by rays from its middle with a cosine distribution about its normal."""
+    """Return (Q,) visible share of the sky of each face, by rays from its middle with a cosine
+    distribution about its normal.
+    """
     number = np.arange(_SKY_RAYS) + 0.5
     radius, angle = np.sqrt(number / _SKY_RAYS), number * (np.pi * (3 - np.sqrt(5)))
-    local = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - number / _SKY_RAYS)])
+    local = np.column_stack(
+        [radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - number / _SKY_RAYS)]
+    )
     helper = np.where(np.abs(mesh.normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     tangent = np.cross(helper, mesh.normals)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
@@ -145,7 +166,9 @@ def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
 
 @cached(error_model="python")
 def _aim_at_sun(normals, triangle, origins, directions, depth, suns, which, facing):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    """Replace the first rays by rays towards the sun from the points that face it, write the samples that they belong to, and return their number."""
+    """Replace the first rays by rays towards the sun from the points that face it, write the
+    samples that they belong to, and return their number.
+    """
     count = 0
     for i in range(len(triangle)):
         if triangle[i] < 0:
@@ -154,7 +177,9 @@ def _aim_at_sun(normals, triangle, origins, directions, depth, suns, which, faci
         if normals[q, 0] * suns[s, 0] + normals[q, 1] * suns[s, 1] + normals[q, 2] * suns[s, 2] > 0:
             lift = np.float32(2e-3) + np.float32(2e-5) * depth[i]
             for a in range(3):
-                origins[count, a] = origins[i, a] + depth[i] * directions[i, a] + lift * normals[q, a]
+                origins[count, a] = (
+                    origins[i, a] + depth[i] * directions[i, a] + lift * normals[q, a]
+                )
                 directions[count, a] = suns[s, a]
             facing[count] = i
             count += 1
@@ -181,7 +206,9 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     out,
     out_depth,
 ):
-    """Compute the light of each sample that a ray hit, and write it where it is nearer than the content of the canvas."""
+    """Compute the light of each sample that a ray hit, and write it where it is nearer than the
+    content of the canvas.
+    """
     for i in range(len(triangle)):
         if triangle[i] < 0 or depth[i] >= out_depth[i]:
             continue
@@ -197,7 +224,11 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
         ambient = sky[q] * (low * (1 - t) + high * t) * (0.86 + 0.14 * normals[q, 2])
         direct = np.float32(0.0)
         if not shadowed[i]:
-            facing = normals[q, 0] * suns[sun, 0] + normals[q, 1] * suns[sun, 1] + normals[q, 2] * suns[sun, 2]
+            facing = (
+                normals[q, 0] * suns[sun, 0]
+                + normals[q, 1] * suns[sun, 1]
+                + normals[q, 2] * suns[sun, 2]
+            )
             direct = max(np.float32(0.0), facing)
         light = _AMBIENT * (0.3 + 0.7 * ambient) + _SUN * direct
 
@@ -215,7 +246,9 @@ def _shade(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
             wide = other / pixel  # width of the voxel in pixels
             strength = min(np.float32(1.0), max(np.float32(0.0), (wide - 2.5) / 7.5))
             reach = max(0.55 * pixel, 0.022 * other)
-            line = max(line, strength * min(np.float32(1.0), max(np.float32(0.0), 1.5 - distance / reach)))
+            line = max(
+                line, strength * min(np.float32(1.0), max(np.float32(0.0), 1.5 - distance / reach))
+            )
         light *= 1 - _EDGE_DARKNESS * line
         for c in range(3):
             out[i, c] = np.uint8(min(np.float32(255.0), colors[q, c] * light + np.float32(0.5)))
@@ -240,9 +273,15 @@ def splat(
     """
     height, width = canvas.depth.shape
     columns, rows, depths = camera.project(points, width, height)
-    pixel = camera.footprint(height) * (np.ones_like(depths) if camera.orthographic else np.maximum(depths, 1e-6))
+    pixel = camera.footprint(height) * (
+        np.ones_like(depths) if camera.orthographic else np.maximum(depths, 1e-6)
+    )
     radii = np.clip(radius_m / pixel, _LEAST_RADIUS, _MOST_RADIUS)
-    seen = (depths > 0.1) & (np.abs(columns - width / 2) < width) & (np.abs(rows - height / 2) < height)
+    seen = (
+        (depths > 0.1)
+        & (np.abs(columns - width / 2) < width)
+        & (np.abs(rows - height / 2) < height)
+    )
     drawn = np.zeros((height, width), np.bool_)
     _draw_balls(
         columns[seen], rows[seen], depths[seen].astype(np.float32), radii[seen], np.ascontiguousarray(colors[seen]),
@@ -257,7 +296,9 @@ def _draw_balls(columns, rows, depths, radii, colors, out, out_depth, drawn):  #
     for i in range(len(columns)):
         radius = radii[i]
         for y in range(max(0, int(rows[i] - radius)), min(height, int(rows[i] + radius) + 1)):
-            for x in range(max(0, int(columns[i] - radius)), min(width, int(columns[i] + radius) + 1)):
+            for x in range(
+                max(0, int(columns[i] - radius)), min(width, int(columns[i] + radius) + 1)
+            ):
                 dx, dy = x + 0.5 - columns[i], y + 0.5 - rows[i]
                 rim = (dx * dx + dy * dy) / (radius * radius)
                 if rim > 1 or depths[i] >= out_depth[y, x]:
@@ -271,7 +312,9 @@ def _draw_balls(columns, rows, depths, radii, colors, out, out_depth, drawn):  #
 
 @cached(error_model="python")
 def _darken_behind(out, depth, drawn):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
-    """Eye-dome lighting: the farther a point is behind its neighbours in the picture, the darker it is."""
+    """Eye-dome lighting: the farther a point is behind its neighbours in the picture, the darker it
+    is.
+    """
     height, width = depth.shape
     reach = 3
     for y in range(reach, height - reach):
@@ -282,7 +325,10 @@ def _darken_behind(out, depth, drawn):  # type: ignore[no-untyped-def]  # pragma
             for dy in (-reach, 0, reach):
                 for dx in (-reach, 0, reach):
                     behind += min(
-                        np.float32(1.5), max(np.float32(0.0), depth[y, x] - depth[y + dy, x + dx] - np.float32(0.15))
+                        np.float32(1.5),
+                        max(
+                            np.float32(0.0), depth[y, x] - depth[y + dy, x + dx] - np.float32(0.15)
+                        ),
                     )
             light = np.exp(-0.12 * behind)
             for c in range(3):

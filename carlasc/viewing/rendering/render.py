@@ -22,7 +22,13 @@ from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.rendering.actor_boxes import check_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
 from carlasc.viewing.rendering.drawings import GridColor, check_color
-from carlasc.viewing.rendering.encoding import FILMS, STILLS, encodable_size, is_film, write_pictures
+from carlasc.viewing.rendering.encoding import (
+    FILMS,
+    STILLS,
+    encodable_size,
+    is_film,
+    write_pictures,
+)
 from carlasc.viewing.rendering.pages import draw_legend
 from carlasc.viewing.rendering.panels import (
     Cell,
@@ -37,9 +43,20 @@ from carlasc.viewing.scene import Scene, SceneReader, as_scene
 from carlasc.viewing.targets import check_target
 
 ORBIT_PICTURES = 120  # of an orbit around a single frame
-_DRIVE_FPS, _ORBIT_FPS = 10.0, 20.0  # frames are 0.1 s apart, so that a film runs at the speed of the drive
+# frames are 0.1 s apart, so that a film runs at the speed of the drive
+_DRIVE_FPS, _ORBIT_FPS = (
+    10.0,
+    20.0,
+)
 
-_ONE = (Scene, str, os.PathLike, Source, StoredSequence)  # one source; anything else is a list of sources
+# one source; anything else is a list of sources
+_ONE = (
+    Scene,
+    str,
+    os.PathLike,
+    Source,
+    StoredSequence,
+)
 
 
 @dataclass(frozen=True)
@@ -84,26 +101,32 @@ def render(
     overwrite: bool = False,
     run: Run = Run(workers=1),  # noqa: B008 (frozen)
 ) -> RenderResult:
-    """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP). Neither a screen nor a GPU is needed.
+    """Draw a frame of a scene as a picture (PNG), or several frames as a film (GIF, MP4, WebP).
 
-    A list of scenes is drawn as panels of one size, from the same camera, with captions. A PNG has a panel per frame of each scene, a
-    film has a panel per scene.
+    Neither a screen nor a GPU is needed.
+
+    A list of scenes is drawn as panels of one size, from the same camera, with captions. A PNG has
+    a panel per frame of each scene, a film has a panel per scene.
 
     Args:
         source: a `Scene`; or anything that a scene's `source` may be; or a list of these.
-        out: file name that ends in .png, .gif, .mp4 or .webp; None names the file after the sequence, in the current folder.
-            A scene without `frames` gives a picture of the first frame, or a film of all frames.
-        what: grid, scan, flow, truth, errors: several names, separated by commas, are drawn side by side. None draws the grid,
-            with a ground truth also the truth and the errors; or the scan if there is no grid.
-        color: what the colours of the grid mean: "class"; or "confidence" (the probability that a voxel is occupied), "views" (the
-            scans that saw it), "votes", "inferred" (seen or inferred): see `docs/format.md#evidence`; "actor" (the number of its actor) or
-            "seen" (by how many cameras).
-        boxes: whether boxes around actors are drawn: those of the field `boxes`, otherwise the tightest ones around the points of each
-            actor of `instances`.
-        camera: the camera. By default the camera follows the ego vehicle, behind and above it, because grids and
-            scans are in the frame of its sensor.
+        out: file name that ends in .png, .gif, .mp4 or .webp; None names the file after the
+            sequence, in the current folder. A scene without `frames` gives a picture of the first
+            frame, or a film of all frames.
+        what: grid, scan, flow, truth, errors: several names, separated by commas, are drawn side by
+            side. None draws the grid, with a ground truth also the truth and the errors; or the
+            scan if there is no grid.
+        color: what the colours of the grid mean: "class"; or "confidence" (the probability that a
+            voxel is occupied), "views" (the scans that saw it), "votes", "inferred" (seen or
+            inferred): see `docs/format.md#evidence`; "actor" (the number of its actor) or "seen"
+            (by how many cameras).
+        boxes: whether boxes around actors are drawn: those of the field `boxes`, otherwise the
+            tightest ones around the points of each actor of `instances`.
+        camera: the camera. By default the camera follows the ego vehicle, behind and above it,
+            because grids and scans are in the frame of its sensor.
         style: size, legend, captions and size of text, for a screen or for a paper.
-        fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit around one frame).
+        fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit
+            around one frame).
         overwrite: whether an existing file is replaced.
         run: how the pictures are spread over processes, with a callback for progress.
 
@@ -130,7 +153,9 @@ def render(
     target = _name_after(readers[0], film) if out is None else Path(out)
     check_target(target, STILLS + FILMS, overwrite)
     _check_kind(target, None if together else readers[0], style, film=film, orbit=camera.orbit)
-    legend_file = style.sheet.legend_file(target) if style.legend and style.sheet.legend_apart else None
+    legend_file = (
+        style.sheet.legend_file(target) if style.legend and style.sheet.legend_apart else None
+    )
     if legend_file is not None:
         check_target(legend_file, STILLS, overwrite)
     for reader in readers:
@@ -138,9 +163,16 @@ def render(
         if boxes:
             check_boxes(reader.data)
 
-    renderers = [FrameRenderer.of(reader, camera, ego=style.ego, color=color, boxes=boxes) for reader in readers]
+    renderers = [
+        FrameRenderer.of(reader, camera, ego=style.ego, color=color, boxes=boxes)
+        for reader in readers
+    ]
     pictures = plan_cells(renderers, film)
-    shown = [cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells] if style.legend else []
+    shown = (
+        [cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells]
+        if style.legend
+        else []
+    )
     entries = merge_legends(shown)
     sheet = replace(style.sheet, size=encodable_size(target, style.sheet.size))
     drawer = PictureRenderer(
@@ -155,7 +187,9 @@ def render(
     with closing(run_all(_Shot.render, shots, run)) as drawn:
         write_pictures(target, _reported(drawn, len(shots), run.progress), fps, sheet.dpi)
     if legend_file is not None and entries and sheet.font_size is not None:
-        write_pictures(legend_file, [draw_legend(entries, sheet.font_size, sheet.size[0])], fps, sheet.dpi)
+        write_pictures(
+            legend_file, [draw_legend(entries, sheet.font_size, sheet.size[0])], fps, sheet.dpi
+        )
     return RenderResult(
         target,
         ", ".join(dict.fromkeys(reader.path for reader in readers)),
@@ -171,11 +205,19 @@ def render(
 
 
 def _open_scenes(
-    scenes: Sequence[Scene], what: str | None, out: str | os.PathLike[str] | None, *, orbit: bool, together: bool
+    scenes: Sequence[Scene],
+    what: str | None,
+    out: str | os.PathLike[str] | None,
+    *,
+    orbit: bool,
+    together: bool,
 ) -> tuple[list[SceneReader], bool]:
     """Return readers of the frames to draw, and whether they become a film."""
     readers = [scene.open(what) for scene in scenes]
-    several = any(scene.frames is not None and len(r.frames) > 1 for scene, r in zip(scenes, readers, strict=True))
+    several = any(
+        scene.frames is not None and len(r.frames) > 1
+        for scene, r in zip(scenes, readers, strict=True)
+    )
     film = is_film(Path(out)) if out is not None else orbit or (several and not together)
     if orbit or not film:
         readers = [
@@ -185,8 +227,11 @@ def _open_scenes(
     return readers, film
 
 
-def _check_kind(target: Path, alone: SceneReader | None, style: StyleOptions, *, film: bool, orbit: bool) -> None:
-    """Raise ArgumentError if several frames are given for one still picture, or the style of paper for a film.
+def _check_kind(
+    target: Path, alone: SceneReader | None, style: StyleOptions, *, film: bool, orbit: bool
+) -> None:
+    """Raise ArgumentError if several frames are given for one still picture, or the style of paper
+    for a film.
 
     `alone` is the reader if each of its frames is a picture of its own, or None.
     """
@@ -197,7 +242,9 @@ def _check_kind(target: Path, alone: SceneReader | None, style: StyleOptions, *,
     if orbit and not film:
         raise ArgumentError("orbit", expected="a film", found=target.name, advice=advice)
     if style.name == "paper" and film:
-        raise ArgumentError("style", expected="screen for a film", found=style.name, advice="name a .png")
+        raise ArgumentError(
+            "style", expected="screen for a film", found=style.name, advice="name a .png"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,14 +259,19 @@ class _Shot:
         return self.drawer.render(self.cells, self.viewpoint)
 
 
-def _plan_shots(drawer: PictureRenderer, pictures: list[list[Cell]], camera: CameraOptions) -> list[_Shot]:
+def _plan_shots(
+    drawer: PictureRenderer, pictures: list[list[Cell]], camera: CameraOptions
+) -> list[_Shot]:
     """Return the frames and the viewpoint of each picture."""
     if not camera.orbit:
         return [_Shot(drawer, cells, camera.viewpoint) for cells in pictures]
     if len(pictures) == 1:
         pictures = pictures * ORBIT_PICTURES
     angles = 2 * np.pi * np.arange(len(pictures)) / len(pictures)
-    return [_Shot(drawer, cells, camera.viewpoint.turned(float(a))) for cells, a in zip(pictures, angles, strict=True)]
+    return [
+        _Shot(drawer, cells, camera.viewpoint.turned(float(a)))
+        for cells, a in zip(pictures, angles, strict=True)
+    ]
 
 
 def _reported(
@@ -236,13 +288,20 @@ def _name_after(reader: SceneReader, film: bool) -> Path:
     first, last = reader.frames[0], reader.frames[-1]
     what = "" if reader.contents == ("grid",) else f"_{'_'.join(reader.contents)}"
     numbers = f"{first:06d}" if first == last else f"{first:06d}-{last:06d}"
-    return Path(f"{reader.data.sequence.name or 'carlasc'}{what}_{numbers}.{'mp4' if film else 'png'}")
+    return Path(
+        f"{reader.data.sequence.name or 'carlasc'}{what}_{numbers}.{'mp4' if film else 'png'}"
+    )
 
 
 def _notes_of(readers: Sequence[SceneReader], pictures: list[list[Cell]]) -> dict[str, None]:
-    """Return the notes of the readers and, for a single picture, notes on empty parts; each note once, in order."""
+    """Return the notes of the readers and, for a single picture, notes on empty parts; each note
+    once, in order.
+    """
     notes = [note for reader in readers for note in reader.notes]
     for cell in pictures[0] if len(pictures) == 1 else []:
-        drawings = ((content, cell.renderer.draw(content, cell.frame)) for content in cell.renderer.reader.contents)
+        drawings = (
+            (content, cell.renderer.draw(content, cell.frame))
+            for content in cell.renderer.reader.contents
+        )
         notes += [f"{content}: {drawing.note}" for content, drawing in drawings if drawing.note]
     return dict.fromkeys(notes)

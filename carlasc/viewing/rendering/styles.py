@@ -1,4 +1,6 @@
-"""The style of a picture: for a screen, or for a paper, with lengths in centimetres and the legend in a separate file."""
+"""The style of a picture: for a screen, or for a paper, with lengths in centimetres and the legend
+in a separate file.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,12 @@ from carlasc.errors import ArgumentError
 SMALLEST, LARGEST = (64, 64), 16384  # pixels of a picture
 
 _SCREEN_SIZE = (1280, 720)
-_PAPER_SIZE, _PAPER_DPI, _PAPER_FONT_PT = "8.8cm x 5cm", 300.0, 8.0  # a column of two; the type of a caption
+# a column of two; the type of a caption
+_PAPER_SIZE, _PAPER_DPI, _PAPER_FONT_PT = (
+    "8.8cm x 5cm",
+    300.0,
+    8.0,
+)
 _INCHES = {"cm": 1 / 2.54, "mm": 1 / 25.4, "in": 1.0}
 _POINTS_PER_INCH = 72
 _LENGTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
@@ -25,13 +32,17 @@ class StyleOptions:
     """How a picture looks.
 
     Attributes:
-        name: "screen"; or "paper": PNG with 300 pixels per inch, text of 8 points, and the legend in a separate file,
-            `<name>.legend.png`.
-        size: (width, height) of the picture in pixels; or a text such as "1280x720" (pixels), "8.8cm x 5cm", "88mm x 50mm" or
-            "3.5in x 2in". None takes 1280 x 720 pixels, or 8.8 x 5 cm on paper.
-        dpi: pixels per inch in the metadata of a PNG. None takes 300 on paper and for a size with a unit.
-        captions: for a list of scenes: a text for each panel, after its letter. Empty names the differences between the panels.
-        columns: for a list of scenes: number of panels in a row. None takes the number of frames of one scene, or the best fit.
+        name: "screen"; or "paper": PNG with 300 pixels per inch, text of 8 points, and the legend
+            in a separate file, `<name>.legend.png`.
+        size: (width, height) of the picture in pixels; or a text such as "1280x720" (pixels),
+            "8.8cm x 5cm", "88mm x 50mm" or "3.5in x 2in". None takes 1280 x 720 pixels, or 8.8 x 5
+            cm on paper.
+        dpi: pixels per inch in the metadata of a PNG. None takes 300 on paper and for a size with a
+            unit.
+        captions: for a list of scenes: a text for each panel, after its letter. Empty names the
+            differences between the panels.
+        columns: for a list of scenes: number of panels in a row. None takes the number of frames of
+            one scene, or the best fit.
         legend: whether the picture has a legend.
         ego: whether a plain car is drawn at the sensor.
 
@@ -49,7 +60,9 @@ class StyleOptions:
 
     def __post_init__(self) -> None:
         if self.name not in get_args(StyleName):
-            raise ArgumentError("style", expected=" or ".join(get_args(StyleName)), found=repr(self.name))
+            raise ArgumentError(
+                "style", expected=" or ".join(get_args(StyleName)), found=repr(self.name)
+            )
         if self.dpi is not None and not 30 <= self.dpi <= 2400:
             raise ArgumentError("dpi", expected="30 to 2400 pixels per inch", found=f"{self.dpi:g}")
         if self.columns is not None and self.columns < 1:
@@ -65,7 +78,9 @@ class StyleOptions:
             lengths, with_unit = _read_lengths(size)
             if dpi is None and (with_unit or paper):
                 dpi = _PAPER_DPI
-            width, height = (round(length * (dpi or 1.0)) if with_unit else round(length) for length in lengths)
+            width, height = (
+                round(length * (dpi or 1.0)) if with_unit else round(length) for length in lengths
+            )
             size = (width, height)
         if not paper:
             return Sheet(size, dpi)
@@ -96,7 +111,9 @@ class Sheet:
 
 def check_size(size: tuple[int, int]) -> None:
     """Raise ArgumentError if (width, height) in pixels is not a size that a picture can have."""
-    if len(size) != 2 or not all(low <= value <= LARGEST for low, value in zip(SMALLEST, size, strict=True)):
+    if len(size) != 2 or not all(
+        low <= value <= LARGEST for low, value in zip(SMALLEST, size, strict=True)
+    ):
         raise ArgumentError(
             "size",
             expected=f"{SMALLEST[0]}x{SMALLEST[1]} to {LARGEST}x{LARGEST} pixels",
@@ -105,8 +122,13 @@ def check_size(size: tuple[int, int]) -> None:
 
 
 def _read_lengths(text: str) -> tuple[tuple[float, float], bool]:
-    """Return the two lengths of a text, in inches if they have a unit, otherwise in pixels; and whether they have one."""
-    found = [_LENGTH.fullmatch(part.strip()) for part in re.split(r"\s*x\s*", text.strip().lower(), maxsplit=1)]
+    """Return the two lengths of a text, in inches if they have a unit, otherwise in pixels; and
+    whether they have one.
+    """
+    found = [
+        _LENGTH.fullmatch(part.strip())
+        for part in re.split(r"\s*x\s*", text.strip().lower(), maxsplit=1)
+    ]
     pairs = [(float(match[1]), match[2]) for match in found if match is not None]
     if len(pairs) == 2:
         (width, first), (height, second) = pairs
@@ -117,5 +139,7 @@ def _read_lengths(text: str) -> tuple[tuple[float, float], bool]:
         elif first in _INCHES and second in _INCHES:
             return (width * _INCHES[first], height * _INCHES[second]), True
     raise ArgumentError(
-        "size", expected="WIDTHxHEIGHT, such as 1280x720 (pixels), 8.8cmx5cm or 3.5inx2in", found=repr(text)
+        "size",
+        expected="WIDTHxHEIGHT, such as 1280x720 (pixels), 8.8cmx5cm or 3.5inx2in",
+        found=repr(text),
     )

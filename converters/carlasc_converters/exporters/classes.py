@@ -44,7 +44,13 @@ _KINDS = {  # vehicles as in CarlaOcc, for CARLA's tags, if it has them
     "parking": Kind(11, 44, 0),
 }
 _TABLES = {  # name of a class table -> kind -> names of its classes
-    "carlaocc": {"truck": "Truck", "bus": "Bus", "train": "Train", "motorcycle": "Motorcycle", "bicycle": "Bicycle"},
+    "carlaocc": {
+        "truck": "Truck",
+        "bus": "Bus",
+        "train": "Train",
+        "motorcycle": "Motorcycle",
+        "bicycle": "Bicycle",
+    },
     "kitti": {"truck": "Truck", "train": "Tram", "other": "Misc"},
     "kitti360": {
         "bicycle": "bicycle",
@@ -86,15 +92,20 @@ KINDS: Mapping[str, Mapping[str, Kind]] = MappingProxyType(
 )
 """Name of a class table -> name of a class -> its kind in other data sets.
 
-Other data sets have more classes than CarlaSC, above all for vehicles. CarlaSC has one class for vehicles, so that a map through its classes
-would turn buses and bicycles into cars. With these entries, the more detailed classes of converters are kept.
+Other data sets have more classes than CarlaSC, above all for vehicles. CarlaSC has one class for
+vehicles, so that a map through its classes would turn buses and bicycles into cars. With these
+entries, the more detailed classes of converters are kept.
 """
 
 
 def mapping_of(
-    maps: Mapping[str, Mapping[int, int]], kind: Literal["occ3d", "raw", "category"], table: ClassTable, where: str
+    maps: Mapping[str, Mapping[int, int]],
+    kind: Literal["occ3d", "raw", "category"],
+    table: ClassTable,
+    where: str,
 ) -> dict[int, int]:
-    """Return the map from the ids of a class table: its own map if it exists, otherwise a map through CarlaSC's classes.
+    """Return the map from the ids of a class table: its own map if it exists, otherwise a map
+    through CarlaSC's classes.
 
     In the second case, classes that CarlaSC does not have are mapped by their kind.
 
@@ -119,16 +130,24 @@ def mapping_of(
         )
     mapping = {label: label for label in table.names}
     for remap in remaps:
-        mapping = {label: remap.mapping[middle] for label, middle in mapping.items() if middle in remap.mapping}
+        mapping = {
+            label: remap.mapping[middle]
+            for label, middle in mapping.items()
+            if middle in remap.mapping
+        }
     kinds = KINDS.get(table.name, {})
     return {
-        label: getattr(kinds[table.names[label]], kind) if table.names[label] in kinds else maps["carla"][carla]
+        label: getattr(kinds[table.names[label]], kind)
+        if table.names[label] in kinds
+        else maps["carla"][carla]
         for label, carla in mapping.items()
     }
 
 
 def lookup_of(mapping: Mapping[int, int]) -> NDArray[np.int32]:
-    """Return a table from ids to classes, -2 for ids without a class; its last entry stands for all larger ids."""
+    """Return a table from ids to classes, -2 for ids without a class; its last entry stands for all
+    larger ids.
+    """
     lookup = np.full(max(mapping) + 2, _NONE, np.int32)
     lookup[list(mapping)] = list(mapping.values())
     return lookup
@@ -152,9 +171,13 @@ def classes_of(
         FormatError: a label has no class.
     """
     beyond = len(lookup) - 1
-    found: NDArray[np.int32] = lookup[labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)]
+    found: NDArray[np.int32] = lookup[
+        labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)
+    ]
     if (found == _NONE).any():
         bad = int(labels[found == _NONE][0])
         times = int(np.count_nonzero(labels == bad))
-        raise FormatError(where, expected=f"class ids of {table.name}", found=f"{bad} ({times} times)")
+        raise FormatError(
+            where, expected=f"class ids of {table.name}", found=f"{bad} ({times} times)"
+        )
     return found

@@ -1,4 +1,6 @@
-"""The common part of exporters of voxel grids: the choice of the grid, its classes, its axes and its voxels."""
+"""The common part of exporters of voxel grids: the choice of the grid, its classes, its axes and
+its voxels.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +21,12 @@ from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_
 
 GridName = Annotated[
     str | None,
-    "Grid to export. Default: the grid with exactly the voxels of the other data set, otherwise the grid with the smallest voxels.",
+    "Grid to export. Default: the grid with exactly the voxels of the other data set, otherwise "
+    "the grid with the smallest voxels.",
 ]
-Predictions = Annotated[bool, "The grids are predictions without counts: all of their voxels are known."]
+Predictions = Annotated[
+    bool, "The grids are predictions without counts: all of their voxels are known."
+]
 _MOSTLY = 0.5  # share of the occupied voxels above which structure without a class gives a note
 _CARLASC_HEIGHT_M = 1.8  # docs/format.md#coordinate-frame
 
@@ -31,7 +36,8 @@ class GridExporter(FrameExporter):
 
     Attributes:
         target: geometry of the grids that are written, in the frame that `frame_of` returns.
-        maps: name of a class table -> id -> class that is written, or IGNORED for classes whose voxels are unknown.
+        maps: name of a class table -> id -> class that is written, or IGNORED for classes whose
+            voxels are unknown.
         kind: the attribute of a `Kind` that holds its class.
         free: the class of free voxels.
         slug: a name for the exact grid in the layout.
@@ -51,7 +57,9 @@ class GridExporter(FrameExporter):
         return TargetFrame()
 
     def check(self, sequence: storage.Sequence) -> list[str]:
-        """Return notes on what resampling loses; raise if the grid or the map of its classes does not exist."""
+        """Return notes on what resampling loses; raise if the grid or the map of its classes does
+        not exist.
+        """
         name, axes, frame = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
         mapping_of(self.maps, self.kind, sequence.classes_of(name), f"{sequence.location}/{name}")
         if not self.predictions and f"{name}/counts" not in sequence.fields():
@@ -65,14 +73,21 @@ class GridExporter(FrameExporter):
         if notes and sequence.metadata.has_rays:  # no grids can be made from scans without rays
             exact = frame.spec_from(self.target, axes)
             size = ",".join(map(str, exact.size))
-            bounds = ",".join(f"{value:g}" for pair in zip(exact.lower, exact.upper, strict=True) for value in pair)
+            bounds = ",".join(
+                f"{value:g}"
+                for pair in zip(exact.lower, exact.upper, strict=True)
+                for value in pair
+            )
             notes.append(
-                f"`carlasc regrid SOURCE --observe scans --size {size} --bounds {bounds} --name {self.slug}` makes the exact grid"
+                f"`carlasc regrid SOURCE --observe scans --size {size} --bounds {bounds} --name "
+                f"{self.slug}` makes the exact grid"
             )
         return notes + self._structure_without_class(sequence, name)
 
     def _structure_without_class(self, sequence: storage.Sequence, name: str) -> list[str]:
-        """Return a note on the class of structure, if it has no class in the first frame, as in data with boxes only."""
+        """Return a note on the class of structure, if it has no class in the first frame, as in
+        data with boxes only.
+        """
         table, frames = sequence.classes_of(name), sequence.frames(f"{name}/labels")
         if not len(frames):
             return []
@@ -84,7 +99,8 @@ class GridExporter(FrameExporter):
         becomes = mapping_of(self.maps, self.kind, table, sequence.location)[table.geometry_id]
         what = "unknown voxels" if becomes == IGNORED else f"class {becomes}"
         return [
-            f"{sequence.location}/{name}: {share:.0%} of the occupied voxels are {table.names[table.geometry_id]}, structure without a class of its own:"
+            f"{sequence.location}/{name}: {share:.0%} of the occupied voxels are "
+            f"{table.names[table.geometry_id]}, structure without a class of its own:"
             f" they become {what} of {self.slug}"
         ]
 
@@ -99,11 +115,18 @@ class GridExporter(FrameExporter):
             MissingDataError: the sequence has no Cartesian grid, or none of that name.
             ArgumentError: the grid of that name is not Cartesian.
         """
-        grids = {name: spec for name, spec in sequence.grids.items() if f"{name}/labels" in sequence.fields()}
+        grids = {
+            name: spec
+            for name, spec in sequence.grids.items()
+            if f"{name}/labels" in sequence.fields()
+        }
         return choose_grid(sequence, grids, self.grid, (self.target, self.frame_of(sequence)))
 
-    def read(self, sequence: storage.Sequence, frame: int) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
-        """Return a frame's grid in the target's voxels and classes: (X, Y, Z) labels, and which voxels are known.
+    def read(
+        self, sequence: storage.Sequence, frame: int
+    ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+        """Return a frame's grid in the target's voxels and classes: (X, Y, Z) labels, and which
+        voxels are known.
 
         Raises:
             CarlascError: the grid cannot be read, or has an id that is not in its class table.
@@ -122,12 +145,19 @@ class GridExporter(FrameExporter):
         where = f"{sequence.location}: {name} of frame {frame}"
         lookup = lookup_of(mapping_of(self.maps, self.kind, table, where))
         classes = classes_of(grid.labels, lookup, table, where)
-        known = np.ones(grid.spec.size, np.bool_) if self.predictions else grid.known & (classes != IGNORED)
+        known = (
+            np.ones(grid.spec.size, np.bool_)
+            if self.predictions
+            else grid.known & (classes != IGNORED)
+        )
         codes: NDArray[np.unsignedinteger] = np.where(classes == self.free, 0, classes + 1).astype(
             np.uint16 if lookup.max() > 254 else np.uint8
         )
         return resample_to(
-            place.turn(codes, axes), place.turn(known, axes), place.spec_in(grid.spec, axes), self.target
+            place.turn(codes, axes),
+            place.turn(known, axes),
+            place.spec_in(grid.spec, axes),
+            self.target,
         )
 
 
@@ -142,7 +172,8 @@ def choose_grid(
     Args:
         sequence: the sequence.
         grids: geometry of its grids, by name.
-        wanted: the requested grid; None takes the one with the voxels of the target, otherwise the one with the smallest voxels.
+        wanted: the requested grid; None takes the one with the voxels of the target, otherwise the
+            one with the smallest voxels.
         target: geometry that is written, and its frame.
 
     Raises:
@@ -161,7 +192,10 @@ def choose_grid(
     if not flat:
         found = "only cylindrical ones" if grids else "none"
         raise MissingDataError(
-            sequence.location, expected="a Cartesian grid", found=found, advice="make one: `carlasc regrid`"
+            sequence.location,
+            expected="a Cartesian grid",
+            found=found,
+            advice="make one: `carlasc regrid`",
         )
     if target is not None:
         spec, frame = target
@@ -172,22 +206,32 @@ def choose_grid(
 
 
 def number_folders(names: Sequence[str], prefix: str, digits: int) -> dict[str, str]:
-    """Return a number for each name: the number at its end, after the prefix, or the next free number.
+    """Return a number for each name: the number at its end, after the prefix, or the next free
+    number.
 
     Args:
         names: names of sequences.
         prefix: the text before the number.
         digits: number of digits.
     """
-    numbers = {name: match[1] for name in names if (match := re.search(rf"{prefix}(\d{{{digits}}})$", name))}
-    free = (f"{number:0{digits}d}" for number in range(10_000) if f"{number:0{digits}d}" not in numbers.values())
+    numbers = {
+        name: match[1]
+        for name in names
+        if (match := re.search(rf"{prefix}(\d{{{digits}}})$", name))
+    }
+    free = (
+        f"{number:0{digits}d}"
+        for number in range(10_000)
+        if f"{number:0{digits}d}" not in numbers.values()
+    )
     return {name: numbers.get(name) or next(free) for name in names}
 
 
 def sensor_height(sequence: storage.Sequence, given: float | None) -> tuple[float, bool]:
     """Return the height of the sensor above the ground in metres, and whether it was assumed.
 
-    It is the given height, that of the first sensor in carlasc.json, or that of CarlaSC. Sequences without carlasc.json are CarlaSC's.
+    It is the given height, that of the first sensor in carlasc.json, or that of CarlaSC. Sequences
+    without carlasc.json are CarlaSC's.
     """
     if given is not None:
         return given, False
@@ -207,7 +251,9 @@ def read_points(sequence: storage.Sequence, frame: int) -> NDArray[np.float32]:
     return points if sequence.metadata.axes == "right" else mirror_points(points)
 
 
-def scan_occupancy(sequence: storage.Sequence, points: NDArray[np.float32], spec: GridSpec) -> NDArray[np.bool_]:
+def scan_occupancy(
+    sequence: storage.Sequence, points: NDArray[np.float32], spec: GridSpec
+) -> NDArray[np.bool_]:
     """Return the voxels that hold a point of a scan.
 
     Args:

@@ -1,4 +1,6 @@
-"""Sequences of the layout as SemanticKITTI's files: see the format page, `docs/format.md#semantickitti`."""
+"""Sequences of the layout as SemanticKITTI's files: see the format page,
+`docs/format.md#semantickitti`.
+"""
 
 from __future__ import annotations
 
@@ -17,35 +19,60 @@ from carlasc.core.tables import CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI1
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice
 from carlasc.storage import layout
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
-from carlasc_converters.exporters.grid_exporter import choose_grid, number_folders, read_points, scan_occupancy
+from carlasc_converters.exporters.grid_exporter import (
+    choose_grid,
+    number_folders,
+    read_points,
+    scan_occupancy,
+)
 from carlasc_converters.exporters.occlusion import occluded_voxels
-from carlasc_converters.exporters.submission import Task, check_archive, check_submission, pack_submission
+from carlasc_converters.exporters.submission import (
+    Task,
+    check_archive,
+    check_submission,
+    pack_submission,
+)
 from carlasc_converters.kitti import CLASS_PARTS
 from carlasc_converters.kitti_voxels import MASKS, pack_bits
 
-_NAMES_OF_11 = "unlabeled building fence other-object person pole road other-ground sidewalk vegetation car"
+_NAMES_OF_11 = (
+    "unlabeled building fence other-object person pole road other-ground sidewalk vegetation car"
+)
 TO_RAW: Mapping[str, Mapping[int, int]] = {
     "carla": REMAPS["carla_to_semantickitti"].mapping,
-    CARLASC11.name: dict(zip(CARLASC11.names, map(SEMANTICKITTI.id_of, _NAMES_OF_11.split()), strict=True)),
+    CARLASC11.name: dict(
+        zip(CARLASC11.names, map(SEMANTICKITTI.id_of, _NAMES_OF_11.split()), strict=True)
+    ),
     SEMANTICKITTI.name: {label: label for label in SEMANTICKITTI.names},
-    SEMANTICKITTI19.name: {label: SEMANTICKITTI.id_of(name) for label, name in SEMANTICKITTI19.names.items()},
+    SEMANTICKITTI19.name: {
+        label: SEMANTICKITTI.id_of(name) for label, name in SEMANTICKITTI19.names.items()
+    },
 }
 """Name of a class table -> id -> raw id of SemanticKITTI."""
 
 _FENCE, _BUILDING = 51, 50
 UNSCORED: Mapping[int, int] = {1: 0, 52: _BUILDING, 99: _BUILDING}
-"""Raw id that SemanticKITTI's evaluator does not accept in a prediction -> id that is written instead.
+"""Raw id that SemanticKITTI's evaluator does not accept in a prediction -> id that is written
+instead.
 
-Its table maps outlier, other-structure and other-object to no class. Their voxels stay occupied, as buildings: other structures are most
-similar to buildings, and a few voxels of other objects change the score of buildings least."""
-_WALL = 11  # CarlaSC's: other-structure in ground truth; a fence in predictions, as its paper's class Barrier
+Its table maps outlier, other-structure and other-object to no class. Their voxels stay occupied, as
+buildings: other structures are most similar to buildings, and a few voxels of other objects change
+the score of buildings least.
+"""
+# CarlaSC's: other-structure in ground truth; a fence in predictions, as its paper's class Barrier
+_WALL = 11
 TO_PREDICTED: Mapping[str, Mapping[int, int]] = {
     name: {label: UNSCORED.get(raw, raw) for label, raw in mapping.items()}
     | ({_WALL: _FENCE} if name == "carla" else {})
     for name, mapping in TO_RAW.items()
 }
-"""Name of a class table -> id -> raw id in a prediction: only ids that the evaluator scores, and 0."""
-_STANDS, _MOVES = 9, 251  # the ids of moving-object segmentation; unlabelled points and outliers stay 0
+"""Name of a class table -> id -> raw id in a prediction: only ids that the evaluator scores, and 0.
+"""
+# the ids of moving-object segmentation; unlabelled points and outliers stay 0
+_STANDS, _MOVES = (
+    9,
+    251,
+)
 _MOVING_M_S = 0.5  # points that are faster than this are moving
 _TO_MOVING = np.arange(max(SEMANTICKITTI.names) + 1)
 _TO_MOVING[list(SEMANTICKITTI.standing.values())] = list(SEMANTICKITTI.standing)
@@ -62,18 +89,26 @@ class KittiExporter(FrameExporter):
 
     def __init__(
         self,
-        grid: Annotated[str | None, "Grid to export. Default: the grid with the smallest voxels."] = None,
+        grid: Annotated[
+            str | None, "Grid to export. Default: the grid with the smallest voxels."
+        ] = None,
         *,
-        predictions: Annotated[bool, "The grids are predictions: only predictions/ is written."] = False,
+        predictions: Annotated[
+            bool, "The grids are predictions: only predictions/ is written."
+        ] = False,
         labels: Annotated[
             Literal["semantic", "moving"],
-            "moving: the labels of moving-object segmentation, 9 for static and 251 for moving points.",
+            "moving: the labels of moving-object segmentation, 9 for static and 251 for moving "
+            "points.",
         ] = "semantic",
         check: Annotated[
             Task | None,
-            "Export nothing: check the predictions in OUT for a task, as SemanticKITTI's script does. SOURCE is the benchmark's data.",
+            "Export nothing: check the predictions in OUT for a task, as SemanticKITTI's script "
+            "does. SOURCE is the benchmark's data.",
         ] = None,
-        zip: Annotated[str | None, "With --check: also pack OUT for the benchmark into this file."] = None,
+        zip: Annotated[
+            str | None, "With --check: also pack OUT for the benchmark into this file."
+        ] = None,
     ) -> None:
         check_choice("labels", labels, ("semantic", "moving"))
         if zip is not None:
@@ -93,9 +128,16 @@ class KittiExporter(FrameExporter):
         """Check and pack the predictions in `root`, if an option requests that."""
         if self.task is None:
             return None
-        ids = set(TO_PREDICTED[SEMANTICKITTI.name].values()) if self.task == "completion" else set(SEMANTICKITTI.names)
+        ids = (
+            set(TO_PREDICTED[SEMANTICKITTI.name].values())
+            if self.task == "completion"
+            else set(SEMANTICKITTI.names)
+        )
         files = check_submission(root, Path(source), self.task, ids)
-        notes = [f"{root} is a valid submission to SemanticKITTI's benchmark for {self.task}: {len(files)} files"]
+        notes = [
+            f"{root} is a valid submission to SemanticKITTI's benchmark for {self.task}: "
+            f"{len(files)} files"
+        ]
         if self.archive is not None:
             pack_submission(root, files, Path(self.archive))
             notes.append(f"{self.archive} contains them")
@@ -107,8 +149,13 @@ class KittiExporter(FrameExporter):
         return "predictions" if self.predictions else "data"
 
     def folders(self, names: Sequence[str]) -> dict[str, str]:
-        """Return sequences/NN for each name: 08 for KITTI_08, and the next free number for other names."""
-        return {name: f"sequences/{number}" for name, number in number_folders(names, "KITTI_", 2).items()}
+        """Return sequences/NN for each name: 08 for KITTI_08, and the next free number for other
+        names.
+        """
+        return {
+            name: f"sequences/{number}"
+            for name, number in number_folders(names, "KITTI_", 2).items()
+        }
 
     def check(self, sequence: storage.Sequence) -> list[str]:
         """Check the grid and the classes."""
@@ -126,7 +173,10 @@ class KittiExporter(FrameExporter):
         return super().frames(sequence)
 
     def documents(self, sequence: storage.Sequence) -> dict[str, bytes]:
-        """Return poses, calibration and times. The poses are those of the LiDAR, and Tr is the identity."""
+        """Return poses, calibration and times.
+
+        The poses are those of the LiDAR, and Tr is the identity.
+        """
         if self.predictions:
             return {}
         documents = {}
@@ -161,26 +211,39 @@ class KittiExporter(FrameExporter):
             both = labels.astype("<u4") | _instances(sequence, frame, len(labels)) << 16
             made[f"labels/{frame:06d}.label"] = both.tobytes()
         if f"predictions/{frame:06d}.label" in wanted:
-            made[f"predictions/{frame:06d}.label"] = self._labels(sequence, frame).astype("<u2").tobytes()
+            made[f"predictions/{frame:06d}.label"] = (
+                self._labels(sequence, frame).astype("<u2").tobytes()
+            )
         if f"voxels/{frame:06d}.label" in wanted:
             made |= self._voxels(sequence, frame, points)
         return made
 
     def _point_labels(self, sequence: storage.Sequence, frame: int) -> NDArray[np.integer]:
-        """Return (N,) ids of SemanticKITTI: those of moving actors where the class or the flow of a point says that it moves."""
+        """Return (N,) ids of SemanticKITTI: those of moving actors where the class or the flow of a
+        point says that it moves.
+        """
         table, where = sequence.metadata.classes, f"{sequence.location}: labels of frame {frame}"
         labels = self._raw_ids(table, sequence.read("labels", frame), where)
-        if not table.moving and frame in sequence.frames("flow"):  # without classes for moving actors
+        # without classes for moving actors
+        if not table.moving and frame in sequence.frames("flow"):
             flow = np.asarray(sequence.read("flow", frame))
             if len(flow) != len(labels):
                 where = f"{sequence.location}: flow of frame {frame}"
-                raise FormatError(where, expected=f"{len(labels)} rows, as labels", found=str(len(flow)))
-            labels = np.where(np.linalg.norm(flow, axis=1) > _MOVING_M_S, _TO_MOVING[labels], labels)
+                raise FormatError(
+                    where, expected=f"{len(labels)} rows, as labels", found=str(len(flow))
+                )
+            labels = np.where(
+                np.linalg.norm(flow, axis=1) > _MOVING_M_S, _TO_MOVING[labels], labels
+            )
         if self.labels == "moving":
-            labels = np.select([np.isin(labels, sorted(SEMANTICKITTI.moving)), labels > 1], [_MOVES, _STANDS], 0)
+            labels = np.select(
+                [np.isin(labels, sorted(SEMANTICKITTI.moving)), labels > 1], [_MOVES, _STANDS], 0
+            )
         return labels
 
-    def _voxels(self, sequence: storage.Sequence, frame: int, points: NDArray[np.float32]) -> Mapping[str, bytes]:
+    def _voxels(
+        self, sequence: storage.Sequence, frame: int, points: NDArray[np.float32]
+    ) -> Mapping[str, bytes]:
         """Return the original voxel files if they were kept, else files made from the grid."""
         kept = _kept_files(sequence, frame) if self.grid is None else {}
         if kept:
@@ -201,7 +264,9 @@ class KittiExporter(FrameExporter):
         """Return (X, Y, Z) ids of SemanticKITTI, right-handed."""
         name = self._grid_of(sequence)
         where = f"{sequence.location}: {name} of frame {frame}"
-        labels = self._raw_ids(sequence.classes_of(name), sequence.read(f"{name}/labels", frame), where)
+        labels = self._raw_ids(
+            sequence.classes_of(name), sequence.read(f"{name}/labels", frame), where
+        )
         return labels if _is_right_handed(sequence) else mirror_grid(labels)
 
     def _counts(self, sequence: storage.Sequence, frame: int) -> NDArray[np.floating]:
@@ -226,24 +291,34 @@ class KittiExporter(FrameExporter):
         return choose_grid(sequence, sequence.grids, self.grid)
 
     def _mapping(self, classes: ClassTable, where: str) -> dict[int, int]:
-        """Return the map from the ids of a class table to SemanticKITTI's; raise if it does not exist."""
+        """Return the map from the ids of a class table to SemanticKITTI's; raise if it does not
+        exist.
+        """
         if not self.predictions:
             return mapping_of(TO_RAW, "raw", classes, where)
-        return {label: UNSCORED.get(raw, raw) for label, raw in mapping_of(TO_PREDICTED, "raw", classes, where).items()}
+        return {
+            label: UNSCORED.get(raw, raw)
+            for label, raw in mapping_of(TO_PREDICTED, "raw", classes, where).items()
+        }
 
-    def _raw_ids(self, classes: ClassTable, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.int32]:
+    def _raw_ids(
+        self, classes: ClassTable, labels: NDArray[np.unsignedinteger], where: str
+    ) -> NDArray[np.int32]:
         """Map class ids to SemanticKITTI's.
 
         Raises:
-            FormatError: an id is not in the table, or nothing maps the table to SemanticKITTI's classes.
+            FormatError: an id is not in the table, or nothing maps the table to SemanticKITTI's
+                classes.
         """
         return classes_of(labels, lookup_of(self._mapping(classes, where)), classes, where)
 
 
 def _instances(sequence: storage.Sequence, frame: int, count: int) -> NDArray[np.uint32]:
-    """Return the (count,) numbers of actors in a frame as SemanticKITTI's files hold them, 0 for none.
+    """Return the (count,) numbers of actors in a frame as SemanticKITTI's files hold them, 0 for
+    none.
 
-    Numbers that `convert` made from SemanticKITTI's own numbers have the class in the upper half. The lower half is the own number.
+    Numbers that `convert` made from SemanticKITTI's own numbers have the class in the upper half.
+    The lower half is the own number.
 
     Raises:
         FormatError: a number needs more than 16 bits, or there are not as many as labels.
@@ -274,7 +349,9 @@ def _kept_files(sequence: storage.Sequence, frame: int) -> dict[str, bytes]:
     kept = {}
     for suffix in (".label", *MASKS):
         try:
-            kept[f"{frame:06d}{suffix}"] = sequence.read_document(f"{VOXEL_FILES}/{frame:06d}{suffix}")
+            kept[f"{frame:06d}{suffix}"] = sequence.read_document(
+                f"{VOXEL_FILES}/{frame:06d}{suffix}"
+            )
         except (MissingDataError, FileNotFoundError):
             continue
     return kept

@@ -1,7 +1,8 @@
-"""Sequences of the layout as the files of Occ3D-nuScenes: `gts/{scene}/{token}/labels.npz` and annotations.json.
+"""Sequences of the layout as the files of Occ3D-nuScenes: `gts/{scene}/{token}/labels.npz` and
+annotations.json.
 
-The format is that of the benchmark's description and loaders. nuScenes has tokens; here they are made from the name of the sequence and the
-number of the frame.
+The format is that of the benchmark's description and loaders. nuScenes has tokens; here they are
+made from the name of the sequence and the number of the frame.
 """
 
 from __future__ import annotations
@@ -24,7 +25,12 @@ from carlasc.core.geometry import quaternions_of, translation
 from carlasc.core.grids import GridSpec
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
-from carlasc_converters.exporters.grid_exporter import GridExporter, GridName, Predictions, sensor_height
+from carlasc_converters.exporters.grid_exporter import (
+    GridExporter,
+    GridName,
+    Predictions,
+    sensor_height,
+)
 
 _ANNOTATIONS = "annotations.json"
 _CAMERAS = "mask_camera is a copy of mask_lidar, because no cameras are known"
@@ -43,7 +49,9 @@ def frame_token(name: str, frame: int) -> str:
 
 
 class Occ3dExporter(GridExporter):
-    """Writes grids as Occ3D-nuScenes has them: 200 x 200 x 16 voxels of 0.4 m around the vehicle, with the origin on the ground."""
+    """Writes grids as Occ3D-nuScenes has them: 200 x 200 x 16 voxels of 0.4 m around the vehicle,
+    with the origin on the ground.
+    """
 
     title = "Occ3D-nuScenes: gts/SCENE/TOKEN/labels.npz and annotations.json"
     target = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
@@ -57,7 +65,9 @@ class Occ3dExporter(GridExporter):
         *,
         predictions: Predictions = False,
         height_m: Annotated[
-            float | None, "Height of the sensor above the ground, in metres. Default: that in carlasc.json, or 1.8."
+            float | None,
+            "Height of the sensor above the ground, in metres. Default: that in carlasc.json, or "
+            "1.8.",
         ] = None,
     ) -> None:
         super().__init__(grid, predictions=predictions)
@@ -72,7 +82,10 @@ class Occ3dExporter(GridExporter):
         notes = []
         height, assumed = sensor_height(sequence, self.height_m)
         if assumed:
-            notes.append(f"the height of the sensor is not known: {height:g} m is assumed; `height_m` sets it")
+            notes.append(
+                f"the height of the sensor is not known: {height:g} m is assumed; `height_m` sets "
+                f"it"
+            )
         if layout.POSES not in sequence.documents():
             notes.append(f"{sequence.location} has no poses, and so annotations.json has none")
         if not self.predictions and not self._has_seen(sequence):
@@ -88,9 +101,15 @@ class Occ3dExporter(GridExporter):
         return (f"{frame_token(sequence.name, frame)}/labels.npz",)
 
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
-        """Return semantics and masks. Without the field `seen`, voxels that the LiDAR observed count as observed by cameras."""
+        """Return semantics and masks.
+
+        Without the field `seen`, voxels that the LiDAR observed count as observed by cameras.
+        """
         labels, known = self.read(sequence, frame)
-        semantics, mask = np.where(known, labels, self.free).astype(np.uint8), known.astype(np.uint8)
+        semantics, mask = (
+            np.where(known, labels, self.free).astype(np.uint8),
+            known.astype(np.uint8),
+        )
         seen = self._read_seen(sequence, frame) & mask if self._has_seen(sequence) else mask
         buffer = io.BytesIO()
         np.savez_compressed(buffer, semantics=semantics, mask_lidar=mask, mask_camera=seen)
@@ -104,7 +123,9 @@ class Occ3dExporter(GridExporter):
         name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
         seen = place.turn((sequence.read(f"{name}/seen", frame) > 0).astype(np.uint8), axes)
         spec = place.spec_in(sequence.grids[name], axes)
-        return resample_to(seen, np.ones(spec.size, np.bool_), spec, self.target)[0].astype(np.uint8)
+        return resample_to(seen, np.ones(spec.size, np.bool_), spec, self.target)[0].astype(
+            np.uint8
+        )
 
     def index(self, root: Path, exported: Sequence[Exported]) -> Files:
         """Return annotations.json, with the scenes that are in it already."""
@@ -118,7 +139,9 @@ class Occ3dExporter(GridExporter):
                 if _SPLITS.get(part.sequence.split or "") == key:
                     names.add(part.sequence.name)
             scenes[part.sequence.name] = self._scene(part)
-        lists = {key: sorted(names) for key, names in splits.items() if names or key != "test_split"}
+        lists = {
+            key: sorted(names) for key, names in splits.items() if names or key != "test_split"
+        }
         copied = not all(self._has_seen(part.sequence) for part in exported)
         about = {"carlasc": _CAMERAS if copied else _SEEN}
         content = lists | about | {"scene_infos": {name: scenes[name] for name in sorted(scenes)}}
@@ -130,7 +153,12 @@ class Occ3dExporter(GridExporter):
         documents = sequence.documents()
         scene = {}
         rows = zip(
-            tokens[:-2], part.frames, tokens[1:-1], tokens[2:], sequence.times_of(part.frames).tolist(), strict=True
+            tokens[:-2],
+            part.frames,
+            tokens[1:-1],
+            tokens[2:],
+            sequence.times_of(part.frames).tolist(),
+            strict=True,
         )
         for before, frame, token, after, seconds in rows:
             scene[token] = {
@@ -152,4 +180,7 @@ def _pose(sequence: storage.Sequence, frame: int, place: TargetFrame) -> dict[st
     vehicle_T_scan = translation((0.0, 0.0, place.height_m))
     scan_T_vehicle = translation((0.0, 0.0, -place.height_m))
     pose = vehicle_T_scan @ first_T_scan @ scan_T_vehicle
-    return {"translation": pose[:3, 3].tolist(), "rotation": quaternions_of(pose[None, :3, :3])[0].tolist()}
+    return {
+        "translation": pose[:3, 3].tolist(),
+        "rotation": quaternions_of(pose[None, :3, :3])[0].tolist(),
+    }

@@ -1,4 +1,6 @@
-"""Occluded voxels: those that a sensor at the origin cannot see because of occupied voxels before them."""
+"""Occluded voxels: those that a sensor at the origin cannot see because of occupied voxels before
+them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ class _Columns(NamedTuple):
     """The occupied voxels of a grid, by column.
 
     Attributes:
-        runs: (2 R,) int32, per run of occupied voxels the face below the first and the face above the last, column by column.
+        runs: (2 R,) int32, per run of occupied voxels the face below the first and the face above
+            the last, column by column.
         first: (X * Y + 1,) int32, place of the runs of each column in `runs`.
     """
 
@@ -28,12 +31,16 @@ class _Columns(NamedTuple):
 
 
 class _Heights(NamedTuple):
-    """The heights of the lines of up to 32 voxels of any column. A new stage begins each time that a line passes a horizontal face.
+    """The heights of the lines of up to 32 voxels of any column.
+
+    A new stage begins each time that a line passes a horizontal face.
 
     Attributes:
-        times: (N + 1,) float64, the fraction of the way to the sensor at which each stage ends; infinite for the last one.
+        times: (N + 1,) float64, the fraction of the way to the sensor at which each stage ends;
+            infinite for the last one.
         stages: (_PARTS,) int32, the stage at the beginning of each part of the way.
-        below: (N + 1, Z + 1) uint32, per stage and face the voxels whose lines are below it, as bits.
+        below: (N + 1, Z + 1) uint32, per stage and face the voxels whose lines are below it, as
+            bits.
         up: the voxels whose lines go up, as bits.
         down: the other voxels, as bits.
     """
@@ -46,13 +53,16 @@ class _Heights(NamedTuple):
 
 
 def occluded_voxels(occupied: NDArray[np.bool_], spec: GridSpec) -> NDArray[np.bool_]:
-    """Return the occupied voxels, and the voxels whose line to the sensor passes through an occupied one.
+    """Return the occupied voxels, and the voxels whose line to the sensor passes through an
+    occupied one.
 
-    The line goes from the centre of a voxel to the sensor, which is at the origin, from voxel to voxel (Amanatides and Woo 1987): through
-    the nearest face, and for equally near faces x before y before z. It ends at the sensor, or where it leaves the grid.
+    The line goes from the centre of a voxel to the sensor, which is at the origin, from voxel to
+    voxel (Amanatides and Woo 1987): through the nearest face, and for equally near faces x before y
+    before z. It ends at the sensor, or where it leaves the grid.
 
-    The lines of all voxels of a column pass the same columns at the same times, and the times at which a line passes horizontal faces
-    depend only on the height of its voxel. One walk in 2-D is therefore enough per column; the bits of an integer are its voxels.
+    The lines of all voxels of a column pass the same columns at the same times, and the times at
+    which a line passes horizontal faces depend only on the height of its voxel. One walk in 2-D is
+    therefore enough per column; the bits of an integer are its voxels.
 
     Args:
         occupied: (X, Y, Z) bool.
@@ -66,7 +76,9 @@ def occluded_voxels(occupied: NDArray[np.bool_], spec: GridSpec) -> NDArray[np.b
     occluded = np.zeros(occupied.shape, np.bool_)
     for lowest in range(0, spec.size[2], _BITS):
         part = occluded[..., lowest : lowest + _BITS]
-        _occlude(columns, sensor, _heights(lowest, part.shape[2], spec.size[2], float(sensor[2])), part)
+        _occlude(
+            columns, sensor, _heights(lowest, part.shape[2], spec.size[2], float(sensor[2])), part
+        )
     return occluded
 
 
@@ -79,7 +91,9 @@ def _columns(occupied: NDArray[np.bool_]) -> _Columns:
 
 
 def _heights(lowest: int, count: int, rows: int, sensor: float) -> _Heights:
-    """Return the heights of the lines of `count` voxels from the height `lowest` on, in a grid of `rows`; `sensor` is in voxels."""
+    """Return the heights of the lines of `count` voxels from the height `lowest` on, in a grid of
+    `rows`; `sensor` is in voxels.
+    """
     start = np.arange(lowest, lowest + count)
     bits = np.uint32(1) << np.arange(count, dtype=np.uint32)
     way = sensor - start - 0.5
@@ -94,18 +108,24 @@ def _heights(lowest: int, count: int, rows: int, sensor: float) -> _Heights:
     order = np.argsort(times[voxel, step])
     voxel, step = voxel[order], step[order]
     below = np.empty((len(order) + 1, rows + 1), np.uint32)
-    below[0] = np.bitwise_or.reduce(np.where(start[:, None] < np.arange(rows + 1), bits[:, None], 0), axis=0)
+    below[0] = np.bitwise_or.reduce(
+        np.where(start[:, None] < np.arange(rows + 1), bits[:, None], 0), axis=0
+    )
     # A line that passes a face changes its side of this face only.
     below[1:] = 0
     below[np.arange(1, len(below)), faces[voxel, step]] = bits[voxel]
     np.bitwise_xor.accumulate(below, axis=0, out=below)
     ends = np.append(times[voxel, step], np.inf)
     stages = np.searchsorted(ends, np.arange(_PARTS) / _PARTS)
-    return _Heights(ends, stages.astype(np.int32), below, np.uint32(bits[up].sum()), np.uint32(bits[~up].sum()))
+    return _Heights(
+        ends, stages.astype(np.int32), below, np.uint32(bits[up].sum()), np.uint32(bits[~up].sum())
+    )
 
 
 @cached(error_model="python")
-def _occlude(columns: _Columns, sensor: NDArray[np.float64], heights: _Heights, occluded: NDArray[np.bool_]) -> None:
+def _occlude(
+    columns: _Columns, sensor: NDArray[np.float64], heights: _Heights, occluded: NDArray[np.bool_]
+) -> None:
     """Walk from every column to the sensor.
 
     Args:
@@ -123,12 +143,19 @@ def _occlude(columns: _Columns, sensor: NDArray[np.float64], heights: _Heights, 
 
 @numba.njit(nogil=True)
 def _walk(
-    columns: _Columns, sensor: NDArray[np.float64], heights: _Heights, x: int, y: int, depth: int, width: int
+    columns: _Columns,
+    sensor: NDArray[np.float64],
+    heights: _Heights,
+    x: int,
+    y: int,
+    depth: int,
+    width: int,
 ) -> np.uint32:
     """Return the voxels of column (x, y) whose line to the sensor meets an occupied voxel, as bits."""
     rx, ry = sensor[0] - x - 0.5, sensor[1] - y - 0.5
     sx, sy = (1 if rx > 0 else -1), (1 if ry > 0 else -1)
-    # Per axis: the fraction of the way between two faces (d), and the fraction at which the next face comes (t).
+    # Per axis: the fraction of the way between two faces (d), and the fraction at which the next
+    # face comes (t).
     dx = 1 / abs(rx) if rx != 0 else np.inf
     dy = 1 / abs(ry) if ry != 0 else np.inf
     tx, ty = dx / 2, dy / 2

@@ -1,4 +1,6 @@
-"""Sequences of the layout as the files of OpenOccupancy-nuScenes: `scene_{token}/occupancy/{token}.npy`."""
+"""Sequences of the layout as the files of OpenOccupancy-nuScenes:
+`scene_{token}/occupancy/{token}.npy`.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,11 @@ from carlasc_converters.exporters.occ3d import frame_token, scene_token
 
 
 class OpenOccupancyExporter(GridExporter):
-    """Writes the occupied voxels as OpenOccupancy has them: 512 x 512 x 40 voxels of 0.2 m around the LiDAR, x to the right, y forward.
+    """Writes the occupied voxels as OpenOccupancy has them: 512 x 512 x 40 voxels of 0.2 m around
+    the LiDAR, x to the right, y forward.
 
-    The classes are those of Occ3D, whose class 0, "others", is noise here. Free and unknown voxels are both absent.
+    The classes are those of Occ3D, whose class 0, "others", is noise here. Free and unknown voxels
+    are both absent.
     """
 
     title = "OpenOccupancy-nuScenes: scene_TOKEN/occupancy/TOKEN.npy"

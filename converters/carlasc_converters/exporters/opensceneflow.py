@@ -1,6 +1,8 @@
-"""Sequences of the layout as the files of OpenSceneFlow: one HDF5 file per log, with a group per scan, and the indices of its loader.
+"""Sequences of the layout as the files of OpenSceneFlow: one HDF5 file per log, with a group per
+scan, and the indices of its loader.
 
-The pickled indices are written because the loader of the other project needs them. This module never reads a pickle.
+The pickled indices are written because the loader of the other project needs them. This module
+never reads a pickle.
 """
 
 from __future__ import annotations
@@ -26,10 +28,13 @@ from carlasc.storage import layout
 from carlasc_converters.exporters.classes import classes_of, lookup_of, mapping_of
 
 _EVALUATED = 5  # every fifth scan with flow is evaluated, as in the project's own script
-_EVALUATED_M = 50.0  # points within this distance along x and y are evaluated, as in the challenge of Argoverse 2
+# points within this distance along x and y are evaluated, as in the challenge of Argoverse 2
+_EVALUATED_M = 50.0
 _FIRST_NS = (
     10**18
-)  # name of the first scan's group: the loader orders names as text, so all need the same number of digits
+    # name of the first scan's group: the loader orders names as text, so all need the same number
+    # of digits
+)
 _PROTOCOL = 4  # of the pickle: fixed, so that the bytes do not depend on the version of Python
 
 # Argoverse 2's categories in alphabetical order, from 1; 0 is none.
@@ -45,13 +50,17 @@ CATEGORIES: Mapping[str, Mapping[int, int]] = {
     "carla": {label: _CARLA.get(label, 0) for label in range(25)},
     "carlasc11": {label: _CARLA.get(label, 0) for label in range(11)},
     SEMANTICKITTI.name: {label: _KITTI.get(label, 0) for label in SEMANTICKITTI.names},
-    "argoverse2": {label: label if label <= 30 else 0 for label in range(33)},  # its converter numbers them so
+    # its converter numbers them so
+    "argoverse2": {label: label if label <= 30 else 0 for label in range(33)},
 }
 """Name of a class table -> id -> category of Argoverse 2."""
 
 
 class OpenSceneFlowExporter(SequenceExporter):
-    """Writes scans, poses and scene flow. Points have right-handed axes and their origin at the sensor."""
+    """Writes scans, poses and scene flow.
+
+    Points have right-handed axes and their origin at the sensor.
+    """
 
     title = "OpenSceneFlow: SPLIT/LOG.h5 and SPLIT/index_total.pkl, index_flow.pkl, index_eval.pkl"
 
@@ -60,7 +69,10 @@ class OpenSceneFlowExporter(SequenceExporter):
         return dict.fromkeys(names, ".")
 
     def file(self, sequence: storage.Sequence) -> str:
-        """Return SPLIT/LOG.h5. The loader takes the name up to the first dot as the name of the log."""
+        """Return SPLIT/LOG.h5.
+
+        The loader takes the name up to the first dot as the name of the log.
+        """
         split = "" if sequence.split is None else f"{sequence.split.lower()}/"
         return f"{split}{sequence.name.replace('.', '_') or 'log'}.h5"
 
@@ -78,11 +90,16 @@ class OpenSceneFlowExporter(SequenceExporter):
                 raise MissingDataError(sequence.location, expected=expected, found="none")
         notes = []
         if "labels" not in fields:
-            notes.append(f"{sequence.location} has no labels: the ground is found by the shape of each scan")
+            notes.append(
+                f"{sequence.location} has no labels: the ground is found by the shape of each scan"
+            )
         else:
             mapping_of(CATEGORIES, "category", sequence.metadata.classes, sequence.location)
         if layout.TIMES not in sequence.documents():
-            notes.append(f"{sequence.location} has no times: {layout.FRAME_PERIOD_S} s between frames is assumed")
+            notes.append(
+                f"{sequence.location} has no times: {layout.FRAME_PERIOD_S} s between frames is "
+                f"assumed"
+            )
         self._timestamps(sequence)
         return notes
 
@@ -93,10 +110,13 @@ class OpenSceneFlowExporter(SequenceExporter):
     def frames_in(self, path: Path, sequence: storage.Sequence) -> list[int]:
         """Return the frames that a file has a group for."""
         groups = set(_scans_in(path))
-        return [frame for frame, timestamp in self._timestamps(sequence).items() if timestamp in groups]
+        return [
+            frame for frame, timestamp in self._timestamps(sequence).items() if timestamp in groups
+        ]
 
     def index(self, root: Path, exported: Sequence[Exported]) -> Files:
-        """Return the indices of each folder that was written to, with the logs that were in it already.
+        """Return the indices of each folder that was written to, with the logs that were in it
+        already.
 
         They list all scans, those with flow, and those that are evaluated.
         """
@@ -104,7 +124,10 @@ class OpenSceneFlowExporter(SequenceExporter):
         made: dict[str, bytes] = {}
         for folder in sorted(folders):
             logs = {path.stem: _scans_in(path) for path in sorted(folder.glob("*.h5"))}
-            flows = {log: [time for time, has_flow in scans.items() if has_flow] for log, scans in logs.items()}
+            flows = {
+                log: [time for time, has_flow in scans.items() if has_flow]
+                for log, scans in logs.items()
+            }
             total = {log: list(scans) for log, scans in logs.items()}
             evaluated = {log: times[::_EVALUATED] for log, times in flows.items()}
             for name, chosen in (("total", total), ("flow", flows), ("eval", evaluated)):
@@ -116,18 +139,26 @@ class OpenSceneFlowExporter(SequenceExporter):
     def make_frame(self, sequence: storage.Sequence, frame: int) -> dict[str, NDArray[Any]]:
         """Return the arrays of a scan; those of flow only if another scan follows."""
         left = sequence.metadata.axes == "left"
-        fields = [name for name in ("labels", "instances", "flow", "seconds", "sensor") if _has(sequence, name, frame)]
+        fields = [
+            name
+            for name in ("labels", "instances", "flow", "seconds", "sensor")
+            if _has(sequence, name, frame)
+        ]
         read = {name: sequence.read(name, frame) for name in fields}
         points = np.asarray(sequence.read("points", frame)[:, :3], np.float32)
         for name, array in read.items():
             if len(array) != len(points):
                 where = f"{sequence.location}: {name} of frame {frame}"
-                raise FormatError(where, expected=f"{len(points)} rows, as points", found=str(len(array)))
+                raise FormatError(
+                    where, expected=f"{len(points)} rows, as points", found=str(len(array))
+                )
         points = mirror_points(points) if left else points
         pose = _pose(sequence, frame)
         made: dict[str, NDArray[Any]] = {
             "lidar": points,
-            "lidar_id": read["sensor"].astype(np.uint8) if "sensor" in read else np.zeros(len(points), np.uint8),
+            "lidar_id": read["sensor"].astype(np.uint8)
+            if "sensor" in read
+            else np.zeros(len(points), np.uint8),
             "pose": pose,
         }
         if "seconds" in read:
@@ -136,7 +167,9 @@ class OpenSceneFlowExporter(SequenceExporter):
         if "labels" in read:
             where = f"{sequence.location}: labels of frame {frame}"
             lookup = lookup_of(mapping_of(CATEGORIES, "category", table, where))
-            made["flow_category_indices"] = classes_of(read["labels"], lookup, table, where).astype(np.uint8)
+            made["flow_category_indices"] = classes_of(read["labels"], lookup, table, where).astype(
+                np.uint8
+            )
             made["ground_mask"] = np.isin(read["labels"], sorted(table.ground))
         else:
             made["ground_mask"] = ground_points(points)
@@ -155,7 +188,8 @@ class OpenSceneFlowExporter(SequenceExporter):
         return made
 
     def _timestamps(self, sequence: storage.Sequence) -> dict[int, str]:
-        """Return the name of each frame's group: its time in nanoseconds, after that of the first scan, which is always the same.
+        """Return the name of each frame's group: its time in nanoseconds, after that of the first
+        scan, which is always the same.
 
         Raises:
             FormatError: times do not increase.
@@ -165,7 +199,11 @@ class OpenSceneFlowExporter(SequenceExporter):
         for before, after, frame in zip(times, times[1:], frames[1:], strict=False):
             if after <= before:
                 where = f"{sequence.location}/{layout.TIMES}"
-                raise FormatError(where, expected="times that increase", found=f"{after / 1e9:g} s at frame {frame}")
+                raise FormatError(
+                    where,
+                    expected="times that increase",
+                    found=f"{after / 1e9:g} s at frame {frame}",
+                )
         return {frame: str(_FIRST_NS + time) for frame, time in zip(frames, times, strict=True)}
 
 
@@ -183,14 +221,22 @@ class _Step:
         now: Boxes | None,
         later: Boxes | None,
     ) -> dict[str, NDArray[Any]]:
-        """Return the displacement of points to the next scan, in its frame, and the points for which it is known.
+        """Return the displacement of points to the next scan, in its frame, and the points for
+        which it is known.
 
-        An object with boxes in both scans moves with its box; without a box in the next scan, its points are not valid. Other points move
-        by their velocity. Without velocities, points outside of boxes are static, and scans without annotation have no valid points.
+        An object with boxes in both scans moves with its box; without a box in the next scan, its
+        points are not valid. Other points move by their velocity. Without velocities, points
+        outside of boxes are static, and scans without annotation have no valid points.
         """
-        moved = points.astype(np.float64) if velocity is None else points + velocity.astype(np.float64) * self.seconds
+        moved = (
+            points.astype(np.float64)
+            if velocity is None
+            else points + velocity.astype(np.float64) * self.seconds
+        )
         there = transform_points(self.next_T_now, moved)
-        valid = np.full(len(points), velocity is not None or (now is not None and later is not None))
+        valid = np.full(
+            len(points), velocity is not None or (now is not None and later is not None)
+        )
         if now is not None and later is not None:
             owners = _owners(now, points) if instances is None else instances
             rows = {int(track): row for row, track in enumerate(later.tracks)}
@@ -209,7 +255,10 @@ class _Step:
 
 
 class _LogFile(SequenceFile):
-    """An HDF5 file that is being written. Objects are numbered from 1 in the order in which they appear, because numbers have 16 bits."""
+    """An HDF5 file that is being written.
+
+    Objects are numbered from 1 in the order in which they appear, because numbers have 16 bits.
+    """
 
     def __init__(self, path: Path, timestamps: Mapping[int, str]) -> None:
         self._file = import_extra("h5py", "hdf5").File(path, "w")
@@ -219,7 +268,10 @@ class _LogFile(SequenceFile):
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._file.close()
 
@@ -237,7 +289,9 @@ class _LogFile(SequenceFile):
         for instance in found.tolist():
             self._numbers.setdefault(instance, len(self._numbers))
         if len(self._numbers) > np.iinfo(np.int16).max + 1:
-            raise FormatError(self._path, expected="at most 32767 objects", found=str(len(self._numbers) - 1))
+            raise FormatError(
+                self._path, expected="at most 32767 objects", found=str(len(self._numbers) - 1)
+            )
         return np.array([self._numbers[instance] for instance in found.tolist()], np.int16)[
             np.searchsorted(found, instances)
         ]
@@ -256,7 +310,9 @@ def _scans_in(path: Path) -> dict[str, bool]:
             return {name: "flow" in file[name] for name in sorted(file, key=int)}
     except (OSError, ValueError) as error:
         advice = "remove the file, or export again with `overwrite=True`"
-        raise FormatError(path, expected="an HDF5 file of scans", found="something else", advice=advice) from error
+        raise FormatError(
+            path, expected="an HDF5 file of scans", found="something else", advice=advice
+        ) from error
 
 
 def _has(sequence: storage.Sequence, field: str, frame: int) -> bool:

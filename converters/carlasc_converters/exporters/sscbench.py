@@ -1,4 +1,6 @@
-"""Sequences of the layout as the files of SSCBench-KITTI-360: `data_2d_raw/2013_05_28_drive_{XXXX}_sync/voxels/`."""
+"""Sequences of the layout as the files of SSCBench-KITTI-360:
+`data_2d_raw/2013_05_28_drive_{XXXX}_sync/voxels/`.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +32,16 @@ _RAW = {
     for name, mapping in TO_SSCBENCH.items()
 } | {
     SEMANTICKITTI.name: _KITTI,
-    SEMANTICKITTI19.name: {label: SEMANTICKITTI.id_of(name) for label, name in SEMANTICKITTI19.names.items()},
+    SEMANTICKITTI19.name: {
+        label: SEMANTICKITTI.id_of(name) for label, name in SEMANTICKITTI19.names.items()
+    },
 }
 
 
 class SscBenchExporter(GridExporter):
-    """Writes grids as SSCBench-KITTI-360 has them: 256 x 256 x 32 voxels of 0.2 m before the LiDAR, of every 5th frame."""
+    """Writes grids as SSCBench-KITTI-360 has them: 256 x 256 x 32 voxels of 0.2 m before the LiDAR,
+    of every 5th frame.
+    """
 
     title = "SSCBench-KITTI-360: data_2d_raw/DRIVE/voxels/NNNNNN.label, .invalid and .bin"
     target = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
@@ -62,7 +68,9 @@ class SscBenchExporter(GridExporter):
         return "predictions" if self.predictions else "data"
 
     def folders(self, names: Sequence[str]) -> dict[str, str]:
-        """Return data_2d_raw/2013_05_28_drive_XXXX_sync for each name: 0003 for KITTI360_0003, and the next free number for other names."""
+        """Return data_2d_raw/2013_05_28_drive_XXXX_sync for each name: 0003 for KITTI360_0003, and
+        the next free number for other names.
+        """
         return {
             name: f"data_2d_raw/2013_05_28_drive_{number}_sync"
             for name, number in number_folders(names, "KITTI360_", 4).items()
@@ -79,10 +87,14 @@ class SscBenchExporter(GridExporter):
         return tuple(f"voxels/{frame:06d}{suffix}" for suffix in (".label", ".invalid", ".bin"))
 
     def make_frame(self, sequence: storage.Sequence, frame: int) -> Files:
-        """Return the raw ids, one byte for each unknown voxel, and one bit for each voxel of the frame's own scan."""
+        """Return the raw ids, one byte for each unknown voxel, and one bit for each voxel of the
+        frame's own scan.
+        """
         labels, known = self.read(sequence, frame)
         content: list[bytes] = [np.where(known, labels, 0).astype("<u2").tobytes()]
         if not self.predictions:
             content.append((~known).astype(np.uint8).tobytes())
-            content.append(pack_bits(scan_occupancy(sequence, read_points(sequence, frame), self.target)))
+            content.append(
+                pack_bits(scan_occupancy(sequence, read_points(sequence, frame), self.target))
+            )
         return dict(zip(self.frame_files(sequence, frame), content, strict=True))

@@ -1,4 +1,6 @@
-"""Submissions to SemanticKITTI's benchmark: a folder of predictions is checked as by `validate_submission.py`, and packed."""
+"""Submissions to SemanticKITTI's benchmark: a folder of predictions is checked as by
+`validate_submission.py`, and packed.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,11 @@ from carlasc.storage.files import make_folder, rename, sync_tree, unfinished, wr
 Task = Literal["completion", "segmentation"]
 SEQUENCES = range(11, 22)
 """The sequences that the benchmark scores."""
-_INPUTS = {"completion": "voxels", "segmentation": "velodyne"}  # the input of each prediction, in the data set
+# the input of each prediction, in the data set
+_INPUTS = {
+    "completion": "voxels",
+    "segmentation": "velodyne",
+}
 _BITS, _BYTES_PER_POINT = 8, 16  # of the inputs: voxels in a byte, and the size of a point
 _DESCRIPTION = "description.txt"  # may lie beside sequences/
 
@@ -25,8 +31,10 @@ def check_submission(root: Path, dataset: Path, task: Task, ids: Collection[int]
 
     Args:
         root: folder that holds `sequences/` with the predictions.
-        dataset: the benchmark's data: `sequences/NN/voxels/000000.bin` for completion, `sequences/NN/velodyne/000000.bin` for segmentation.
-        task: "completion", uint16 per voxel, or "segmentation", uint32 per point with the class in the lower half.
+        dataset: the benchmark's data: `sequences/NN/voxels/000000.bin` for completion,
+            `sequences/NN/velodyne/000000.bin` for segmentation.
+        task: "completion", uint16 per voxel, or "segmentation", uint32 per point with the class in
+            the lower half.
         ids: the class ids that the benchmark's evaluator accepts.
 
     Returns:
@@ -34,30 +42,44 @@ def check_submission(root: Path, dataset: Path, task: Task, ids: Collection[int]
 
     Raises:
         MissingDataError: a sequence or a file is missing, in `root` or in `dataset`.
-        FormatError: the size of a file does not match its input, an id is not a class, or a file is not needed.
+        FormatError: the size of a file does not match its input, an id is not a class, or a file is
+            not needed.
     """
     wanted: list[Path] = []
     for number in SEQUENCES:
-        inputs, folder = dataset / f"sequences/{number}/{_INPUTS[task]}", Path(f"sequences/{number}/predictions")
+        inputs, folder = (
+            dataset / f"sequences/{number}/{_INPUTS[task]}",
+            Path(f"sequences/{number}/predictions"),
+        )
         scans = {path.stem: path for path in sorted(inputs.glob("*.bin"))}
         if not scans:
-            raise MissingDataError(inputs, expected="the inputs of a test sequence, 000000.bin and so on", found="none")
+            raise MissingDataError(
+                inputs, expected="the inputs of a test sequence, 000000.bin and so on", found="none"
+            )
         if not (root / folder).is_dir():
             raise MissingDataError(
-                root / folder, expected=f"a prediction for each of {len(scans)} inputs", found="none"
+                root / folder,
+                expected=f"a prediction for each of {len(scans)} inputs",
+                found="none",
             )
         names = {path.name for path in (root / folder).iterdir()}
         if missing := [f"{stem}.label" for stem in scans if f"{stem}.label" not in names]:
             there = len(scans) - len(missing)
             found = f"{there}, without {first_names(missing, 3)}"
-            raise MissingDataError(root / folder, expected=f"{len(scans)} files of predictions", found=found)
+            raise MissingDataError(
+                root / folder, expected=f"{len(scans)} files of predictions", found=found
+            )
         if task == "completion" and (more := sorted(names - {f"{stem}.label" for stem in scans})):
             found = f"{len(more)} more: {first_names(more, 3)}"
-            raise FormatError(root / folder, expected=f"no more than {len(scans)} files", found=found)
+            raise FormatError(
+                root / folder, expected=f"no more than {len(scans)} files", found=found
+            )
         for stem, scan in scans.items():
             wanted.append(folder / f"{stem}.label")
             _check_file(root / wanted[-1], scan, task, ids)
-    others = sorted(path.name for path in (root / "sequences").iterdir() if path.name not in map(str, SEQUENCES))
+    others = sorted(
+        path.name for path in (root / "sequences").iterdir() if path.name not in map(str, SEQUENCES)
+    )
     if task == "completion" and others:
         found = f"also {first_names(others, 3)}"
         raise FormatError(root / "sequences", expected="the sequences 11 to 21", found=found)
@@ -78,21 +100,30 @@ def _check_file(path: Path, scan: Path, task: Task, ids: Collection[int]) -> Non
     if bad:
         raise FormatError(
             path, expected=f"class ids that the evaluator takes, {', '.join(map(str, sorted(ids)))}",
-            found=f"{bad[0]} ({counts[bad[0]]} times)", advice="`carlasc export kitti --predictions` writes only these",
+            found=f"{bad[0]} ({counts[bad[0]]} times)", advice="`carlasc export kitti "
+                                                               "--predictions` writes only these",
         )  # fmt: skip
 
 
 def pack_submission(root: Path, files: Iterable[Path], archive: Path) -> None:
-    """Write files of `root` to a zip with entries for their folders, as the benchmark requires. The zip is complete or does not exist.
+    """Write files of `root` to a zip with entries for their folders, as the benchmark requires.
+
+    The zip is complete or does not exist.
 
     Raises:
         ArgumentError: its name does not end in .zip.
         StorageError: it cannot be written.
     """
     check_archive(archive)
-    files, part = [*files, *(Path(_DESCRIPTION) for _ in range((root / _DESCRIPTION).is_file()))], unfinished(archive)
+    files, part = (
+        [*files, *(Path(_DESCRIPTION) for _ in range((root / _DESCRIPTION).is_file()))],
+        unfinished(archive),
+    )
     folders: Mapping[str, None] = dict.fromkeys(
-        f"{parent.as_posix()}/" for file in files for parent in reversed(file.parents) if parent != Path()
+        f"{parent.as_posix()}/"
+        for file in files
+        for parent in reversed(file.parents)
+        if parent != Path()
     )
     with writing(archive):
         make_folder(archive.parent)

@@ -1,4 +1,7 @@
-"""Recording from a stand-in for the server. No test here has used a live server (see docs/commands/capture.md)."""
+"""Recording from a stand-in for the server.
+
+No test here has used a live server (see docs/commands/capture.md).
+"""
 
 import io
 import json
@@ -9,7 +12,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-pytest.importorskip("carla", reason="the carla package is not installed: pip install 'carlasc[carla]'")
+pytest.importorskip(
+    "carla", reason="the carla package is not installed: pip install 'carlasc[carla]'"
+)
 
 import carla
 from helpers.servers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
@@ -28,7 +33,13 @@ ROAD, VEHICLE, WALKER = (CARLA.id_of(name) for name in ("Road", "Vehicle", "Pede
 
 
 def call(out, server, timeout_s=5.0, **options):
-    chosen = {"count": 3, "sensors": 4, "town": "Town01", "traffic": "light", "bev": False} | options
+    chosen = {
+        "count": 3,
+        "sensors": 4,
+        "town": "Town01",
+        "traffic": "light",
+        "bev": False,
+    } | options
     return record(out, server=ServerOptions(timeout_s=timeout_s), carla=server, **chosen)
 
 
@@ -61,8 +72,11 @@ def test_class_ids_do_not_depend_on_the_servers_version(tmp_path):
         one, other = (Capture(tmp_path / name).read(1, frame).scan for name in ("old", "new"))
         assert np.array_equal(one.labels, other.labels)
         assert {ROAD, VEHICLE, WALKER} == set(np.unique(one.labels))
-        road = transform_points(Capture(tmp_path / "new").read_pose(1, frame), other.points[other.labels == ROAD])
-        assert np.abs(road[:, 2]).max() < 0.05  # poses take points to the world: the ground is level there
+        road = transform_points(
+            Capture(tmp_path / "new").read_pose(1, frame), other.points[other.labels == ROAD]
+        )
+        # poses take points to the world: the ground is level there
+        assert np.abs(road[:, 2]).max() < 0.05
 
 
 def test_sensors_are_placed_as_the_format_says(tmp_path):
@@ -71,14 +85,23 @@ def test_sensors_are_placed_as_the_format_says(tmp_path):
     capture = Capture(tmp_path)
     poses = np.stack([capture.read_pose(sensor, 0) for sensor in range(20)])
     (ego,) = [a for a in server.worlds[-1].actors if a.attributes.get("role_name") == "hero"]
-    world_T_ego = poses[0] @ np.linalg.inv(np.block([[np.eye(3), np.array([[-0.5], [0.0], [1.8]])], [np.zeros(3), 1]]))
+    world_T_ego = poses[0] @ np.linalg.inv(
+        np.block([[np.eye(3), np.array([[-0.5], [0.0], [1.8]])], [np.zeros(3), 1]])
+    )
     assert np.allclose(
-        world_T_ego[:3, 3], [ego.transform.location.x, ego.transform.location.y, ego.transform.location.z], atol=1e-4
+        world_T_ego[:3, 3],
+        [ego.transform.location.x, ego.transform.location.y, ego.transform.location.z],
+        atol=1e-4,
     )
     offsets = np.stack([(np.linalg.inv(world_T_ego) @ pose)[:3, 3] for pose in poses])
-    assert np.allclose(poses[:, :3, :3], poses[0, :3, :3], atol=1e-6)  # the vehicle's own orientation
+    # the vehicle's own orientation
+    assert np.allclose(poses[:, :3, :3], poses[0, :3, :3], atol=1e-6)
     assert np.allclose(offsets, sensor_offsets(20, np.random.default_rng(0)), atol=1e-4)
-    assert (np.abs(offsets[1:, :2]) <= 20).all() and (offsets[1:, 2] >= 1).all() and (offsets[1:, 2] <= 5).all()
+    assert (
+        (np.abs(offsets[1:, :2]) <= 20).all()
+        and (offsets[1:, 2] >= 1).all()
+        and (offsets[1:, 2] <= 5).all()
+    )
     assert not np.allclose(sensor_offsets(20, np.random.default_rng(1))[1:], offsets[1:], atol=0.1)
     assert np.allclose(sensor_offsets(1, np.random.default_rng(1)), [[-0.5, 0, 1.8]])
     lidars = [a for a in server.worlds[-1].actors if "lidar" in a.type_id]
@@ -142,7 +165,9 @@ def test_velocities_are_over_ground_in_the_sensors_frame(tmp_path):
             transform_points(r.world_T_sensor, r.scan.points[r.scan.instances == actor]).mean(0)
             for r in (recording, later)
         ]
-        assert np.allclose(middle[1] - middle[0], 0.1 * recording.world_T_sensor[:3, :3] @ rows[actor], atol=0.03)
+        assert np.allclose(
+            middle[1] - middle[0], 0.1 * recording.world_T_sensor[:3, :3] @ rows[actor], atol=0.03
+        )
 
 
 def test_an_actor_keeps_its_number_through_the_sequence_and_in_a_second_run(tmp_path):
@@ -168,7 +193,10 @@ def test_a_measurement_of_another_tick_is_skipped_or_refused():
         for tick in (4, 5, 7):
             arrived.put(SimpleNamespace(frame=tick))
         assert server.measurement(arrived, 5, "LiDAR 0").frame == 5
-        with pytest.raises(ServerError, match="expected tick 6 of LiDAR 0, found tick 7: check that no other client"):
+        with pytest.raises(
+            ServerError,
+            match="expected tick 6 of LiDAR 0, found tick 7: check that no other client",
+        ):
             server.measurement(arrived, 6, "LiDAR 0")
 
 
@@ -193,8 +221,12 @@ def test_the_server_is_cleaned_up(server, tmp_path):
     assert_cleaned_up(server)
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("time-out of 5000ms"), MemoryError()])
-@pytest.mark.parametrize(("what", "after"), [("tick", 0), ("tick", 2), ("spawn", 0), ("spawn", 9), ("spawn", 70)])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), RuntimeError("time-out of 5000ms"), MemoryError()]
+)
+@pytest.mark.parametrize(
+    ("what", "after"), [("tick", 0), ("tick", 2), ("spawn", 0), ("spawn", 9), ("spawn", 70)]
+)
 def test_the_server_is_cleaned_up_after_any_error(tmp_path, error, what, after):
     server = FakeServer()
     server.fail_at = (what, after, error)
@@ -209,10 +241,11 @@ def test_a_failed_clean_up_is_reported(tmp_path):
     server.cannot_destroy = True
     with pytest.raises(ServerError, match="could not be cleaned up"):
         call(tmp_path, server)
+    # the others were destroyed all the same
     assert set(server.left_behind) <= {
         "vehicle.tesla.model3",
         "vehicle.audi.tt",
-    }  # the others were destroyed all the same
+    }
     assert not server.worlds[-1].settings.synchronous_mode
 
 
@@ -223,7 +256,8 @@ def test_an_interrupted_recording_is_continued(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         call(tmp_path / "cut", server, count=5)
     assert Capture(tmp_path / "cut").frames.tolist() == [0, 1, 2]
-    (tmp_path / "cut" / "raw" / "labels2" / "1.npy").unlink()  # and a frame in the middle is not whole
+    # and a frame in the middle is not whole
+    (tmp_path / "cut" / "raw" / "labels2" / "1.npy").unlink()
     kept = (tmp_path / "cut" / "raw" / "velodyne0" / "0.npy").stat().st_mtime_ns
     result = call(tmp_path / "cut", FakeServer(), count=5)
     assert (result.written, whole.written) == (3, 5)
@@ -253,7 +287,8 @@ def test_a_replay_that_departs_from_the_drive_is_refused(tmp_path):
 def test_a_replay_follows_within_two_centimetres(tmp_path, drift_m, follows):
     call(tmp_path, FakeServer(), count=1)
     server = FakeServer()
-    server.drift = drift_m / 2  # the first tick is the pedestrians', so frame 0 is two ticks away from the start
+    # the first tick is the pedestrians', so frame 0 is two ticks away from the start
+    server.drift = drift_m / 2
     if follows:
         assert call(tmp_path, server, count=2).written == 1
     else:
@@ -266,7 +301,9 @@ def test_traffic_and_pedestrians_are_seeded_and_synchronous(tmp_path):
     server.fail_at = ("tick", 2, KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
         call(tmp_path, server, seed=7)
-    assert [(manager.seed, manager.was_synchronous) for manager in server.managers.values()] == [(7, True)]
+    assert [(manager.seed, manager.was_synchronous) for manager in server.managers.values()] == [
+        (7, True)
+    ]
     assert server.pedestrians_seed == 7
 
 
@@ -293,8 +330,13 @@ def test_cameras_have_colour_class_and_depth_where_the_town_has_them(server, tmp
     assert list(capture.cameras) == ["front", "left"]
     mounted = [actor for actor in server.worlds[-1].actors if actor.type_id == "sensor.camera.rgb"]
     turns = [one.offset.rotation.yaw for one in mounted]
-    assert turns == pytest.approx([0, -90]) and float(mounted[0].attributes["fov"]) == pytest.approx(70)
-    place = capture.cameras["left"].sensor_T_camera[:3, 3] + sensor_offsets(1, np.random.default_rng(0))[0]
+    assert turns == pytest.approx([0, -90]) and float(
+        mounted[0].attributes["fov"]
+    ) == pytest.approx(70)
+    place = (
+        capture.cameras["left"].sensor_T_camera[:3, 3]
+        + sensor_offsets(1, np.random.default_rng(0))[0]
+    )
     at = mounted[1].offset.location
     assert [at.x, at.y, at.z] == pytest.approx(place.tolist(), abs=1e-5)
     images = capture.read_images(1)
@@ -308,8 +350,11 @@ def test_cameras_have_colour_class_and_depth_where_the_town_has_them(server, tmp
         for name in ("image_labels", "image_depths")
     }
     old = server.version == "0.9.13"
-    assert set(np.unique(kinds["image_labels"])) == {10 if old else CARLA.id_of("Terrain")}  # tag 10
-    assert set(np.unique(kinds["image_depths"])) == {round((64 + 128 * 256) / (2**24 - 1) * 1000 * 256)}
+    # tag 10
+    assert set(np.unique(kinds["image_labels"])) == {10 if old else CARLA.id_of("Terrain")}
+    assert set(np.unique(kinds["image_depths"])) == {
+        round((64 + 128 * 256) / (2**24 - 1) * 1000 * 256)
+    }
     color = decode_image(images["images.front.jpg"].tobytes(), "a", one, color=True)
     assert np.abs(color.astype(int) - (10, 120, 250)).max() < 8
     with pytest.raises(ConflictError):
@@ -321,10 +366,13 @@ def test_each_frame_and_sensor_has_its_own_noise(tmp_path):
     call(tmp_path / "noisy", FakeServer(), count=2)
     noise = []
     for sensor, frame in ((0, 0), (1, 0), (0, 1)):
-        plain, noisy = (Capture(tmp_path / name).read(sensor, frame).scan.points for name in ("plain", "noisy"))
+        plain, noisy = (
+            Capture(tmp_path / name).read(sensor, frame).scan.points for name in ("plain", "noisy")
+        )
         noise.append((noisy - plain)[:40, 0])
     assert all(
-        abs(np.corrcoef(one, other)[0, 1]) < 0.6 for one, other in zip(noise, noise[1:] + noise[:1], strict=True)
+        abs(np.corrcoef(one, other)[0, 1]) < 0.6
+        for one, other in zip(noise, noise[1:] + noise[:1], strict=True)
     )
 
 
@@ -383,23 +431,31 @@ def test_the_error_of_an_unknown_town_lists_the_towns(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize("options", [{"count": 0}, {"sensors": 0}, {"seed": -1}, {"traffic": "none"}])
+@pytest.mark.parametrize(
+    "options", [{"count": 0}, {"sensors": 0}, {"seed": -1}, {"traffic": "none"}]
+)
 def test_arguments_out_of_range_are_refused(tmp_path, options):
     with pytest.raises(ArgumentError):
         call(tmp_path, FakeServer(), **options)
 
 
 def test_bytes_and_poses_of_the_official_package_are_decoded():
-    transform = carla.Transform(carla.Location(1.0, 2.0, 3.0), carla.Rotation(pitch=10.0, yaw=30.0, roll=5.0))
+    transform = carla.Transform(
+        carla.Location(1.0, 2.0, 3.0), carla.Rotation(pitch=10.0, yaw=30.0, roll=5.0)
+    )
     records = np.array([(1, 2, 3, 0.5, 77, 14)], DETECTION)
     assert records.dtype.itemsize == 24
-    measurement = type("Measurement", (), {"raw_data": records.tobytes(), "transform": transform, "timestamp": 1.5})
+    measurement = type(
+        "Measurement", (), {"raw_data": records.tobytes(), "transform": transform, "timestamp": 1.5}
+    )
     sweep = decode_sweep(measurement)
     assert sweep.detections["actor"].tolist() == [77] and sweep.detections["tag"].tolist() == [14]
     moved = carla.Location(1.0, 2.0, 3.0)
     moved = transform.transform(moved)
     assert np.allclose(
-        transform_points(sweep.world_T_sensor, np.array([[1.0, 2, 3]])), [[moved.x, moved.y, moved.z]], atol=1e-4
+        transform_points(sweep.world_T_sensor, np.array([[1.0, 2, 3]])),
+        [[moved.x, moved.y, moved.z]],
+        atol=1e-4,
     )
     measurement.raw_data = b"abc"
     with pytest.raises(CarlascError, match="24 bytes"):
@@ -407,14 +463,20 @@ def test_bytes_and_poses_of_the_official_package_are_decoded():
 
 
 @pytest.mark.parametrize(
-    ("text", "numbers"), [("0.9.13", (0, 9, 13)), ("0.9.15-dirty", (0, 9, 15)), ("0.10.0", (0, 10, 0))]
+    ("text", "numbers"),
+    [("0.9.13", (0, 9, 13)), ("0.9.15-dirty", (0, 9, 15)), ("0.10.0", (0, 10, 0))],
 )
 def test_versions_are_read(text, numbers):
-    assert Server(ServerOptions("127.0.0.1", 2000, timeout_s=1.0), FakeServer(text)).version_numbers == numbers
+    assert (
+        Server(ServerOptions("127.0.0.1", 2000, timeout_s=1.0), FakeServer(text)).version_numbers
+        == numbers
+    )
 
 
 def test_without_a_server_the_command_says_so_in_one_line(tmp_path):
-    result = CliRunner().invoke(app, ["capture", str(tmp_path / "a"), "--port", "1", "--timeout", "1", "--count", "1"])
+    result = CliRunner().invoke(
+        app, ["capture", str(tmp_path / "a"), "--port", "1", "--timeout", "1", "--count", "1"]
+    )
     assert result.exit_code == 1
     assert "127.0.0.1:1" in result.stderr and "--host" in result.stderr
     assert not (tmp_path / "a").exists()

@@ -61,7 +61,9 @@ pytest.importorskip("trimesh", reason="the simulator needs carlasc[simulate]")
 
 
 def with_only_a_box(drive: TownDrive, frame: int, box_at: tuple[float, float, float]) -> Snapshot:
-    """Return a snapshot that holds only a cube of Wall, 1 m wide, at a position in the ego vehicle's frame."""
+    """Return a snapshot that holds only a cube of Wall, 1 m wide, at a position in the ego
+    vehicle's frame.
+    """
     real = drive.snapshot(frame)
     builder = MeshBuilder()
     builder.boxes(CARLA.id_of("Wall"), box_at, (1.0, 1.0, 1.0))
@@ -83,8 +85,14 @@ def test_the_road_is_at_minus_1_8_m_within_noise(drive: TownDrive) -> None:
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 2.0])
-def test_a_box_on_the_right_has_positive_y_and_one_ahead_positive_x(drive: TownDrive, yaw_rad: float) -> None:
-    for at, axis, sign in (((0.0, 8.0, 1.0), 1, 1), ((0.0, -8.0, 1.0), 1, -1), ((8.0, 0.0, 1.0), 0, 1)):
+def test_a_box_on_the_right_has_positive_y_and_one_ahead_positive_x(
+    drive: TownDrive, yaw_rad: float
+) -> None:
+    for at, axis, sign in (
+        ((0.0, 8.0, 1.0), 1, 1),
+        ((0.0, -8.0, 1.0), 1, -1),
+        ((8.0, 0.0, 1.0), 0, 1),
+    ):
         snapshot = with_only_a_box(drive, 0, at)
         pose = snapshot.world_T_ego @ translation((-0.5, 0.0, 1.8)) @ rotation_z(yaw_rad)
         points = scan_snapshot(snapshot, pose, drive.lidar, np.random.default_rng(0)).scan.points
@@ -96,7 +104,9 @@ def test_a_box_on_the_right_has_positive_y_and_one_ahead_positive_x(drive: TownD
 
 
 def test_yaw_turns_x_towards_y_and_vehicles_keep_right(drive: TownDrive) -> None:
-    """The frame is left-handed: a turn to the right increases the yaw, and the lane is to the right of the centre line."""
+    """The frame is left-handed: a turn to the right increases the yaw, and the lane is to the right
+    of the centre line.
+    """
     pose = drive.ego_pose(0)
     streets = drive.town.streets
     lane = min(
@@ -160,7 +170,9 @@ def test_points_of_an_actor_are_on_its_mesh(drive: TownDrive) -> None:
         assert recording.scan.instances is not None
         world = transform_points(recording.world_T_sensor, recording.scan.points)
         for id in np.unique(recording.scan.instances[recording.scan.instances != 0]).tolist():
-            points = transform_points(invert(actors[id].world_T_actor), world[recording.scan.instances == id])
+            points = transform_points(
+                invert(actors[id].world_T_actor), world[recording.scan.instances == id]
+            )
             low, high = actors[id].mesh.vertices.min(axis=0), actors[id].mesh.vertices.max(axis=0)
             assert (points > low - 0.03).all()
             assert (points < high + 0.03).all()
@@ -168,7 +180,9 @@ def test_points_of_an_actor_are_on_its_mesh(drive: TownDrive) -> None:
     assert checked > 500
 
 
-def test_velocities_are_over_ground_in_the_sensors_frame_for_each_actor_that_was_hit(drive: TownDrive) -> None:
+def test_velocities_are_over_ground_in_the_sensors_frame_for_each_actor_that_was_hit(
+    drive: TownDrive,
+) -> None:
     recording = drive.record(100, 3)
     assert recording.scan.instances is not None
     hit = np.unique(recording.scan.instances[recording.scan.instances != 0])
@@ -188,7 +202,9 @@ def test_sensors_have_the_offsets_of_the_data_set(drive: TownDrive) -> None:
     for frame in (0, 150):
         poses = drive.sensor_poses(frame, 3)
         for pose, offset in zip(poses, offsets[:3], strict=True):
-            np.testing.assert_allclose(invert(drive.ego_pose(frame)) @ pose, translation(offset), atol=1e-9)
+            np.testing.assert_allclose(
+                invert(drive.ego_pose(frame)) @ pose, translation(offset), atol=1e-9
+            )
 
 
 def test_every_seed_has_its_own_sensors(drive: TownDrive) -> None:
@@ -210,7 +226,8 @@ def test_reference_sensors_are_others_and_in_free_space(drive: TownDrive) -> Non
     again = drive.reference_observations(50, sensors=20)
     np.testing.assert_array_equal(again[7].scan.points, reference[7].scan.points)
     assert not np.array_equal(
-        drive.reference_observations(50, sensors=1, seed=1)[0].world_T_sensor, reference[0].world_T_sensor
+        drive.reference_observations(50, sensors=1, seed=1)[0].world_T_sensor,
+        reference[0].world_T_sensor,
     )
 
 
@@ -245,13 +262,18 @@ def test_every_sensor_and_frame_has_its_own_noise(drive: TownDrive) -> None:
     noise = []
     for frame, sensor in ((20, 0), (20, 1), (21, 0)):
         clean, noisy = quiet.scan(frame, sensor).points, drive.scan(frame, sensor).points
-        rays = map(tuple, np.round(clean / np.linalg.norm(clean, axis=1, keepdims=True), 4).tolist())
+        rays = map(
+            tuple, np.round(clean / np.linalg.norm(clean, axis=1, keepdims=True), 4).tolist()
+        )
         noise.append(dict(zip(rays, (noisy - clean)[:, 0].tolist(), strict=True)))
     for i, one in enumerate(noise):
         for other in noise[i + 1 :]:
             common = sorted(one.keys() & other.keys())  # rays that hit something in both scans
             assert len(common) > 1000
-            assert abs(np.corrcoef([one[ray] for ray in common], [other[ray] for ray in common])[0, 1]) < 0.2
+            assert (
+                abs(np.corrcoef([one[ray] for ray in common], [other[ray] for ray in common])[0, 1])
+                < 0.2
+            )
 
 
 def test_sensors_far_from_the_vehicle_see_everything_within_their_range(drive: TownDrive) -> None:
@@ -304,7 +326,10 @@ def test_a_place_close_above_a_roof_is_not_free(drive: TownDrive) -> None:
 
 def test_reference_sensors_are_at_all_heights(drive: TownDrive) -> None:
     ego = invert(drive.ego_pose(50))
-    places = [transform_points(ego, r.world_T_sensor[:3, 3]) for r in drive.reference_observations(50, sensors=20)]
+    places = [
+        transform_points(ego, r.world_T_sensor[:3, 3])
+        for r in drive.reference_observations(50, sensors=20)
+    ]
     heights = np.array(places)[:, 2]
     assert ((heights[[4, 14]] >= 0.4) & (heights[[4, 14]] <= 1.0)).all()
     assert ((heights[[9, 19]] >= 7.0) & (heights[[9, 19]] <= 14.0)).all()
@@ -313,7 +338,9 @@ def test_reference_sensors_are_at_all_heights(drive: TownDrive) -> None:
 
 
 def test_a_seed_keeps_its_town_and_its_traffic(drive: TownDrive) -> None:
-    """Where this fails, the same seed makes another town: raise TOWN_VERSION, so that old and new frames are not mixed."""
+    """Where this fails, the same seed makes another town: raise TOWN_VERSION, so that old and new
+    frames are not mixed.
+    """
     assert TOWN_VERSION == 1
     mesh = drive.town.mesh
     assert (len(mesh.vertices), len(mesh.faces)) == SEED_3["mesh"]
@@ -323,8 +350,12 @@ def test_a_seed_keeps_its_town_and_its_traffic(drive: TownDrive) -> None:
     np.testing.assert_allclose(drive.ego_pose(100)[:2, 3], SEED_3["ego"], atol=1e-6)
     actors = drive.actors(100)
     assert len(actors) == SEED_3["actors"]
-    np.testing.assert_allclose(np.mean([a.world_T_actor[:3, 3] for a in actors], axis=0), SEED_3["places"], atol=1e-6)
-    np.testing.assert_allclose(np.mean([a.velocity for a in actors], axis=0), SEED_3["velocities"], atol=1e-4)
+    np.testing.assert_allclose(
+        np.mean([a.world_T_actor[:3, 3] for a in actors], axis=0), SEED_3["places"], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        np.mean([a.velocity for a in actors], axis=0), SEED_3["velocities"], atol=1e-4
+    )
     np.testing.assert_allclose(drive.sensor_offsets(3)[2], SEED_3["offset"], atol=1e-9)
     points = drive.record(100, 2).scan.points
     assert len(points) == pytest.approx(SEED_3["points"], rel=0.01)

@@ -45,4 +45,6 @@ def test_distances_do_not_depend_on_the_centre_of_the_scene() -> None:
 def test_the_exact_rotation_is_a_rotation() -> None:
     vectors = np.random.default_rng(0).normal(size=(50, 3))
     pose = translation((5.0, -3.0, 1.0)) @ rotation_z(0.7)
-    np.testing.assert_allclose(rotate_exactly(pose, vectors), rotate_vectors(pose, vectors), atol=1e-12)
+    np.testing.assert_allclose(
+        rotate_exactly(pose, vectors), rotate_vectors(pose, vectors), atol=1e-12
+    )

@@ -43,7 +43,9 @@ SMALL: dict[str, Any] = {"count": 3, "sensors": 2, "seed": 4, "traffic": "light"
 
 def digests(root: Path) -> dict[str, str]:
     files = sorted(path for path in root.rglob("*") if path.is_file())
-    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files
+    }
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,9 @@ def test_the_capture_holds_what_the_drive_records(recorded: Path) -> None:
         assert capture.read_time(2, sensor) == pytest.approx(0.2)
 
 
-def test_the_birds_eye_picture_has_the_published_size_and_shows_the_road_in_the_middle(recorded: Path) -> None:
+def test_the_birds_eye_picture_has_the_published_size_and_shows_the_road_in_the_middle(
+    recorded: Path,
+) -> None:
     data = Capture(recorded).read_bev(0)
     assert data is not None
     from PIL import Image
@@ -86,10 +90,15 @@ def test_another_process_with_two_workers_and_another_hash_seed_writes_the_same_
 ) -> None:
     script = (
         "from carlasc import Run\nfrom carlasc.captures import Lidar, simulate\n"
-        f"if __name__ == '__main__':\n    simulate({str(tmp_path / 'two')!r}, **{SMALL!r}, run=Run(workers=2))\n"
+        f"if __name__ == '__main__':\n    simulate({str(tmp_path / 'two')!r}, **{SMALL!r}, "
+        f"run=Run(workers=2))\n"
     )
     (tmp_path / "run.py").write_text(script)
-    subprocess.run([sys.executable, str(tmp_path / "run.py")], check=True, env={**os.environ, "PYTHONHASHSEED": "77"})
+    subprocess.run(
+        [sys.executable, str(tmp_path / "run.py")],
+        check=True,
+        env={**os.environ, "PYTHONHASHSEED": "77"},
+    )
     assert digests(tmp_path / "two") == digests(recorded)
 
 
@@ -108,11 +117,15 @@ def test_a_second_run_goes_on_and_ends_with_the_same_bytes(recorded: Path, tmp_p
     assert (first.written, second.written, second.count) == (2, 2, 3)
     assert simulate(tmp_path, **SMALL, run=Run(workers=1)).written == 0
     ours, theirs = digests(tmp_path), digests(recorded)
-    assert {k: v for k, v in ours.items() if "times" not in k} == {k: v for k, v in theirs.items() if "times" not in k}
+    assert {k: v for k, v in ours.items() if "times" not in k} == {
+        k: v for k, v in theirs.items() if "times" not in k
+    }
     assert Capture(tmp_path).read_time(1, 1) == pytest.approx(0.1)
 
 
-def test_an_interrupted_run_leaves_whole_files_and_is_finished_by_the_next(recorded: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_leaves_whole_files_and_is_finished_by_the_next(
+    recorded: Path, tmp_path: Path
+) -> None:
     def interrupt(done: int, total: int) -> None:
         if done == 1:
             raise KeyboardInterrupt
@@ -125,7 +138,13 @@ def test_an_interrupted_run_leaves_whole_files_and_is_finished_by_the_next(recor
 
 def test_a_capture_of_other_settings_is_refused_and_left_alone(recorded: Path) -> None:
     before = digests(recorded)
-    for change in ({"seed": 5}, {"traffic": "heavy"}, {"sensors": 3}, {"lidar": Lidar(4, 800)}, {"bev": False}):
+    for change in (
+        {"seed": 5},
+        {"traffic": "heavy"},
+        {"sensors": 3},
+        {"lidar": Lidar(4, 800)},
+        {"bev": False},
+    ):
         with pytest.raises(ConflictError, match=str(next(iter(change)))):
             simulate(recorded, **{**SMALL, **change}, run=Run(workers=1))
     assert digests(recorded) == before
@@ -160,23 +179,43 @@ def test_the_command_records_and_prints_its_figures_as_json(tmp_path: Path) -> N
 
     from carlasc.cli import app
 
-    arguments = ["--count", "1", "--sensors", "1", "--seed", "4", "--traffic", "light", "--channels", "8"]
+    arguments = [
+        "--count",
+        "1",
+        "--sensors",
+        "1",
+        "--seed",
+        "4",
+        "--traffic",
+        "light",
+        "--channels",
+        "8",
+    ]
     arguments += ["--points", "800", "--workers", "1"]
-    result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments, "--no-bev", "--json"])
+    result = CliRunner().invoke(
+        app, ["simulate", str(tmp_path / "out"), *arguments, "--no-bev", "--json"]
+    )
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)
     assert figures["written"] == 1
     assert figures["points"] == sum(figures["classes"].values()) > 50
     assert not Capture(tmp_path / "out").has_bev(0)
     assert CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--count", "0"]).exit_code == 2
-    assert CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--traffic", "jam"]).exit_code == 2
+    assert (
+        CliRunner().invoke(app, ["simulate", str(tmp_path / "b"), "--traffic", "jam"]).exit_code
+        == 2
+    )
     assert CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *arguments]).exit_code == 1
 
 
 @pytest.mark.parametrize("package", ["embreex", "trimesh", "PIL"])
 @pytest.mark.parametrize(("run", "extra"), [(simulate, "simulate"), (demonstrate, "demo")])
 def test_without_a_package_of_the_extra_nothing_is_written(
-    run: Callable[..., object], extra: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Callable[..., object],
+    extra: str,
+    package: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, name)
@@ -192,20 +231,31 @@ def test_pictures_need_pillow_and_captures_without_pictures_do_not(
     for name in [name for name in sys.modules if name.startswith("PIL.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "PIL", None)
-    assert simulate(tmp_path, **{**SMALL, "count": 1, "sensors": 1}, bev=False, run=Run(workers=1)).written == 1
+    assert (
+        simulate(
+            tmp_path, **{**SMALL, "count": 1, "sensors": 1}, bev=False, run=Run(workers=1)
+        ).written
+        == 1
+    )
 
 
-def test_a_frame_without_its_picture_or_its_times_is_completed(recorded: Path, tmp_path: Path) -> None:
+def test_a_frame_without_its_picture_or_its_times_is_completed(
+    recorded: Path, tmp_path: Path
+) -> None:
     shutil.copytree(recorded, tmp_path / "copy")
     raw = tmp_path / "copy" / "raw"
     (raw / "bev" / "1.jpg").unlink()
-    (raw / "times1.txt").write_text("".join((raw / "times1.txt").read_text().splitlines(keepends=True)[:2]))
+    (raw / "times1.txt").write_text(
+        "".join((raw / "times1.txt").read_text().splitlines(keepends=True)[:2])
+    )
     assert simulate(tmp_path / "copy", **SMALL, run=Run(workers=1)).written == 1
     assert (raw / "bev" / "1.jpg").read_bytes() == (recorded / "raw" / "bev" / "1.jpg").read_bytes()
     assert Capture(tmp_path / "copy").read_time(2, 1) == pytest.approx(0.2)
 
 
-def test_a_capture_of_another_version_of_the_town_is_refused(recorded: Path, tmp_path: Path) -> None:
+def test_a_capture_of_another_version_of_the_town_is_refused(
+    recorded: Path, tmp_path: Path
+) -> None:
     (tmp_path / "raw").mkdir()
     settings = json.loads((recorded / "raw" / "simulation.json").read_text())
     assert settings["recipe"] == 1  # the name of the town's version in the file
@@ -229,7 +279,10 @@ def test_the_command_names_options_in_its_errors(tmp_path: Path) -> None:
 
     for options, message in (
         (["--range", "0"], "carlasc: --range: expected more than 0"),
-        (["--channels", "9", "--points", "8"], "carlasc: --points: expected at least one per channel"),
+        (
+            ["--channels", "9", "--points", "8"],
+            "carlasc: --points: expected at least one per channel",
+        ),
     ):
         result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *options])
         assert result.exit_code == 2
@@ -237,7 +290,9 @@ def test_the_command_names_options_in_its_errors(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_that_was_killed_before_it_wrote_times_ends_with_the_same_bytes(recorded: Path, tmp_path: Path) -> None:
+def test_a_run_that_was_killed_before_it_wrote_times_ends_with_the_same_bytes(
+    recorded: Path, tmp_path: Path
+) -> None:
     """What `kill -9` leaves: frames without times, here the first and the last."""
     shutil.copytree(recorded, tmp_path, dirs_exist_ok=True)
     for sensor in range(SMALL["sensors"]):
@@ -252,7 +307,14 @@ for package in ("embreex", "trimesh", "PIL"):
     pytest.importorskip(package, reason="the simulator needs carlasc[simulate]")
 
 SPEC = GridSpec.published().with_size((16, 16, 4))
-HOW = {"count": 5, "first_frame": 3, "sensors": 3, "seed": 4, "traffic": "light", "lidar": Lidar(8, 800, 50.0)}
+HOW = {
+    "count": 5,
+    "first_frame": 3,
+    "sensors": 3,
+    "seed": 4,
+    "traffic": "light",
+    "lidar": Lidar(8, 800, 50.0),
+}
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +327,10 @@ def written(tmp_path_factory):
 
 
 def test_it_returns_what_the_capture_on_disk_holds(written):
-    on_disk, simulated = Capture(written / "town"), pickle.loads(pickle.dumps(SimulatedCapture(**HOW)))
+    on_disk, simulated = (
+        Capture(written / "town"),
+        pickle.loads(pickle.dumps(SimulatedCapture(**HOW))),
+    )
     assert simulated.sensors == on_disk.sensors
     assert np.array_equal(simulated.frames, on_disk.frames)
     for sensor in simulated.sensors:
@@ -299,7 +364,19 @@ def test_it_has_no_scans_to_merge_and_no_place_to_write_to(tmp_path):
 
 def test_the_command_writes_a_store_or_grids_if_it_is_asked_to(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    options = ["--count", "2", "--sensors", "2", "--points", "500", "--channels", "4", "--no-bev", "--workers", "1"]
+    options = [
+        "--count",
+        "2",
+        "--sensors",
+        "2",
+        "--points",
+        "500",
+        "--channels",
+        "4",
+        "--no-bev",
+        "--workers",
+        "1",
+    ]
     run = CliRunner().invoke(app, ["simulate", "town.zarr", *options, "--size", "16,16,4"])
     assert run.exit_code == 0, run.output
     (sequence,) = carlasc.open("town.zarr").sequences().values()
@@ -321,7 +398,9 @@ def test_parts_of_a_simulation_write_the_bytes_of_one(written, tmp_path, order):
 
 
 def picture_of_box(centre: tuple[float, float, float]) -> np.ndarray:
-    """Return which pixels of a bird's-eye picture, (1080, 1920), show a box of 4 m in the ego vehicle's frame."""
+    """Return which pixels of a bird's-eye picture, (1080, 1920), show a box of 4 m in the ego
+    vehicle's frame.
+    """
     from PIL import Image
 
     world_T_ego = translation((30.0, -12.0, 0.0)) @ rotation_z(1.1)
@@ -329,7 +408,9 @@ def picture_of_box(centre: tuple[float, float, float]) -> np.ndarray:
     builder.boxes(CARLA.id_of("Vehicle"), centre, (4.0, 4.0, 0.1))
     mesh = builder.build().transformed(world_T_ego)
     scene = RayScene(mesh, world_T_ego[:3, 3])
-    snapshot = Snapshot(0, world_T_ego, {}, mesh, np.full(len(mesh.faces), EGO_ID, np.uint32), scene)
+    snapshot = Snapshot(
+        0, world_T_ego, {}, mesh, np.full(len(mesh.faces), EGO_ID, np.uint32), scene
+    )
     pixels = np.asarray(Image.open(io.BytesIO(render_birdseye(snapshot))), np.int64)
     shown: np.ndarray = pixels.sum(axis=2) < 500
     return shown

@@ -3,7 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from carlasc.captures.town.streets import HALF_ROAD_M, LANE_WIDTH_M, SIDEWALK_M, Streets, draw_streets, right_of
+from carlasc.captures.town.streets import (
+    HALF_ROAD_M,
+    LANE_WIDTH_M,
+    SIDEWALK_M,
+    Streets,
+    draw_streets,
+    right_of,
+)
 
 
 @pytest.fixture(scope="module", params=range(4))
@@ -20,7 +27,9 @@ def test_right_of_forward_is_y_because_the_frame_is_left_handed() -> None:
     np.testing.assert_array_equal(right_of(np.array([1.0, 0.0])), [0.0, 1.0])
 
 
-def test_one_block_is_the_outside_and_all_others_have_their_inside_on_the_right(streets: Streets) -> None:
+def test_one_block_is_the_outside_and_all_others_have_their_inside_on_the_right(
+    streets: Streets,
+) -> None:
     assert [block.outside for block in streets.blocks].count(True) == 1
     for block in streets.blocks:
         assert (area(block.outline.at(HALF_ROAD_M)) > 0) != block.outside
@@ -28,7 +37,10 @@ def test_one_block_is_the_outside_and_all_others_have_their_inside_on_the_right(
 
 def test_offsets_shrink_blocks_and_grow_the_outside(streets: Streets) -> None:
     for block in streets.blocks:
-        near, far = (abs(area(block.outline.at(offset))) for offset in (HALF_ROAD_M, HALF_ROAD_M + SIDEWALK_M))
+        near, far = (
+            abs(area(block.outline.at(offset)))
+            for offset in (HALF_ROAD_M, HALF_ROAD_M + SIDEWALK_M)
+        )
         assert (far > near) == block.outside
 
 

@@ -66,7 +66,9 @@ def test_rectangles_overlap_as_their_areas_do() -> None:
 
 
 def test_land_is_reserved_once_and_only_inside_its_boundary() -> None:
-    notched = np.array([[0, 0], [10, 0], [10, 10], [6, 10], [6, 5], [4, 5], [4, 10], [0, 10]], float)
+    notched = np.array(
+        [[0, 0], [10, 0], [10, 10], [6, 10], [6, 5], [4, 5], [4, 10], [0, 10]], float
+    )
     land = Land(notched)
     assert not land.reserve(Rectangle(np.array([5.0, 8.0]), (1.0, 1.0), 0.0))  # in the notch
     assert not land.reserve(Rectangle(np.array([0.0, 5.0]), (1.0, 1.0), 0.0))  # across the edge

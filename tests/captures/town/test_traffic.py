@@ -95,10 +95,15 @@ def test_a_frame_does_not_depend_on_the_frames_before_it(drive: TownDrive, twin:
         np.testing.assert_array_equal(one.world_T_actor, other.world_T_actor)
 
 
-def test_the_ego_vehicle_drives_on_the_road_and_its_origin_is_on_the_ground(drive: TownDrive) -> None:
+def test_the_ego_vehicle_drives_on_the_road_and_its_origin_is_on_the_ground(
+    drive: TownDrive,
+) -> None:
     for frame in range(0, 300, 50):
         pose = drive.ego_pose(frame)
         assert pose[2, 3] == 0.0
-        nearest = min(np.linalg.norm(lane.path - pose[:2, 3], axis=1).min() for lane in drive.town.streets.lanes)
+        nearest = min(
+            np.linalg.norm(lane.path - pose[:2, 3], axis=1).min()
+            for lane in drive.town.streets.lanes
+        )
         assert nearest < 0.5
         np.testing.assert_allclose(invert(pose) @ pose, np.eye(4), atol=1e-12)

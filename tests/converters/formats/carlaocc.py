@@ -15,9 +15,9 @@ TAGS = {
     "none": 0, "road": 1, "building": 3, "vegetation": 9, "pole": 6, "car": 14, "van": 15, "pedestrian": 12, "cyclist": 13,
 }  # fmt: skip
 TAG_OF_KIND = np.array([TAGS[kind] for kind in KINDS], np.uint32)
-SURROUND = GridSpec("cartesian", (128, 128, 16), (-25.6, -25.6, -2.4), (25.6, 25.6, 4.0)).with_bounds(
-    (-25.6, -25.6, -2.4), (25.6, 25.6, 4.0)
-)
+SURROUND = GridSpec(
+    "cartesian", (128, 128, 16), (-25.6, -25.6, -2.4), (25.6, 25.6, 4.0)
+).with_bounds((-25.6, -25.6, -2.4), (25.6, 25.6, 4.0))
 FIRST_ACTOR = 100
 """What is added to the number of a track to make an ObjIdx."""
 
@@ -30,7 +30,9 @@ def write_carlaocc(
     grids: dict[str, GridSpec] | None = None,
     factor: int = 2048,
 ) -> Path:
-    """Write a drive as a sequence and return its folder; `factor` is 1000 or 2048: how labels of voxels hold class and instance."""
+    """Write a drive as a sequence and return its folder; `factor` is 1000 or 2048: how labels of
+    voxels hold class and instance.
+    """
     folder = root / name
     for part in ("semantic_lidar", "poses"):
         (folder / part).mkdir(parents=True)
@@ -41,7 +43,8 @@ def write_carlaocc(
         actors = np.where(scan.instances > 0, scan.instances + FIRST_ACTOR, 0)
         actors[tags == TAGS["pole"]] = 7  # poles are actors too
         header = (
-            f"ply\nformat ascii 1.0\nelement vertex {len(tags)}\nproperty float x\nproperty float y\nproperty float z\n"
+            f"ply\nformat ascii 1.0\nelement vertex {len(tags)}\nproperty float x\nproperty float "
+            f"y\nproperty float z\n"
             "property float CosAngle\nproperty int ObjIdx\nproperty int ObjTag\nend_header"
         )
         rows = np.column_stack([scan.points[:, :3], np.ones(len(tags)), actors, tags])
@@ -71,8 +74,12 @@ def write_grid(path: Path, drive: SimulatedDrive, frame: int, spec: GridSpec, fa
     )
 
 
-def mesh_voxels(drive: SimulatedDrive, frame: int, spec: GridSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return (X, Y, Z) tags and tracks of the voxels that something fills or touches, 0 elsewhere, in the frame of the LiDAR."""
+def mesh_voxels(
+    drive: SimulatedDrive, frame: int, spec: GridSpec
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return (X, Y, Z) tags and tracks of the voxels that something fills or touches, 0 elsewhere,
+    in the frame of the LiDAR.
+    """
     pose = world_T_sensor(drive, frame)
     centers = spec.centers()
     height = transform_points(pose, centers)[..., 2]
@@ -83,7 +90,9 @@ def mesh_voxels(drive: SimulatedDrive, frame: int, spec: GridSpec) -> tuple[NDAr
         moves = TAGS[thing.kind] >= TAGS["pedestrian"]
         track += moves
         lidar_T_box = invert(pose) @ thing.world_T_box(frame * drive.period_s)
-        if np.linalg.norm(lidar_T_box[:3, 3]) > np.linalg.norm(spec.upper) + np.linalg.norm(thing.size):
+        if np.linalg.norm(lidar_T_box[:3, 3]) > np.linalg.norm(spec.upper) + np.linalg.norm(
+            thing.size
+        ):
             continue  # outside of the grid
         own = transform_points(invert(lidar_T_box), centers)
         inside = (np.abs(own) < (np.array(thing.size) + spec.voxel_size) / 2).all(axis=-1)

@@ -23,7 +23,9 @@ CLASSES = {
     "cyclist": 25,
 }
 CLASS_OF = np.array([CLASSES.get(kind, 0) for kind in KINDS], np.int32)
-IMU_T_CAMERA = translation((1.57, 0.05, -0.1)) @ np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+IMU_T_CAMERA = translation((1.57, 0.05, -0.1)) @ np.array(
+    [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+)
 LIDAR_T_CAMERA = translation((0.77, 0.01, -0.12)) @ rotation_z(0.02) @ IMU_T_CAMERA
 DRIVE = "2013_05_28_drive_0003_sync"
 _STATIC = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
@@ -41,14 +43,21 @@ def write_kitti360(
     windows: Collection[tuple[int, int]] = (),
     name: str = DRIVE,
 ) -> Path:
-    """Write a drive, and return the folder of its scans. Clouds are written for `windows`: their first and last frames."""
+    """Write a drive, and return the folder of its scans.
+
+    Clouds are written for `windows`: their first and last frames.
+    """
     scans, poses = root / "data_3d_raw" / name / "velodyne_points", root / "data_poses" / name
     for frame in range(drive.frames):
         write_scan(scans / f"data/{frame:010d}.bin", drive.scan(frame).points)
     write_stamps(scans / "timestamps.txt", drive.times)
     poses.mkdir(parents=True, exist_ok=True)
     world_T_imu = drive.world_T_lidar(drive.times) @ LIDAR_T_CAMERA @ invert(IMU_T_CAMERA)
-    rows = [f"{frame} {numbers(pose)}\n" for frame, pose in enumerate(world_T_imu) if frame not in without_pose]
+    rows = [
+        f"{frame} {numbers(pose)}\n"
+        for frame, pose in enumerate(world_T_imu)
+        if frame not in without_pose
+    ]
     (poses / "poses.txt").write_text("".join(rows))
     (root / "calibration").mkdir(exist_ok=True)
     cameras = "".join(f"image_0{number}: {numbers(IMU_T_CAMERA)}\n" for number in range(4))
@@ -66,14 +75,18 @@ def instances_of(scan: DriveScan) -> NDArray[np.uint32]:
 
 
 def write_window(folder: Path, drive: KittiDrive, window: tuple[int, int]) -> None:
-    """Write the clouds of a window: everything that stands, and, with its frame, everything that moves."""
+    """Write the clouds of a window: everything that stands, and, with its frame, everything that
+    moves.
+    """
     movable = [thing for thing in drive.drive.things if thing.kind in MOVABLE]
     moving = np.array([False, *(thing.speed != 0 for thing in movable)])
     parts: dict[str, list[NDArray[np.void]]] = {"static": [], "dynamic": []}
     for frame in range(window[0], min(window[1], drive.frames - 1) + 1):
         scan = drive.scan(frame)
         rows = np.zeros(len(scan.points), DYNAMIC)
-        places = np.einsum("nij,nj->ni", scan.world_T_sensor[:, :3, :3], scan.points[:, :3].astype(np.float64))
+        places = np.einsum(
+            "nij,nj->ni", scan.world_T_sensor[:, :3, :3], scan.points[:, :3].astype(np.float64)
+        )
         for axis, values in zip("xyz", (places + scan.world_T_sensor[:, :3, 3]).T, strict=True):
             rows[axis] = values
         classes = CLASS_OF[scan.kinds]

@@ -1,4 +1,6 @@
-"""What the data sets of the KITTI family would have recorded of a simulated drive, with a LiDAR that turns clockwise."""
+"""What the data sets of the KITTI family would have recorded of a simulated drive, with a LiDAR
+that turns clockwise.
+"""
 
 from __future__ import annotations
 
@@ -40,12 +42,16 @@ class KittiDrive:
 
     def boxes(self, frame: int, labels: dict[str, int]) -> Boxes:
         """Return the boxes in front of the LiDAR: what the camera sees."""
-        boxes = self.drive.boxes(frame, labels).transform(invert(self.drive.sensors[0].vehicle_T_sensor))
+        boxes = self.drive.boxes(frame, labels).transform(
+            invert(self.drive.sensors[0].vehicle_T_sensor)
+        )
         return boxes.select(boxes.centers[:, 0] > 1.0)
 
 
 def small_drive(frames: int = 6, period_s: float = PERIOD_S) -> KittiDrive:
-    return KittiDrive(SimulatedDrive(frames, period_s, rolling=True, clockwise=True, channels=10, columns=90))
+    return KittiDrive(
+        SimulatedDrive(frames, period_s, rolling=True, clockwise=True, channels=10, columns=90)
+    )
 
 
 def write_scan(path: Path, points: NDArray[np.float32]) -> None:
@@ -56,19 +62,20 @@ def write_scan(path: Path, points: NDArray[np.float32]) -> None:
 def write_stamps(path: Path, seconds: NDArray[np.float64]) -> None:
     """Write timestamps.txt as KITTI does: with nanoseconds."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    stamps = np.datetime64("2011-09-26T13:02:25.9", "ns") + np.round(np.asarray(seconds) * 1e9).astype(
-        "timedelta64[ns]"
-    )
+    stamps = np.datetime64("2011-09-26T13:02:25.9", "ns") + np.round(
+        np.asarray(seconds) * 1e9
+    ).astype("timedelta64[ns]")
     path.write_text("".join(f"{str(stamp).replace('T', ' ')}\n" for stamp in stamps))
 
 
 def packets_of(world_T_imu: NDArray[np.float64], latitude: float = 49.0) -> NDArray[np.float64]:
-    """Return the (K, 30) packets of OXTS whose poses are these: the inverse of the Mercator projection of KITTI's development kit."""
+    """Return the (K, 30) packets of OXTS whose poses are these: the inverse of the Mercator
+    projection of KITTI's development kit.
+    """
     earth = 6378137.0
     scale = np.cos(np.radians(latitude))
-    begin = (
-        scale * earth * np.log(np.tan(np.pi * (90 + latitude) / 360))
-    )  # the first place: its latitude gives the scale
+    # the first place: its latitude gives the scale
+    begin = scale * earth * np.log(np.tan(np.pi * (90 + latitude) / 360))
     places = world_T_imu[:, :3, 3] - world_T_imu[0, :3, 3]
     packets = np.zeros((len(world_T_imu), 30))
     packets[:, 0] = 360 / np.pi * np.arctan(np.exp((places[:, 1] + begin) / (scale * earth))) - 90
@@ -83,7 +90,9 @@ def packets_of(world_T_imu: NDArray[np.float64], latitude: float = 49.0) -> NDAr
 
 def write_packets(path: Path, packets: NDArray[np.float64]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("".join(" ".join(f"{value!r}" for value in row) + "\n" for row in packets.tolist()))
+    path.write_text(
+        "".join(" ".join(f"{value!r}" for value in row) + "\n" for row in packets.tolist())
+    )
 
 
 def numbers(transform: Transform) -> str:

@@ -5,7 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from converters.formats.kitti_drive import KittiDrive, packets_of, write_packets, write_scan, write_stamps
+from converters.formats.kitti_drive import (
+    KittiDrive,
+    packets_of,
+    write_packets,
+    write_scan,
+    write_stamps,
+)
 
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import rotation_z, rotations_of, translation
@@ -16,9 +22,16 @@ DRIVE = "2011_09_26/2011_09_26_drive_0005_sync"
 
 
 def write_raw(
-    root: Path, drive: KittiDrive, labels: dict[str, int], name: str = DRIVE, *, oxts_late_s: float = 0.0
+    root: Path,
+    drive: KittiDrive,
+    labels: dict[str, int],
+    name: str = DRIVE,
+    *,
+    oxts_late_s: float = 0.0,
 ) -> Path:
-    """Write a drive and return its folder. Packets of the navigation system come `oxts_late_s` after the scans.
+    """Write a drive and return its folder.
+
+    Packets of the navigation system come `oxts_late_s` after the scans.
 
     Args:
         labels: the class ids of `drive.boxes`, by kind: the names of their types are written.
@@ -34,26 +47,36 @@ def write_raw(
         write_packets(folder / f"oxts/data/{frame:010d}.txt", packet[None])
     rotation, place = LIDAR_T_IMU[:3, :3].reshape(-1).tolist(), LIDAR_T_IMU[:3, 3].tolist()
     (folder.parent / "calib_imu_to_velo.txt").write_text(
-        f"calib_time: 25-May-2012 16:47:16\nR: {' '.join(map(repr, rotation))}\nT: {' '.join(map(repr, place))}\n"
+        f"calib_time: 25-May-2012 16:47:16\nR: {' '.join(map(repr, rotation))}\nT: "
+        f"{' '.join(map(repr, place))}\n"
     )
     boxes = [drive.boxes(frame, labels) for frame in range(drive.frames)]
-    (folder / "tracklet_labels.xml").write_text(tracklets_of(boxes, {labels[kind]: TYPES[kind] for kind in TYPES}))
+    (folder / "tracklet_labels.xml").write_text(
+        tracklets_of(boxes, {labels[kind]: TYPES[kind] for kind in TYPES})
+    )
     return folder
 
 
 def tracklets_of(boxes: list[Boxes], types: dict[int, str], interpolated: int | None = None) -> str:
-    """Return tracklet_labels.xml for the boxes of frames 0, 1, ...; those of one frame are marked as filled in."""
+    """Return tracklet_labels.xml for the boxes of frames 0, 1, ...; those of one frame are marked
+    as filled in.
+    """
     last = max(int(found.tracks.max(initial=0)) for found in boxes)
     items = [_tracklet(boxes, track, types, interpolated) for track in range(1, last + 1)]
     return (
         '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n<!DOCTYPE boost_serialization>\n'
-        '<boost_serialization signature="serialization::archive" version="9">\n<tracklets class_id="0">\n'
+        '<boost_serialization signature="serialization::archive" version="9">\n<tracklets '
+        'class_id="0">\n'
         f"<count>{len(items)}</count>\n<item_version>1</item_version>\n{''.join(items)}</tracklets>\n</boost_serialization>\n"
     )
 
 
-def _tracklet(boxes: list[Boxes], track: int, types: dict[int, str], interpolated: int | None) -> str:
-    rows = [(frame, found, np.flatnonzero(found.tracks == track)) for frame, found in enumerate(boxes)]
+def _tracklet(
+    boxes: list[Boxes], track: int, types: dict[int, str], interpolated: int | None
+) -> str:
+    rows = [
+        (frame, found, np.flatnonzero(found.tracks == track)) for frame, found in enumerate(boxes)
+    ]
     rows = [(frame, found, row) for frame, found, row in rows if len(row)]
     first = rows[0][0] if rows else 0
     length, width, height = rows[0][1].sizes[rows[0][2][0]].tolist() if rows else (1.0, 1.0, 1.0)

@@ -16,9 +16,12 @@ from carlasc.core.geometry import Transform, quaternions_of, rotation_z, transla
 from carlasc.testing.drives import KINDS, DriveScan, SimulatedDrive
 
 START_US = 1532402927647951
-MOUNT = translation((0.94, 0.0, 1.84)) @ rotation_z(-np.pi / 2)  # x of the LiDAR points to the right, y forward
+# x of the LiDAR points to the right, y forward
+MOUNT = translation((0.94, 0.0, 1.84)) @ rotation_z(-np.pi / 2)
 MATRIX = [[1266.4, 0.0, 816.3], [0.0, 1266.4, 491.5], [0.0, 0.0, 1.0]]
-VEHICLE_T_CAMERA = translation((1.7, 0.0, 1.5)) @ np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+VEHICLE_T_CAMERA = translation((1.7, 0.0, 1.5)) @ np.array(
+    [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+)
 IMAGE_LATER_US = 10_000
 GLOBAL_T_WORLD = translation((411.3, 1180.9, 0.0)) @ rotation_z(-1.1)
 CATEGORIES = {
@@ -31,7 +34,9 @@ CLASS_OF_KIND = np.array([CLASS_IDS[CATEGORIES[kind]] for kind in KINDS], np.uin
 
 def drive(frames: int = 7, *, channels: int = 12, columns: int = 90) -> SimulatedDrive:
     """Return a small drive with the LiDAR of the data set."""
-    return SimulatedDrive(frames, 0.05, (Sensor("LIDAR_TOP", MOUNT),), channels=channels, columns=columns)
+    return SimulatedDrive(
+        frames, 0.05, (Sensor("LIDAR_TOP", MOUNT),), channels=channels, columns=columns
+    )
 
 
 def microseconds(drive: SimulatedDrive, frame: int) -> int:
@@ -61,9 +66,16 @@ def write_nuscenes(
     panoptic: bool = True,
     annotated: bool = True,
 ) -> Path:
-    """Write scenes by name into a folder, and return the folder of the tables; every so many scans are key frames, and the last one."""
-    tables: dict[str, list[dict[str, Any]]] = {name: [] for name in ("scene", "sample", "sample_data", "ego_pose")}
-    tables |= {name: [] for name in ("calibrated_sensor", "sample_annotation", "instance", "lidarseg", "panoptic")}
+    """Write scenes by name into a folder, and return the folder of the tables; every so many scans
+    are key frames, and the last one.
+    """
+    tables: dict[str, list[dict[str, Any]]] = {
+        name: [] for name in ("scene", "sample", "sample_data", "ego_pose")
+    }
+    tables |= {
+        name: []
+        for name in ("calibrated_sensor", "sample_annotation", "instance", "lidarseg", "panoptic")
+    }
     tables["sensor"] = [
         {"token": "sensor-camera", "channel": "CAM_FRONT", "modality": "camera"},
         {"token": "sensor-lidar", "channel": "LIDAR_TOP", "modality": "lidar"},
@@ -74,7 +86,9 @@ def write_nuscenes(
         if lidarseg or panoptic or not name.startswith(("noise", "flat", "static.", "vehicle.ego"))
     ]
     if not (lidarseg or panoptic):
-        tables["category"] = [{key: row[key] for key in row if key != "index"} for row in tables["category"]]
+        tables["category"] = [
+            {key: row[key] for key in row if key != "index"} for row in tables["category"]
+        ]
     for scene, drive in drives.items():
         _write_scene(root, tables, version, scene, drive, every, (lidarseg, panoptic, annotated))
     folder = root / version
@@ -102,7 +116,11 @@ def _write_scene(
     mounts = {"lidar": drive.sensors[0].vehicle_T_sensor, "camera": VEHICLE_T_CAMERA}
     for name, mount in mounts.items():
         token = f"{scene}-mount-{name}"
-        row = {"token": token, "sensor_token": f"sensor-{name}", "camera_intrinsic": MATRIX if name == "camera" else []}
+        row = {
+            "token": token,
+            "sensor_token": f"sensor-{name}",
+            "camera_intrinsic": MATRIX if name == "camera" else [],
+        }
         tables["calibrated_sensor"].append(row | pose_keys(mount))
     for frame in reversed(range(drive.frames)):  # rows of tables have no order
         key, at = frame % every == 0, microseconds(drive, frame)
@@ -117,7 +135,10 @@ def _write_scene(
             "width": 0,
             "height": 0,
         }
-        row |= {"calibrated_sensor_token": f"{scene}-mount-lidar", "filename": str(folder / f"{scene}__{at}.pcd.bin")}
+        row |= {
+            "calibrated_sensor_token": f"{scene}-mount-lidar",
+            "filename": str(folder / f"{scene}__{at}.pcd.bin"),
+        }
         camera = {
             "token": f"{token}-picture",
             "calibrated_sensor_token": f"{scene}-mount-camera",
@@ -140,20 +161,32 @@ def _write_scene(
         labels = CLASS_OF_KIND[scan.kinds]
         if lidarseg:
             file = f"lidarseg/{version}/{token}_lidarseg.bin"
-            tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": file})
+            tables["lidarseg"].append(
+                {"token": token, "sample_data_token": token, "filename": file}
+            )
             _write_bytes(root / file, labels.tobytes())
         if panoptic:
             file = f"panoptic/{version}/{token}_panoptic.npz"
-            tables["panoptic"].append({"token": token, "sample_data_token": token, "filename": file})
+            tables["panoptic"].append(
+                {"token": token, "sample_data_token": token, "filename": file}
+            )
             (root / file).parent.mkdir(parents=True, exist_ok=True)
-            objects = np.where(scan.instances > 0, panoptic_number(scan.instances.astype(np.int64)), 0)
-            np.savez_compressed(root / file, data=(labels.astype(np.int64) * 1000 + objects).astype(np.uint16))
+            objects = np.where(
+                scan.instances > 0, panoptic_number(scan.instances.astype(np.int64)), 0
+            )
+            np.savez_compressed(
+                root / file, data=(labels.astype(np.int64) * 1000 + objects).astype(np.uint16)
+            )
         if annotated:
             _annotate(tables, drive, frame, scene, sample)
 
 
 def _annotate(
-    tables: dict[str, list[dict[str, Any]]], drive: SimulatedDrive, frame: int, scene: str, sample: str
+    tables: dict[str, list[dict[str, Any]]],
+    drive: SimulatedDrive,
+    frame: int,
+    scene: str,
+    sample: str,
 ) -> None:
     """Add the boxes of a key frame to the tables."""
     boxes = drive.boxes(frame)
@@ -164,14 +197,21 @@ def _annotate(
     ):
         instance = f"{scene}-object-{track}"
         if instance not in known:
-            tables["instance"].append({"token": instance, "category_token": f"category-{CLASS_OF_KIND[kind]}"})
+            tables["instance"].append(
+                {"token": instance, "category_token": f"category-{CLASS_OF_KIND[kind]}"}
+            )
         keys = {"token": f"{instance}-{frame}", "sample_token": sample, "instance_token": instance}
-        tables["sample_annotation"].append(keys | {"size": [width, length, height], **pose_keys(pose)})
+        tables["sample_annotation"].append(
+            keys | {"size": [width, length, height], **pose_keys(pose)}
+        )
 
 
 def pose_keys(pose: Transform) -> dict[str, list[float]]:
     """Return the keys of a pose."""
-    return {"translation": pose[:3, 3].tolist(), "rotation": quaternions_of(pose[None, :3, :3])[0].tolist()}
+    return {
+        "translation": pose[:3, 3].tolist(),
+        "rotation": quaternions_of(pose[None, :3, :3])[0].tolist(),
+    }
 
 
 def write_table(path: Path, rows: Sequence[Any]) -> None:

@@ -15,9 +15,14 @@ TAGS = {
 TAG_OF_KIND = np.array([TAGS[kind] for kind in KINDS], np.uint32)
 FIRST_ACTOR = 500
 FIRST_SCAN = 3
-"""index_frame of the first scan: the scans before it were taken while the vehicle stood, and left out."""
+"""index_frame of the first scan: the scans before it were taken while the vehicle stood, and left
+out.
+"""
 ROW = np.dtype(
-    [(name, "<f4") for name in ("x", "y", "z", "x_lidar_position", "y_lidar_position", "z_lidar_position")]
+    [
+        (name, "<f4")
+        for name in ("x", "y", "z", "x_lidar_position", "y_lidar_position", "z_lidar_position")
+    ]
     + [("cos_angle_lidar_surface", "<f4"), ("timestamp", "<f4")]
     + [(name, "<u4") for name in ("index_frame", "instance", "semantic", "semantic_image")]
     + [(name, "u1") for name in ("red", "green", "blue")]
@@ -60,4 +65,7 @@ def scan_rows(drive: SimulatedDrive, frame: int) -> NDArray[np.void]:
 def in_world(scan: DriveScan) -> NDArray[np.float64]:
     """Return the (N, 3) points of a scan in the world."""
     poses = scan.world_T_sensor
-    return np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points[:, :3].astype(np.float64)) + poses[:, :3, 3]
+    return (
+        np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points[:, :3].astype(np.float64))
+        + poses[:, :3, 3]
+    )

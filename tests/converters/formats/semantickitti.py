@@ -24,7 +24,9 @@ def write_semantickitti(root: Path, drive: KittiDrive) -> Path:
         scan = drive.scan(frame)
         write_scan(folder / f"velodyne/{frame:06d}.bin", scan.points)
         (folder / "labels").mkdir(exist_ok=True)
-        (lookup[scan.kinds] | scan.instances << 16).astype("<u4").tofile(folder / f"labels/{frame:06d}.label")
+        (lookup[scan.kinds] | scan.instances << 16).astype("<u4").tofile(
+            folder / f"labels/{frame:06d}.label"
+        )
     world = drive.world_T_lidar(drive.times)
     write_poses(folder / "poses.txt", np.linalg.inv(world[0]) @ world)
     write_calibration(folder / "calib.txt")

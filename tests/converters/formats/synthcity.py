@@ -28,7 +28,9 @@ def area_points(drive: SimulatedDrive) -> tuple[NDArray[np.float64], NDArray[np.
     return points, LABEL_OF_KIND[np.concatenate([scan.kinds for scan in scans])]
 
 
-def write_area(path: Path, drive: SimulatedDrive, *, names: dict[str, str] | None = None, rows: int = 700) -> Path:
+def write_area(
+    path: Path, drive: SimulatedDrive, *, names: dict[str, str] | None = None, rows: int = 700
+) -> Path:
     """Write a drive as a table with row groups of some rows, and columns of some names."""
     points, labels = area_points(drive)
     named = NAMES if names is None else names

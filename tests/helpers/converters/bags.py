@@ -1,4 +1,6 @@
-"""Bags that rosbags writes: messages of points, poses and transforms, of small clouds or of a simulated drive, as ROS 1 and ROS 2."""
+"""Bags that rosbags writes: messages of points, poses and transforms, of small clouds or of a
+simulated drive, as ROS 1 and ROS 2.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +15,21 @@ from carlasc.testing import SimulatedDrive
 KINDS = ("bag", "db3", "mcap")
 START_NS = 1_700_000_000_123_456_789
 WORLD, BASE, LIDAR = "odom", "base_link", "lidar"
-_TYPES = {np.dtype(kind): number for number, kind in enumerate("i1 u1 i2 u2 i4 u4 f4 f8".split(), 1)}
+_TYPES = {
+    np.dtype(kind): number for number, kind in enumerate("i1 u1 i2 u2 i4 u4 f4 f8".split(), 1)
+}
 _LIVOX = {
-    "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n",
-    "CustomMsg": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n",
+    "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 "
+    "reflectivity\nuint8 tag\nuint8 line\n",
+    "CustomMsg": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 "
+    "lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n",
 }
 
 
 class Messages:
-    """Makes messages of ROS 1 (`bag`) or ROS 2, each as (topic, type, time in nanoseconds, message)."""
+    """Makes messages of ROS 1 (`bag`) or ROS 2, each as (topic, type, time in nanoseconds,
+    message).
+    """
 
     def __init__(self, kind: str) -> None:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -42,7 +50,9 @@ class Messages:
         stamp = self.make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 10**9))
         return self.make("std_msgs/msg/Header", *((0,) if self.ros1 else ()), stamp, frame)
 
-    def cloud(self, topic, stamp_ns, points, frame=LIDAR, *, height=1, row_padding=0, big_endian=False):
+    def cloud(
+        self, topic, stamp_ns, points, frame=LIDAR, *, height=1, row_padding=0, big_endian=False
+    ):
         """Points: a structured array whose layout is that of the message."""
         points = np.asarray(points)
         if big_endian:
@@ -55,7 +65,12 @@ class Messages:
         ]
         kind = "sensor_msgs/msg/PointCloud2"
         sizes = (height, len(points) // height, fields, big_endian, points.itemsize, rows.shape[1])
-        return topic, kind, stamp_ns, self.make(kind, self.header(stamp_ns, frame), *sizes, rows.reshape(-1), True)
+        return (
+            topic,
+            kind,
+            stamp_ns,
+            self.make(kind, self.header(stamp_ns, frame), *sizes, rows.reshape(-1), True),
+        )
 
     def livox(self, topic, stamp_ns, rows, package="livox_ros_driver2"):
         """Rows: (offset in nanoseconds, x, y, z, reflectivity, tag, line)."""
@@ -68,11 +83,18 @@ class Messages:
         covariance = np.zeros(36)
         vector = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
         twist = self.make(
-            "geometry_msgs/msg/TwistWithCovariance", self.make("geometry_msgs/msg/Twist", vector, vector), covariance
+            "geometry_msgs/msg/TwistWithCovariance",
+            self.make("geometry_msgs/msg/Twist", vector, vector),
+            covariance,
         )
         placed = self.make("geometry_msgs/msg/PoseWithCovariance", self.pose(pose), covariance)
         kind = "nav_msgs/msg/Odometry"
-        return topic, kind, stamp_ns, self.make(kind, self.header(stamp_ns, WORLD), child, placed, twist)
+        return (
+            topic,
+            kind,
+            stamp_ns,
+            self.make(kind, self.header(stamp_ns, WORLD), child, placed, twist),
+        )
 
     def pose_stamped(self, topic, stamp_ns, pose):
         kind = "geometry_msgs/msg/PoseStamped"
@@ -85,20 +107,31 @@ class Messages:
 
     def path(self, topic, stamps, poses):
         kind = "nav_msgs/msg/Path"
-        placed = [self.pose_stamped("", stamp, pose)[3] for stamp, pose in zip(stamps, poses, strict=True)]
+        placed = [
+            self.pose_stamped("", stamp, pose)[3] for stamp, pose in zip(stamps, poses, strict=True)
+        ]
         return topic, kind, stamps[-1], self.make(kind, self.header(stamps[-1], WORLD), placed)
 
     def transform(self, topic, stamp_ns, parent, child, pose):
         x, y, z, rotation = self._parts(pose)
-        placed = self.make("geometry_msgs/msg/Transform", self.make("geometry_msgs/msg/Vector3", x, y, z), rotation)
-        stamped = self.make("geometry_msgs/msg/TransformStamped", self.header(stamp_ns, parent), child, placed)
+        placed = self.make(
+            "geometry_msgs/msg/Transform", self.make("geometry_msgs/msg/Vector3", x, y, z), rotation
+        )
+        stamped = self.make(
+            "geometry_msgs/msg/TransformStamped", self.header(stamp_ns, parent), child, placed
+        )
         kind = "tf2_msgs/msg/TFMessage"
         return topic, kind, stamp_ns, self.make(kind, [stamped])
 
     def camera_info(self, topic, stamp_ns, frame, size, matrix, model="plumb_bob", distortion=()):
         kind = "sensor_msgs/msg/CameraInfo"
         projection = np.column_stack([matrix, np.zeros(3)])
-        numbers = [np.array(distortion, np.float64), np.ravel(matrix), np.eye(3).ravel(), projection.ravel()]
+        numbers = [
+            np.array(distortion, np.float64),
+            np.ravel(matrix),
+            np.eye(3).ravel(),
+            projection.ravel(),
+        ]
         region = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         values = (size[1], size[0], model, *numbers, 0, 0, region)
         return topic, kind, stamp_ns, self.make(kind, self.header(stamp_ns, frame), *values)
@@ -125,14 +158,18 @@ class Messages:
 
     def pose(self, pose):
         x, y, z, rotation = self._parts(pose)
-        return self.make("geometry_msgs/msg/Pose", self.make("geometry_msgs/msg/Point", x, y, z), rotation)
+        return self.make(
+            "geometry_msgs/msg/Pose", self.make("geometry_msgs/msg/Point", x, y, z), rotation
+        )
 
     def _parts(self, pose):
         w, i, j, k = quaternions_of(np.asarray(pose, np.float64)[None, :3, :3])[0].tolist()
         return *pose[:3, 3].tolist(), self.make("geometry_msgs/msg/Quaternion", i, j, k, w)
 
 
-def write_bag(folder: Path, kind: str, messages: Iterable[tuple], *, store: Messages, compressed: str = "") -> Path:
+def write_bag(
+    folder: Path, kind: str, messages: Iterable[tuple], *, store: Messages, compressed: str = ""
+) -> Path:
     """Write messages, in their order, and return the bag: a file, or a folder for ROS 2.
 
     `compressed`: "bz2" or "lz4" for ROS 1; "message" or "storage" for ROS 2.
@@ -148,7 +185,9 @@ def write_bag(folder: Path, kind: str, messages: Iterable[tuple], *, store: Mess
         plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
         writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
         if compressed:
-            writer.set_compression(rosbag2.CompressionMode[compressed.upper()], rosbag2.CompressionFormat.ZSTD)
+            writer.set_compression(
+                rosbag2.CompressionMode[compressed.upper()], rosbag2.CompressionFormat.ZSTD
+            )
     serialize = store.store.serialize_ros1 if kind == "bag" else store.store.serialize_cdr
     connections = {}
     with writer:
@@ -196,8 +235,11 @@ def velodyne(points, seconds=None):
     return packed
 
 
-def drive_messages(store: Messages, drive: SimulatedDrive, poses: str = "odometry") -> Sequence[tuple]:
-    """Return the messages of a drive: a topic of points a sensor, its transform, and poses of `base_link`, by time.
+def drive_messages(
+    store: Messages, drive: SimulatedDrive, poses: str = "odometry"
+) -> Sequence[tuple]:
+    """Return the messages of a drive: a topic of points a sensor, its transform, and poses of
+    `base_link`, by time.
 
     Poses: "odometry", "pose", "covariance", "path", "tf" or "none".
     """
@@ -205,7 +247,9 @@ def drive_messages(store: Messages, drive: SimulatedDrive, poses: str = "odometr
     stamps = [START_NS + round(seconds * 1e9) for seconds in drive.times.tolist()]
     for index, sensor in enumerate(drive.sensors):
         name = sensor.name
-        messages.append(store.transform("/tf_static", START_NS, BASE, name, sensor.vehicle_T_sensor))
+        messages.append(
+            store.transform("/tf_static", START_NS, BASE, name, sensor.vehicle_T_sensor)
+        )
         for frame, stamp in enumerate(stamps):
             scan = drive.scan(frame, index)
             cloud = velodyne(scan.points, scan.seconds if drive.rolling else None)

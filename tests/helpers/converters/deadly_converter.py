@@ -1,4 +1,6 @@
-"""A converter for drives of the lab, in which frame 3 kills the process that reads it, as a library that crashes does."""
+"""A converter for drives of the lab, in which frame 3 kills the process that reads it, as a library
+that crashes does.
+"""
 
 import multiprocessing
 import os
@@ -9,7 +11,8 @@ from helpers.converters.lab_converter import Drive, Frame, Lab
 
 class DeadlyFrame(Frame):
     def read(self):
-        if self.number == 3 and multiprocessing.parent_process() is not None:  # not the process of the tests
+        # not the process of the tests
+        if self.number == 3 and multiprocessing.parent_process() is not None:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().read()
 

@@ -21,7 +21,10 @@ TABLE = ClassTable(
     ground_only=9,
 )
 TO_CARLA = Remap(
-    "drive_to_carla", TABLE, CARLA, {0: 0, 1: 7, 2: 1, 3: 9, 4: 5, 5: 10, 6: 10, 7: 4, 8: 10, 9: 14, 10: 3}
+    "drive_to_carla",
+    TABLE,
+    CARLA,
+    {0: 0, 1: 7, 2: 1, 3: 9, 4: 5, 5: 10, 6: 10, 7: 4, 8: 10, 9: 14, 10: 3},
 )
 
 
@@ -54,13 +57,22 @@ class DriveRecording(Recording):
     name, split, location = "DRIVE_0", "Train", "memory"
 
     def __init__(self, drive, gives, annotated):
-        self.drive, self.gives, self.annotated, self.sensors = drive, gives, annotated, drive.sensors
+        self.drive, self.gives, self.annotated, self.sensors = (
+            drive,
+            gives,
+            annotated,
+            drive.sensors,
+        )
         self.frames = [DriveFrame(drive, number, gives) for number in range(drive.frames)]
         self.has_labels, self.has_instances = "labels" in gives, "instances" in gives
 
     def poses(self, *, force=False):
         seconds = np.arange(-0.03, self.drive.times[-1] + 0.1, 0.02)  # not those of the frames
-        return Trajectory(self.drive.world_T_vehicle(seconds), seconds) if "poses" in self.gives else None
+        return (
+            Trajectory(self.drive.world_T_vehicle(seconds), seconds)
+            if "poses" in self.gives
+            else None
+        )
 
     def times(self):
         return self.drive.times if "times" in self.gives else None
@@ -68,7 +80,10 @@ class DriveRecording(Recording):
     def boxes(self):
         if "boxes" not in self.gives:
             return None
-        return {number: self.drive.boxes(number) for number in range(0, self.drive.frames, self.annotated)}
+        return {
+            number: self.drive.boxes(number)
+            for number in range(0, self.drive.frames, self.annotated)
+        }
 
 
 class DriveConverter(Converter):

@@ -28,7 +28,9 @@ class Drive(Recording):
 
     def __init__(self, folder):
         self.name, self.location, self.folder = f"LAB_{folder.name}", str(folder), folder
-        self.frames = [Frame(path, number) for number, path in enumerate(sorted(folder.glob("*.npz")))]
+        self.frames = [
+            Frame(path, number) for number, path in enumerate(sorted(folder.glob("*.npz")))
+        ]
 
     def poses(self, *, force=False):
         return Trajectory(np.load(self.folder / "poses.npy"))

@@ -1,4 +1,6 @@
-"""A simulated drive as a store of NCore: written by ourselves as its library writes it, for quick tests; and what its library is given."""
+"""A simulated drive as a store of NCore: written by ourselves as its library writes it, for quick
+tests; and what its library is given.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +21,21 @@ NAMES = {"car": "automobile", "van": "van", "pedestrian": "person", "cyclist": "
 
 
 def contents(drive: SimulatedDrive) -> dict:
-    """Return what a sequence holds: arrays of each frame of each LiDAR, poses, and observations of boxes in the frame of the rig."""
+    """Return what a sequence holds: arrays of each frame of each LiDAR, poses, and observations of
+    boxes in the frame of the rig.
+    """
     half = round(drive.period_s * 5e5)
-    ends = (
-        START_US + half + np.round(drive.times * 1e6).astype(np.int64)
-    )  # of frames, whose middle is the time of the drive
+    # of frames, whose middle is the time of the drive
+    ends = START_US + half + np.round(drive.times * 1e6).astype(np.int64)
     if not drive.rolling:
         ends = ends - half
     frames = {}
     for index, sensor in enumerate(drive.sensors):
         for number, end in enumerate(ends.tolist()):
             scan = drive.scan(number, index)
-            stamps = START_US + np.round((drive.times[number] + scan.seconds) * 1e6).astype(np.int64)
+            stamps = START_US + np.round((drive.times[number] + scan.seconds) * 1e6).astype(
+                np.int64
+            )
             reach = np.linalg.norm(scan.points[:, :3], axis=1)
             direction = (scan.points[:, :3] / reach[:, None]).astype(np.float32)
             distance = np.full((2, len(reach)), np.nan, np.float32)
@@ -44,7 +49,9 @@ def contents(drive: SimulatedDrive) -> dict:
                 "intensity": intensity.astype(np.float32),
                 "span": np.array([end - 2 * half, end], np.uint64),
             }
-    pose_times = np.arange(-drive.period_s, drive.times[-1] + 2 * drive.period_s, drive.period_s / 4)
+    pose_times = np.arange(
+        -drive.period_s, drive.times[-1] + 2 * drive.period_s, drive.period_s / 4
+    )
     observations = []
     for end in ends.tolist():
         seconds = (end - START_US) / 1e6
@@ -82,22 +89,33 @@ def contents(drive: SimulatedDrive) -> dict:
 
 
 def for_library(folder: Path, content: dict) -> None:
-    """Write what the library is given as .npz and JSON: `tests/converters/ncore_library.py` reads it."""
+    """Write what the library is given as .npz and JSON: `tests/converters/ncore_library.py` reads
+    it.
+    """
     arrays = {
-        f"{name}/{n}/{key}": value for (name, n), frame in content["frames"].items() for key, value in frame.items()
+        f"{name}/{n}/{key}": value
+        for (name, n), frame in content["frames"].items()
+        for key, value in frame.items()
     }
     mounts = {f"mount/{name}": pose for name, pose in content["mounts"].items()}
-    np.savez(folder / "given.npz", poses=content["poses"], stamps=content["stamps"], **arrays, **mounts)
+    np.savez(
+        folder / "given.npz", poses=content["poses"], stamps=content["stamps"], **arrays, **mounts
+    )
     (folder / "given.json").write_text(json.dumps(content["observations"]))
 
 
 def write_store(
-    folder: Path, drive: SimulatedDrive, *, version: str = "v4", edit: Callable[[dict], object] = bool
+    folder: Path,
+    drive: SimulatedDrive,
+    *,
+    version: str = "v4",
+    edit: Callable[[dict], object] = bool,
 ) -> Path:
-    """Write a store, and return its file; `edit` may change what it holds, as `contents` returns it.
+    """Write a store, and return its file; `edit` may change what it holds, as `contents` returns
+    it.
 
-    `edit` may add "cameras": for each name `lens`, its attributes in the component "intrinsics", `rig_T_camera`, and `images`: file and format by
-    (start, end) in microseconds.
+    `edit` may add "cameras": for each name `lens`, its attributes in the component "intrinsics",
+    `rig_T_camera`, and `images`: file and format by (start, end) in microseconds.
     """
     content = contents(drive)
     edit(content)
@@ -106,7 +124,9 @@ def write_store(
 
     def group(name: str, **attributes) -> None:
         for end in range(len(parts := name.split("/"))):
-            metadata["/".join([*parts[: end + 1], ".zgroup"]).removeprefix("/")] = {"zarr_format": 2}
+            metadata["/".join([*parts[: end + 1], ".zgroup"]).removeprefix("/")] = {
+                "zarr_format": 2
+            }
         metadata[f"{name}/.zattrs".removeprefix("/")] = attributes
 
     metadata[".zgroup"] = {"zarr_format": 2}
@@ -127,11 +147,15 @@ def write_store(
         }  # fmt: skip
         for row in range(0, len(values), chunks[0]):
             key = ".".join(map(str, [row // chunks[0], *(0 for _ in chunks[1:])]))
-            members[f"{name}/{key}"] = codec.encode(np.ascontiguousarray(values[row : row + chunks[0]]))
+            members[f"{name}/{key}"] = codec.encode(
+                np.ascontiguousarray(values[row : row + chunks[0]])
+            )
 
     for name in content["mounts"]:
         group(f"lidars/{name}", component_version="v1")
-        spans = [frame["span"].tolist() for (own, _), frame in content["frames"].items() if own == name]
+        spans = [
+            frame["span"].tolist() for (own, _), frame in content["frames"].items() if own == name
+        ]
         group(f"lidars/{name}/frames", frames_timestamps_us=spans)
     for (name, _), frame in content["frames"].items():
         place = f"lidars/{name}/frames/{int(frame['span'][1])}"
@@ -147,7 +171,9 @@ def write_store(
     for name, camera in cameras.items():
         group(f"intrinsics/default/cameras/{name}", **camera["lens"])
         group(f"cameras/{name}", component_version="v1")
-        group(f"cameras/{name}/frames", frames_timestamps_us=[list(span) for span in camera["images"]])
+        group(
+            f"cameras/{name}/frames", frames_timestamps_us=[list(span) for span in camera["images"]]
+        )
         for (_, end), (data, kind) in camera["images"].items():
             place = f"cameras/{name}/frames/{end}/image"
             metadata[f"{place}/.zarray"] = {
@@ -157,18 +183,27 @@ def write_store(
             members[f"{place}/0"] = data
     if cameras:
         metadata["intrinsics/default/.zattrs"] = {"component_version": "v1"}
-    content["mounts"] |= {name: camera["rig_T_camera"] for name, camera in cameras.items() if "rig_T_camera" in camera}
-    static = {
-        str((name, "rig")): {"pose": pose.tolist(), "dtype": "float64"} for name, pose in content["mounts"].items()
+    content["mounts"] |= {
+        name: camera["rig_T_camera"] for name, camera in cameras.items() if "rig_T_camera" in camera
     }
-    moving = {"poses": content["poses"].tolist(), "timestamps_us": content["stamps"].tolist(), "dtype": "float64"}
+    static = {
+        str((name, "rig")): {"pose": pose.tolist(), "dtype": "float64"}
+        for name, pose in content["mounts"].items()
+    }
+    moving = {
+        "poses": content["poses"].tolist(),
+        "timestamps_us": content["stamps"].tolist(),
+        "dtype": "float64",
+    }
     group("poses/default/static_poses", **static)
     group("poses/default/dynamic_poses", **{str(("rig", "world")): moving})
     group("cuboids/default", component_version="v1")
     group("cuboids/default/cuboids", cuboid_track_observations=content["observations"])
     path = folder / "drive.ncore4.zarr.itar"
     _write_archive(
-        path, members | {".zmetadata.cbor.xz": _packed({"zarr_consolidated_format": 1, "metadata": metadata})}
+        path,
+        members
+        | {".zmetadata.cbor.xz": _packed({"zarr_consolidated_format": 1, "metadata": metadata})},
     )
     return path
 

@@ -1,4 +1,6 @@
-"""Scans as files of every format, written by NumPy, Open3D and laspy; and poses as files of every format."""
+"""Scans as files of every format, written by NumPy, Open3D and laspy; and poses as files of every
+format.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,8 @@ def write_with_open3d(path: Path, fields: dict[str, np.ndarray], **how) -> None:
     cloud.point["positions"] = open3d.core.Tensor(positions)
     for name, values in fields.items():
         if name not in ("x", "y", "z"):
-            kept = values.astype(np.int32) if values.dtype == np.uint32 else values  # its PLY has no uint32
+            # its PLY has no uint32
+            kept = values.astype(np.int32) if values.dtype == np.uint32 else values
             cloud.point[name] = open3d.core.Tensor(kept.reshape(-1, 1))
     assert open3d.t.io.write_point_cloud(str(path), cloud, **how)
 
@@ -62,8 +65,12 @@ def write_with_laspy(path: Path, fields: dict[str, np.ndarray]) -> None:
     cloud.write(str(path))
 
 
-def write_poses(path: Path, poses: np.ndarray, seconds: np.ndarray, kind: str, start_ns: int = 0) -> None:
-    """Write (K, 4, 4) poses at some times as a file of a kind: tum, kitti, euroc, csv or npy; `start_ns` is added to nanoseconds."""
+def write_poses(
+    path: Path, poses: np.ndarray, seconds: np.ndarray, kind: str, start_ns: int = 0
+) -> None:
+    """Write (K, 4, 4) poses at some times as a file of a kind: tum, kitti, euroc, csv or npy;
+    `start_ns` is added to nanoseconds.
+    """
     w, x, y, z = quaternions_of(poses[:, :3, :3]).T
     places = poses[:, :3, 3].T
     if kind == "npy":
@@ -71,11 +78,18 @@ def write_poses(path: Path, poses: np.ndarray, seconds: np.ndarray, kind: str, s
     elif kind == "kitti":
         np.savetxt(path, poses[:, :3].reshape(-1, 12), "%.18e")
     elif kind == "tum":
-        np.savetxt(path, np.stack([seconds, *places, x, y, z, w], axis=1), "%.17g", header="t x y z qx qy qz qw")
+        np.savetxt(
+            path,
+            np.stack([seconds, *places, x, y, z, w], axis=1),
+            "%.17g",
+            header="t x y z qx qy qz qw",
+        )
     else:
         stamps = [str(start_ns + round(second * 1e9)) for second in seconds.tolist()]
         rows = np.stack([*places, w, x, y, z], axis=1).tolist()
         euroc = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
         lines = [euroc if kind == "euroc" else "time_ns,x,y,z,qw,qx,qy,qz"]
-        lines += [",".join([stamp, *map(repr, row)]) for stamp, row in zip(stamps, rows, strict=True)]
+        lines += [
+            ",".join([stamp, *map(repr, row)]) for stamp, row in zip(stamps, rows, strict=True)
+        ]
         path.write_text("\n".join(lines) + "\n")

@@ -12,7 +12,9 @@ from carlasc.core.scans import Scan
 
 
 def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> SensorRecording:
-    """Return a recording of random points around the sensor, some of them on moving actors, at a random pose without roll and pitch."""
+    """Return a recording of random points around the sensor, some of them on moving actors, at a
+    random pose without roll and pitch.
+    """
     rng = np.random.default_rng(seed)
     xyz = rng.uniform((-20, -20, -2), (20, 20, 1), (points, 3)).astype(np.float32)
     instances = rng.integers(0, actors + 1, points).astype(np.uint32)
@@ -22,8 +24,13 @@ def make_recording(points: int = 300, actors: int = 3, seed: int = 0) -> SensorR
     return SensorRecording(Scan(xyz, labels, None, instances), pose, velocities)
 
 
-def write_capture(root: Path, frames: int = 3, sensors: int = 2, first: int = 100, points: int = 300) -> Capture:
-    """Write a capture of random recordings to a sequence's folder and return it. The picture of frame f is the text "picture f"."""
+def write_capture(
+    root: Path, frames: int = 3, sensors: int = 2, first: int = 100, points: int = 300
+) -> Capture:
+    """Write a capture of random recordings to a sequence's folder and return it.
+
+    The picture of frame f is the text "picture f".
+    """
     writer = CaptureWriter(root)
     for frame in range(first, first + frames):
         for sensor in range(sensors):
@@ -34,7 +41,9 @@ def write_capture(root: Path, frames: int = 3, sensors: int = 2, first: int = 10
 
 
 def read_tree(folder: Path, leave_out: str = "raw") -> dict[str, bytes]:
-    """Return the content of every file in a folder by its relative path, also of hidden files, except in folders called `leave_out`."""
+    """Return the content of every file in a folder by its relative path, also of hidden files,
+    except in folders called `leave_out`.
+    """
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))

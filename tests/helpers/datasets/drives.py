@@ -1,4 +1,6 @@
-"""Small sequences on disk for the tests of Dataset: a sensor that drives around a bend, random points, random grids."""
+"""Small sequences on disk for the tests of Dataset: a sensor that drives around a bend, random
+points, random grids.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,12 @@ from carlasc.storage.folder import FolderSink
 
 def bend(frames: int, step_m: float = 0.8, yaw_rad: float = 0.02) -> NDArray[np.float64]:
     """Return the (F, 4, 4) poses of a drive around a bend, as in poses.txt."""
-    world = np.stack([translation((step_m * i, 0.02 * i, 0.001 * i)) @ rotation_z(yaw_rad * i) for i in range(frames)])
+    world = np.stack(
+        [
+            translation((step_m * i, 0.02 * i, 0.001 * i)) @ rotation_z(yaw_rad * i)
+            for i in range(frames)
+        ]
+    )
     return relative_to(world[0], world)
 
 
@@ -53,7 +60,9 @@ def write_drive(
     rng = np.random.default_rng(seed)
     frames = list(frames)
     grid_frames = frames if grid_frames is None else list(grid_frames)
-    spec = spec or GridSpec.published("cylindrical" if folder.name == "cylindrical" else "cartesian")
+    spec = spec or GridSpec.published(
+        "cylindrical" if folder.name == "cylindrical" else "cartesian"
+    )
     writer = FolderSink(folder.parent).sequence(folder.name)
     scans = [random_points(rng, points) for _ in frames] if scans is None else list(scans)
     for frame, scan in zip(frames, scans, strict=True):
@@ -74,7 +83,9 @@ def write_drive(
 
 
 def write_world(root: Path, spec: GridSpec) -> Path:
-    """Write two training sequences, of six and four frames, and one of three frames to validate with; return the folder."""
+    """Write two training sequences, of six and four frames, and one of three frames to validate
+    with; return the folder.
+    """
     write_drive(root / "Train" / "Town01_Light" / "cartesian", range(6), spec=spec, seed=1)
     write_drive(root / "Train" / "Town02_Light" / "cartesian", range(4), spec=spec, seed=2)
     write_drive(root / "Val" / "Town07_Light" / "cartesian", range(3), spec=spec, seed=3)

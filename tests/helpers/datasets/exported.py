@@ -1,4 +1,6 @@
-"""A small scene to export, and readers of the files of other data sets, by the facts of their formats."""
+"""A small scene to export, and readers of the files of other data sets, by the facts of their
+formats.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,13 @@ THINGS = {(5.1, 3.1, -1.1): CAR, (-4.9, -2.1, -0.5): PEDESTRIAN, (2.3, -5.9, 0.7
 
 
 def scene_grid(
-    spec: GridSpec = SPEC, shift_m: float = 0.0, things: dict[tuple[float, float, float], int] | None = None
+    spec: GridSpec = SPEC,
+    shift_m: float = 0.0,
+    things: dict[tuple[float, float, float], int] | None = None,
 ) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
-    """Return labels and counts: a road at z = -1.8, things, and unknown space behind the sensor beyond 6 m."""
+    """Return labels and counts: a road at z = -1.8, things, and unknown space behind the sensor
+    beyond 6 m.
+    """
     centers = spec.centers()
     labels = np.zeros(spec.size, np.uint32)
     labels[np.abs(centers[..., 2] + 1.75) < 0.3 * spec.voxel_size[2]] = ROAD
@@ -47,7 +53,9 @@ def write_scene(
     counts: bool = True,
     path: str = PATH,
 ) -> Path:
-    """Write a sequence in left-handed axes whose things move forward by 0.4 m a frame, and the vehicle by 1 m."""
+    """Write a sequence in left-handed axes whose things move forward by 0.4 m a frame, and the
+    vehicle by 1 m.
+    """
     writer = FolderSink(root).sequence(path)
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 0, 3] = np.arange(frames)
@@ -61,7 +69,9 @@ def write_scene(
         writer.write(f"{grid}/labels", frame, labels)
         if counts:
             writer.write(f"{grid}/counts", frame, votes)
-        points = np.array([[5.1 + 0.4 * frame, 3.1, -1.1, 0.0], [1.1, -0.3, -1.75, 0.0]], np.float32)
+        points = np.array(
+            [[5.1 + 0.4 * frame, 3.1, -1.1, 0.0], [1.1, -0.3, -1.75, 0.0]], np.float32
+        )
         writer.write("points", frame, points)
         writer.write("labels", frame, np.array([CAR, ROAD], np.uint32))
     return root
@@ -69,10 +79,16 @@ def write_scene(
 
 def files_and_bytes(root: Path) -> dict[str, bytes]:
     """Return every file below a folder, by its path."""
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
 
 
-def read_occ3d(root: Path, scene: str) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[np.uint8]]]]:
+def read_occ3d(
+    root: Path, scene: str
+) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[np.uint8]]]]:
     """Return annotations.json, and the arrays of each token's labels.npz."""
     annotations = json.loads((root / "annotations.json").read_text())
     arrays = {}
@@ -83,7 +99,9 @@ def read_occ3d(root: Path, scene: str) -> tuple[dict[str, Any], dict[str, dict[s
 
 
 def occ3d_cell(x: float, y: float, z: float) -> tuple[int, int, int]:
-    """Return the voxel of a place in the vehicle's frame: x forward, y to the left, z up from the ground."""
+    """Return the voxel of a place in the vehicle's frame: x forward, y to the left, z up from the
+    ground.
+    """
     return int((x + 40) // 0.4), int((y + 40) // 0.4), int((z + 1) // 0.4)
 
 
@@ -95,7 +113,9 @@ def read_openoccupancy(file: Path) -> NDArray[np.uint8]:
     return dense
 
 
-def read_sscbench(folder: Path, frame: int) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
+def read_sscbench(
+    folder: Path, frame: int
+) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint8]]:
     """Return (256, 256, 32) raw labels, invalid, one byte each, and occupancy, unpacked from bits."""
     shape = (256, 256, 32)
     labels = np.fromfile(folder / f"{frame:06d}.label", "<u2").reshape(shape)
@@ -105,7 +125,10 @@ def read_sscbench(folder: Path, frame: int) -> tuple[NDArray[np.uint16], NDArray
 
 
 def read_index(file: Path) -> list[list[str]]:
-    """Return the list of lists of texts that a pickle holds. Nothing but such lists is accepted, and nothing is executed."""
+    """Return the list of lists of texts that a pickle holds.
+
+    Nothing but such lists is accepted, and nothing is executed.
+    """
     stack: list[Any] = []
     marks: list[int] = []
     memo: list[Any] = []

@@ -1,6 +1,8 @@
-"""Small SemanticKITTI data sets made of a simulated drive: right-handed, camera-frame poses, moving classes, instances, voxels.
+"""Small SemanticKITTI data sets made of a simulated drive: right-handed, camera-frame poses, moving
+classes, instances, voxels.
 
-Nothing here uses the converter: files are written as the format page describes them (docs/format.md#semantickitti).
+Nothing here uses the converter: files are written as the format page describes them
+(docs/format.md#semantickitti).
 """
 
 from __future__ import annotations
@@ -20,11 +22,12 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SMALL_LIDAR = Lidar(channels=32, points=16_000)
 MOVING_CLASS = {10: 252, 30: 254}
 
+# made up, but like the real one: x right, y down, z forward
 CAMERA_T_LIDAR = (
     translation((0.06, -0.08, -0.27))
     @ np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     @ rotation_z(0.01)
-)  # made up, but like the real one: x right, y down, z forward
+)
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,8 @@ class KittiTruth:
         folder: the sequence's folder.
         frames: its frame numbers, from 0 for the first frame of the drive.
         poses: (F, 4, 4) first_T_lidar, right-handed, by frame number.
-        flow: (N, 3) m/s of each point by frame, right-handed sensor frame, zero for actors that never move.
+        flow: (N, 3) m/s of each point by frame, right-handed sensor frame, zero for actors that
+            never move.
     """
 
     folder: Path
@@ -85,7 +89,9 @@ def write_kitti(
         if labels:
             classes = kitti_classes(recording.scan.labels, moves)
             (folder / "labels").mkdir(exist_ok=True)
-            (classes | (actors.astype(np.uint32) << 16)).astype("<u4").tofile(folder / "labels" / f"{number:06d}.label")
+            (classes | (actors.astype(np.uint32) << 16)).astype("<u4").tofile(
+                folder / "labels" / f"{number:06d}.label"
+            )
             if voxels_every and number % voxels_every == 0:
                 write_voxels(folder, number, points, classes)
     numbers = tuple(range(len(recordings)))
@@ -96,7 +102,9 @@ def write_kitti(
     return KittiTruth(folder, numbers, poses, flow)
 
 
-def kitti_classes(labels: NDArray[np.unsignedinteger], moves: NDArray[np.bool_]) -> NDArray[np.uint32]:
+def kitti_classes(
+    labels: NDArray[np.unsignedinteger], moves: NDArray[np.bool_]
+) -> NDArray[np.uint32]:
     """Return SemanticKITTI's classes for CARLA's; points of moving actors get a moving class."""
     classes = REMAPS["carla_to_semantickitti"](labels).astype(np.uint32)
     for standing, moving in MOVING_CLASS.items():
@@ -118,7 +126,9 @@ def write_calibration(path: Path, lines: Iterable[str] = ()) -> None:
     path.write_text("\n".join([*rows, *lines]) + "\n")
 
 
-def write_voxels(folder: Path, frame: int, points: NDArray[np.float32], classes: NDArray[np.uint32]) -> None:
+def write_voxels(
+    folder: Path, frame: int, points: NDArray[np.float32], classes: NDArray[np.uint32]
+) -> None:
     """Write voxels of one scan, with masks that mean little but differ from each other."""
     (folder / "voxels").mkdir(exist_ok=True)
     cells = np.floor((points - np.float32([0, -25.6, -2])) / np.float32(0.2)).astype(int)
@@ -137,7 +147,12 @@ def write_voxels(folder: Path, frame: int, points: NDArray[np.float32], classes:
 
 
 def _movers(drive: TownDrive, frames: Sequence[int]) -> set[int]:
-    """Return the actors that move at some time of the drive: they have a moving class in all frames."""
+    """Return the actors that move at some time of the drive: they have a moving class in all
+    frames.
+    """
     return {
-        actor.id for frame in frames for actor in drive.actors(frame) if float(np.square(actor.velocity).sum()) > 0.1**2
+        actor.id
+        for frame in frames
+        for actor in drive.actors(frame)
+        if float(np.square(actor.velocity).sum()) > 0.1**2
     }

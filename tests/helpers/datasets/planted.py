@@ -50,7 +50,9 @@ def write_grids(
         grid: name of the grid.
     """
     sequence, writer = sequence_of(source), FolderSink(out).sequence("cartesian")
-    writer.write_document(layout.params_file(GRID), json.dumps((spec or sequence.grids[grid]).to_params()).encode())
+    writer.write_document(
+        layout.params_file(GRID), json.dumps((spec or sequence.grids[grid]).to_params()).encode()
+    )
     if layout.METADATA in sequence.documents():
         writer.write_document(layout.METADATA, sequence.read_document(layout.METADATA))
     frames = sequence.frames(f"{grid}/labels").tolist()
@@ -74,7 +76,11 @@ def moved(spec: GridSpec, offset_m: tuple[float, float, float]) -> GridSpec:
 
 def larger(spec: GridSpec, ratio: float) -> GridSpec:
     """Return a geometry whose voxels and bounds are larger."""
-    return replace(spec, lower=tuple(np.multiply(spec.lower, ratio)), upper=tuple(np.multiply(spec.upper, ratio)))
+    return replace(
+        spec,
+        lower=tuple(np.multiply(spec.lower, ratio)),
+        upper=tuple(np.multiply(spec.upper, ratio)),
+    )
 
 
 def mirrored(_sequence: Sequence, _frame: int, labels: np.ndarray, counts: np.ndarray) -> tuple:
@@ -123,7 +129,9 @@ def voxels_of(sequence: Sequence, frame: int, other: int, instance: int) -> np.n
     """Return the voxels, in the grid of a frame, of an actor's points in the scan of another frame."""
     scan = sequence.scan(other, ("instances",))
     motion = invert(sequence.read_pose(frame)) @ sequence.read_pose(other)
-    voxels = sequence.grids[GRID].flat_index(transform_points(motion, scan.points[scan.instances == instance]))
+    voxels = sequence.grids[GRID].flat_index(
+        transform_points(motion, scan.points[scan.instances == instance])
+    )
     return voxels[voxels >= 0]
 
 
@@ -134,7 +142,9 @@ def fastest(sequence: Sequence) -> int:
         scan = sequence.scan(frame, ("instances", "flow"))
         fast = (np.linalg.norm(scan.flow[:, :2], axis=1) > 1.0) & (scan.instances > 0)
         inside = sequence.grids[GRID].flat_index(scan.points) >= 0
-        for instance, count in zip(*np.unique(scan.instances[fast & inside], return_counts=True), strict=True):
+        for instance, count in zip(
+            *np.unique(scan.instances[fast & inside], return_counts=True), strict=True
+        ):
             seen[int(instance)] = seen.get(int(instance), 0) + int(count)
     return max(seen, key=seen.get)
 
@@ -154,7 +164,11 @@ def with_boxes(source: Path, out: Path) -> Path:
     writer = FolderSink(without_fields(source, out, "instances", "flow")).sequence("cartesian")
     for frame in sequence.frames("points").tolist():
         sensor_T_world = invert(sequence.read_pose(frame))
-        seen = [(track, sensor_T_world @ pose) for track in tracks if (pose := track.pose(frame)) is not None]
+        seen = [
+            (track, sensor_T_world @ pose)
+            for track in tracks
+            if (pose := track.pose(frame)) is not None
+        ]
         poses = np.stack([pose for _, pose in seen]) if seen else np.empty((0, 4, 4))
         numbers = np.array([[t.instance, t.label] for t, _ in seen], np.uint32).reshape(-1, 2)
         sizes = np.array([t.size for t, _ in seen]).reshape(-1, 3)
@@ -165,7 +179,9 @@ def with_boxes(source: Path, out: Path) -> Path:
 
 
 def write_carlaocc(source: Path, out: Path, name: str = "Town01_Opt_Seq07") -> None:
-    """Write left-handed grids of CARLA's classes as a sequence of CarlaOcc, whose axes are right-handed."""
+    """Write left-handed grids of CARLA's classes as a sequence of CarlaOcc, whose axes are
+    right-handed.
+    """
     sequence = sequence_of(source)
     spec, folder = sequence.grids[GRID], out / name / "occupancy" / "vs_0_4_surround_view"
     tag_of = {new: tag for tag, new in reversed(CARLAOCC_TO_CARLA.mapping.items())}
@@ -175,5 +191,9 @@ def write_carlaocc(source: Path, out: Path, name: str = "Town01_Opt_Seq07") -> N
         labels = tags[sequence.grid(GRID, frame).labels[:, ::-1]]
         cells = np.argwhere(labels > 0)
         rows = np.column_stack([cells, 1000 * labels[labels > 0]]).astype(np.uint16)
-        geometry = {"voxel_size": spec.voxel_size[0], "voxel_origin": np.float32(spec.lower), "volume_size": spec.size}
+        geometry = {
+            "voxel_size": spec.voxel_size[0],
+            "voxel_origin": np.float32(spec.lower),
+            "volume_size": spec.size,
+        }
         np.savez_compressed(folder / f"{frame:04d}.npz", occupancy=rows, **geometry)

@@ -16,7 +16,9 @@ from carlasc.storage import SequenceWriter
 class MemoryFrame(FrameHandle):
     """A frame that holds its content; None stands for a file that cannot be read."""
 
-    def __init__(self, number: int, content: Cloud | None, voxels: VoxelContent | None = None) -> None:
+    def __init__(
+        self, number: int, content: Cloud | None, voxels: VoxelContent | None = None
+    ) -> None:
         self.number, self.content, self.voxels = number, content, voxels
         self.location = f"scan {number}"
 

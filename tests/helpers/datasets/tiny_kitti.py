@@ -1,4 +1,6 @@
-"""SemanticKITTI data sets of a few random points, for tests that do not depend on the content of a scan."""
+"""SemanticKITTI data sets of a few random points, for tests that do not depend on the content of a
+scan.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ CLASSES = np.array([0, 10, 40, 50, 70, 72, 252, 254], np.uint32)
 
 
 def write_tiny_kitti(
-    root: Path, sequence: str = "00", frames: int = 3, *, labels: bool = True, voxels: bool = False, points: int = 60
+    root: Path,
+    sequence: str = "00",
+    frames: int = 3,
+    *,
+    labels: bool = True,
+    voxels: bool = False,
+    points: int = 60,
 ) -> Path:
     """Write one sequence and return its folder."""
     folder = root / "sequences" / sequence

@@ -18,15 +18,23 @@ from numpy.typing import NDArray
 
 OUTPUT = Path(__file__).parents[3] / "test-output"
 _FLAGS = (
-    "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run"
-    " --disable-background-networking --disable-component-update --disable-sync --disable-dev-shm-usage --hide-scrollbars"
+    "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader "
+    "--enable-unsafe-swiftshader --disable-quic --no-first-run"
+    " --disable-background-networking --disable-component-update --disable-sync "
+    "--disable-dev-shm-usage --hide-scrollbars"
 ).split()
 
 
 def start_chromium(profile: Path) -> Any:
     """Start a browser with a fresh profile, or skip the test saying what is missing."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: pip install selenium")
-    binary = shutil.which("chromium") or shutil.which("google-chrome") or shutil.which("chromium-browser")
+    webdriver = pytest.importorskip(
+        "selenium.webdriver", reason="selenium is not installed: pip install selenium"
+    )
+    binary = (
+        shutil.which("chromium")
+        or shutil.which("google-chrome")
+        or shutil.which("chromium-browser")
+    )
     driver = shutil.which("chromedriver")
     if binary is None or driver is None:
         pytest.skip("chromium or chromedriver is not installed: apt-get install chromium-driver")
@@ -47,7 +55,9 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @contextmanager
 def serve_folder(folder: Path) -> Iterator[str]:
-    """Run a web server for a folder on a free port of this machine, as `python -m http.server` does; yields its address."""
+    """Run a web server for a folder on a free port of this machine, as `python -m http.server`
+    does; yields its address.
+    """
     server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Quiet, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
@@ -68,21 +78,27 @@ class Page:
         self.run(
             "while (!document.documentElement.dataset.ready && !window.failed) {"
             " await new Promise((done) => setTimeout(done, 20));"
-            " window.failed = document.getElementById('message').textContent.startsWith('This page');"
+            " window.failed = document.getElementById('message').textContent.startsWith('This "
+            "page');"
             "} document.documentElement.dataset.theme = 'light'; window.carlasc?.setTheme('light');"
         )
 
     def run(self, script: str, *arguments: object) -> Any:
-        """Run the body of an async function in the page, wait until the page is drawn again, and return its result."""
+        """Run the body of an async function in the page, wait until the page is drawn again, and
+        return its result.
+        """
         return self.browser.execute_async_script(
             "const [args, done] = [[...arguments].slice(0, -1), arguments[arguments.length - 1]];"
             f"(async () => {{ {script} }})().then("
-            " (value) => requestAnimationFrame(() => requestAnimationFrame(() => done(value))), (error) => done(`failed: ${error.stack}`));",
+            " (value) => requestAnimationFrame(() => requestAnimationFrame(() => done(value))), "
+            "(error) => done(`failed: ${error.stack}`));",
             *arguments,
         )
 
     def click(self, selector: str) -> None:
-        """Click the element of a CSS selector, as a user would, and wait until the page is drawn again."""
+        """Click the element of a CSS selector, as a user would, and wait until the page is drawn
+        again.
+        """
         self.browser.find_element("css selector", selector).click()
         self.run("")
 
@@ -91,7 +107,9 @@ class Page:
         return str(self.browser.find_element("css selector", selector).text)
 
     def picture(self, name: str | None = None) -> NDArray[np.uint8]:
-        """Return a screenshot, (H, W, 3) uint8, and keep it as test-output/<name>.png if it has a name."""
+        """Return a screenshot, (H, W, 3) uint8, and keep it as test-output/<name>.png if it has a
+        name.
+        """
         image = pytest.importorskip("PIL.Image")
 
         png = self.browser.get_screenshot_as_png()
@@ -103,7 +121,8 @@ class Page:
     def canvas(self, name: str | None = None) -> NDArray[np.uint8]:
         """Return the part of a screenshot that three.js draws."""
         box = self.run(
-            "const r = document.getElementById('stage').getBoundingClientRect(); return [r.x, r.y, r.right, r.bottom]"
+            "const r = document.getElementById('stage').getBoundingClientRect(); return [r.x, "
+            "r.y, r.right, r.bottom]"
         )
         x0, y0, x1, y1 = (round(value) for value in box)
         return self.picture(name)[y0:y1, x0:x1]
@@ -111,5 +130,7 @@ class Page:
     def complaints(self) -> list[str]:
         """Return the warnings and errors in the console since the page was opened."""
         return [
-            entry["message"] for entry in self.browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")
+            entry["message"]
+            for entry in self.browser.get_log("browser")
+            if entry["level"] in ("SEVERE", "WARNING")
         ]

@@ -1,4 +1,6 @@
-"""A headless Firefox that opens pages, driven by its own remote protocol (Marionette): no driver needs to be installed."""
+"""A headless Firefox that opens pages, driven by its own remote protocol (Marionette): no driver
+needs to be installed.
+"""
 
 from __future__ import annotations
 
@@ -34,11 +36,16 @@ class Firefox:
 
     def __init__(self, binary: str, folder: Path, environment: Mapping[str, str]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        lines = (f"user_pref({json.dumps(name)}, {json.dumps(value)});" for name, value in _PREFERENCES.items())
+        lines = (
+            f"user_pref({json.dumps(name)}, {json.dumps(value)});"
+            for name, value in _PREFERENCES.items()
+        )
         (folder / "user.js").write_text("\n".join(lines))
         command = [binary, "--headless", "--marionette", "--no-remote", "--profile", str(folder)]
         quiet = subprocess.DEVNULL
-        self.process = subprocess.Popen(command, env={**environment, "HOME": str(folder)}, stdout=quiet, stderr=quiet)
+        self.process = subprocess.Popen(
+            command, env={**environment, "HOME": str(folder)}, stdout=quiet, stderr=quiet
+        )
         self.socket = socket.create_connection(("127.0.0.1", self._port(folder)), timeout=60)
         self.number = 0
         self._receive()  # it introduces itself
@@ -89,7 +96,12 @@ class Firefox:
     def run(self, script: str) -> Any:
         """Run the body of an async function in the page, and return its result."""
         body = f"const done = arguments[0]; (async () => {{ {script} }})().then(done, (error) => done(`failed: ${{error.stack}}`));"
-        parameters: dict[str, Any] = {"script": body, "args": [], "sandbox": None}  # in the page's own world
+        # in the page's own world
+        parameters: dict[str, Any] = {
+            "script": body,
+            "args": [],
+            "sandbox": None,
+        }
         return self.call("WebDriver:ExecuteAsyncScript", parameters)["value"]
 
     def picture(self, name: str) -> NDArray[np.uint8]:
@@ -117,7 +129,8 @@ def start_firefox(profile: Path, environment: Mapping[str, str]) -> Firefox:
 
     Args:
         profile: an empty folder.
-        environment: names a screen, without which Firefox has no WebGL, not even headless (see `helpers.displays.virtual_screen`).
+        environment: names a screen, without which Firefox has no WebGL, not even headless (see
+            `helpers.displays.virtual_screen`).
     """
     binary = shutil.which("firefox-esr") or shutil.which("firefox")
     if binary is None:

@@ -13,7 +13,10 @@ import pytest
 
 @contextmanager
 def virtual_screen(size: str = "1400x900x24") -> Iterator[dict[str, str]]:
-    """Start Xvfb on a free display; yields the environment that uses it. Skips the test where Xvfb is absent."""
+    """Start Xvfb on a free display; yields the environment that uses it.
+
+    Skips the test where Xvfb is absent.
+    """
     if shutil.which("Xvfb") is None:
         pytest.skip("Xvfb is not installed: apt-get install xvfb")
     reader, writer = os.pipe()

@@ -1,4 +1,6 @@
-"""What processes do that share a cache: they are started, and killed, by the tests of `carlasc.storage.transport.caching`."""
+"""What processes do that share a cache: they are started, and killed, by the tests of
+`carlasc.storage.transport.caching`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ def tree_at(url: str, folder: Path, max_bytes: int = 1 << 20) -> CachedTree:
     return CachedTree(RemoteTree(url), Cache(folder, max_bytes))
 
 
-def read_files(tree: CachedTree, paths: list[str], digests: Any, largest_file: int | None = None) -> None:
+def read_files(
+    tree: CachedTree, paths: list[str], digests: Any, largest_file: int | None = None
+) -> None:
     """Put the digest of each file into a queue."""
     caching._PIECE = PIECE
     if largest_file is not None:  # writing beyond it fails, as on a full disk

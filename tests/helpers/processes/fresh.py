@@ -1,4 +1,6 @@
-"""A function in a process that has run nothing else: what forks needs one, because the threads of earlier tests may hold locks."""
+"""A function in a process that has run nothing else: what forks needs one, because the threads of
+earlier tests may hold locks.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
 
 
-def in_fresh_process(function: Callable[_Given, _Result], *args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
+def in_fresh_process(
+    function: Callable[_Given, _Result], *args: _Given.args, **kwargs: _Given.kwargs
+) -> _Result:
     """Return the result of a function of a module, which a new interpreter calls."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         return process.submit(function, *args, **kwargs).result()

@@ -1,4 +1,5 @@
-"""Runs a command and sends its whole process group a signal after so many frames: `python interrupted.py SIGNAL FRAMES COMMAND ARGS...`
+"""Runs a command and sends its whole process group a signal after so many frames: `python
+interrupted.py SIGNAL FRAMES COMMAND ARGS...`
 
 A terminal does the same when somebody presses Ctrl-C: every process of the group gets SIGINT.
 """
@@ -15,7 +16,9 @@ from carlasc.cli import flags, main
 
 
 @contextmanager
-def interrupting_bar(description: str, unit: str = "frames") -> Iterator[Callable[[int, int], None]]:
+def interrupting_bar(
+    description: str, unit: str = "frames"
+) -> Iterator[Callable[[int, int], None]]:
     def interrupt(done: int, total: int) -> None:
         if done >= frames:
             os.killpg(os.getpgrp(), number)

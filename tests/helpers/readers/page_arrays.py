@@ -18,7 +18,9 @@ def unpack_arrays(block: bytes) -> dict[str, NDArray[Any]]:
     start, arrays = 4 + length, {}
     for name, dtype, size in json.loads(data[4:start]):
         item = np.dtype(dtype).newbyteorder("<")
-        planes = np.frombuffer(data, np.uint8, size * item.itemsize, start).reshape(item.itemsize, size)
+        planes = np.frombuffer(data, np.uint8, size * item.itemsize, start).reshape(
+            item.itemsize, size
+        )
         arrays[name] = np.ascontiguousarray(planes.T).reshape(-1).view(item)
         start += size * item.itemsize
     return arrays

@@ -1,4 +1,7 @@
-"""Reading pictures and films. Test modules that import this are skipped if a package of the render extra is missing."""
+"""Reading pictures and films.
+
+Test modules that import this are skipped if a package of the render extra is missing.
+"""
 
 from __future__ import annotations
 

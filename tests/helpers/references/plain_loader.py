@@ -1,6 +1,9 @@
-"""A loader in NumPy alone, with which `carlasc.Dataset` must agree and whose speed it is compared with.
+"""A loader in NumPy alone, with which `carlasc.Dataset` must agree and whose speed it is compared
+with.
 
-Written from the format page (docs/format.md#training-samples), to be as fast as NumPy allows: contiguous columns, one flat index per point, `bincount` for densities, and tables of the types that samples have. It reads the published layout from the folder.
+Written from the format page (docs/format.md#training-samples), to be as fast as NumPy allows:
+contiguous columns, one flat index per point, `bincount` for densities, and tables of the types that
+samples have. It reads the published layout from the folder.
 """
 
 from __future__ import annotations
@@ -44,8 +47,12 @@ class PlainLoader:
                 current_T_past = self.to_current[frame] @ self.poses[frame - back]
                 columns = current_T_past[:3, :3] @ columns + current_T_past[:3, 3:]
             self.bin(columns, stack[self.history - 1 - back])
-        labels = np.fromfile(self.folder / "evaluation" / f"{frame:06d}.label", np.uint32).reshape(self.size)
-        counts = np.fromfile(self.folder / "evaluation" / f"{frame:06d}.bin", np.float32).reshape(self.size)
+        labels = np.fromfile(self.folder / "evaluation" / f"{frame:06d}.label", np.uint32).reshape(
+            self.size
+        )
+        counts = np.fromfile(self.folder / "evaluation" / f"{frame:06d}.bin", np.float32).reshape(
+            self.size
+        )
         name = "density" if self.density else "occupancy"
         return {name: stack, "labels": self.remap[labels], "known": counts > 0}
 
@@ -58,8 +65,11 @@ class PlainLoader:
         for column, lower, upper in zip(columns, self.lower, self.upper, strict=True):
             inside &= (column >= lower) & (column < upper)
         flat = np.zeros(int(inside.sum()), np.int64)
-        for column, lower, voxel, size in zip(columns, self.lower, self.voxel, self.size, strict=True):
-            cell = ((column[inside] - lower) / voxel).astype(np.int64)  # not negative: truncation is floor
+        for column, lower, voxel, size in zip(
+            columns, self.lower, self.voxel, self.size, strict=True
+        ):
+            # not negative: truncation is floor
+            cell = ((column[inside] - lower) / voxel).astype(np.int64)
             flat = flat * size + np.minimum(cell, size - 1)
         if self.density:
             grid[:] = np.bincount(flat, minlength=grid.size).reshape(grid.shape)

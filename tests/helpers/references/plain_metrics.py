@@ -1,4 +1,6 @@
-"""The metrics once more in plain NumPy, one array operation after the other: what the compiled ones are compared with."""
+"""The metrics once more in plain NumPy, one array operation after the other: what the compiled ones
+are compared with.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,10 @@ def cast(labels, spec, origins, directions, free=0):
         hit = labels[tuple(here.T)] != free
         ends = hit | (further < 0).any(axis=1) | (further >= size).any(axis=1)
         done = walking[ends]
-        found[done], depth[done] = np.ravel_multi_index(tuple(here[ends].T), spec.size), distance[ends]
+        found[done], depth[done] = (
+            np.ravel_multi_index(tuple(here[ends].T), spec.size),
+            distance[ends],
+        )
         walking, axis, further = walking[~ends], axis[~ends], further[~ends]
         voxel[walking] = further
         to_face[walking, axis] += between[walking, axis]
@@ -35,7 +40,9 @@ def cast(labels, spec, origins, directions, free=0):
 
 def rayiou(pred, truth, spec, origins, directions, num_classes, thresholds=(1.0, 2.0, 4.0)):
     """RayIoU of one frame, class by class."""
-    (near, near_depth), (far, far_depth) = (cast(grid, spec, origins, directions) for grid in (pred, truth))
+    (near, near_depth), (far, far_depth) = (
+        cast(grid, spec, origins, directions) for grid in (pred, truth)
+    )
     pred_class, true_class = pred.reshape(-1)[near], truth.reshape(-1)[far]
     valid = true_class != 0
     iou = np.full((len(thresholds), num_classes), np.nan)

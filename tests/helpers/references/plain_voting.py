@@ -1,4 +1,7 @@
-"""Ground truth by ray voting in plain NumPy: slow, dense and short. The judge of the kernel (see the format page, `docs/format.md#votes`)."""
+"""Ground truth by ray voting in plain NumPy: slow, dense and short.
+
+The judge of the kernel (see the format page, `docs/format.md#votes`).
+"""
 
 from __future__ import annotations
 
@@ -36,9 +39,14 @@ def plain_votes(
 def plain_samples(
     observation: Observation, spec: GridSpec, free_step_m: float
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Yield the voxels (-1 outside) and labels of all samples of a step, step by step: 0 is the endpoints, the rest free."""
+    """Yield the voxels (-1 outside) and labels of all samples of a step, step by step: 0 is the
+    endpoints, the rest free.
+    """
     taking_part = observation.labels != 0
-    points, labels = observation.points[taking_part], observation.labels[taking_part].astype(np.int64)
+    points, labels = (
+        observation.points[taking_part],
+        observation.labels[taking_part].astype(np.int64),
+    )
     with np.errstate(all="ignore"):
         units = points / np.linalg.norm(points, axis=1)[:, None]
         step = 0
@@ -56,6 +64,8 @@ def to_grid_frame(observation: Observation, samples: NDArray[np.float64]) -> NDA
     return np.stack([R[a, 0] * x + R[a, 1] * y + R[a, 2] * z + t[a] for a in range(3)], axis=1)
 
 
-def plain_grid(votes: NDArray[np.int64], spec: GridSpec) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def plain_grid(
+    votes: NDArray[np.int64], spec: GridSpec
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return labels and counts, (X, Y, Z) each: argmax takes the lowest id of a tie."""
     return votes.argmax(axis=1).reshape(spec.size), votes.sum(axis=1).reshape(spec.size)

@@ -34,8 +34,10 @@ def link_segments(
     Args:
         segments: the segments of all scans, in any order.
         times: seconds by frame, for every frame with a segment.
-        static: the static points of each scan, in which an actor that stops, for example at a crossing, is found until it continues.
-        deformable: classes whose actors change their shape; without flow, the centre of their points is followed.
+        static: the static points of each scan, in which an actor that stops, for example at a
+            crossing, is found until it continues.
+        deformable: classes whose actors change their shape; without flow, the centre of their
+            points is followed.
 
     Returns:
         Tracks in order of their first segment, with whole bodies.
@@ -46,7 +48,9 @@ def link_segments(
     linker = Linker()
     chains: list[list[Segment]] = []
     for frame in sorted(by_frame.keys() | (static or {}).keys()):
-        chains += linker.add(frame, times[frame], by_frame.get(frame, []), (static or {}).get(frame))
+        chains += linker.add(
+            frame, times[frame], by_frame.get(frame, []), (static or {}).get(frame)
+        )
     chains += linker.finish()
     return complete_bodies([make_track(chain, times, deformable=deformable) for chain in chains])
 
@@ -56,9 +60,10 @@ class FoundActors:
     """What moved in a drive.
 
     Attributes:
-        moved: (M,) int64 indices of the points of each frame that belong to something that moved, tracked or not. They must be left out
-            of other frames.
-        tracked: the actors whose observations align better along an estimated path than without motion.
+        moved: (M,) int64 indices of the points of each frame that belong to something that moved,
+            tracked or not. They must be left out of other frames.
+        tracked: the actors whose observations align better along an estimated path than without
+            motion.
     """
 
     moved: Mapping[int, NDArray[np.int64]]
@@ -78,15 +83,17 @@ def find_actors(
     first_instance: int = 1,
     default_label: int = 0,
 ) -> FoundActors:
-    """Find what moved in the scans of a drive from the free space that other scans saw, and follow it over time.
+    """Find what moved in the scans of a drive from the free space that other scans saw, and follow
+    it over time.
 
-    Scans are read one by one, and only those of some seconds are held. A block of a drive gives the same evidence as the whole drive, if
-    the scans of `HORIZON_S` before and after it are given too.
+    Scans are read one by one, and only those of some seconds are held. A block of a drive gives the
+    same evidence as the whole drive, if the scans of `HORIZON_S` before and after it are given too.
 
     Args:
         scans: the scans in order of time, in one world frame whose z is up.
         movable: classes of objects that can move, if the scans have labels.
-        deformable: classes of objects that change their shape as they move. Without labels, the size tells.
+        deformable: classes of objects that change their shape as they move. Without labels, the
+            size tells.
         first_instance: number of the first actor; others follow.
         default_label: class of actors without labels.
 
@@ -96,6 +103,10 @@ def find_actors(
     moved: dict[int, NDArray[np.int64]] = {}
     evidence = find_evidence(scans, movable=movable)
     tracked = follow_actors(
-        evidence, moved, deformable=deformable, first_instance=first_instance, default_label=default_label
+        evidence,
+        moved,
+        deformable=deformable,
+        first_instance=first_instance,
+        default_label=default_label,
     )
     return FoundActors(moved, tuple(tracked))

@@ -1,4 +1,6 @@
-"""A street of boxes, seen by a LiDAR on a drive: small, exact scenes whose every fault is known, in plain NumPy."""
+"""A street of boxes, seen by a LiDAR on a drive: small, exact scenes whose every fault is known, in
+plain NumPy.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ class Street:
 
     @classmethod
     def random(cls, seed: int = 0) -> Street:
-        """Two streets that cross at the origin, along x and along y, with houses, fences, poles and parked cars."""
+        """Two streets that cross at the origin, along x and along y, with houses, fences, poles and
+        parked cars.
+        """
         rng = np.random.default_rng(seed)
         boxes: list[tuple[list[float], list[float], int]] = []
         for along in (0, 1):
@@ -45,8 +49,24 @@ class Street:
                 s = 10.0 if along else -40.0
                 while s < 70:
                     length, gap, setback = rng.uniform(5, 14), rng.uniform(2, 6), rng.uniform(9, 14)
-                    _add(boxes, along, (s, s + length), side, (setback, setback + 6), rng.uniform(3, 8), BUILDING)
-                    _add(boxes, along, (s + length, s + length + gap), side, (setback, setback + 0.2), 1.2, FENCE)
+                    _add(
+                        boxes,
+                        along,
+                        (s, s + length),
+                        side,
+                        (setback, setback + 6),
+                        rng.uniform(3, 8),
+                        BUILDING,
+                    )
+                    _add(
+                        boxes,
+                        along,
+                        (s + length, s + length + gap),
+                        side,
+                        (setback, setback + 0.2),
+                        1.2,
+                        FENCE,
+                    )
                     pole = s + rng.uniform(0, length)
                     _add(boxes, along, (pole, pole + 0.3), side, (6.0, 6.3), 5.0, POLE)
                     if rng.random() < 0.5:
@@ -55,7 +75,11 @@ class Street:
         return cls(*(np.array(column) for column in zip(*boxes, strict=True)))  # type: ignore[arg-type]
 
     def scan(
-        self, world_T_sensor: NDArray[np.float64], rng: np.random.Generator, channels: int = 24, columns: int = 240
+        self,
+        world_T_sensor: NDArray[np.float64],
+        rng: np.random.Generator,
+        channels: int = 24,
+        columns: int = 240,
     ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """Cast a LiDAR's rays: +2 to -25 degrees, 50 m, noise of 2 cm.
 
@@ -68,7 +92,12 @@ class Street:
             indexing="ij",
         )
         rays = np.stack(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
+            [
+                np.cos(elevation) * np.cos(azimuth),
+                np.cos(elevation) * np.sin(azimuth),
+                np.sin(elevation),
+            ],
+            axis=-1,
         ).reshape(-1, 3)
         directions, origin = rays @ world_T_sensor[:3, :3].T, world_T_sensor[:3, 3]
         distance, labels = self._cast(origin, directions)
@@ -85,21 +114,30 @@ class Street:
             ground = np.where(directions[:, 2] < 0, -origin[2] / directions[:, 2], np.inf)
             for axis in range(3):
                 inverse = 1 / directions[:, axis, None]
-                a, b = (self.lower[:, axis] - origin[axis]) * inverse, (self.upper[:, axis] - origin[axis]) * inverse
+                a, b = (
+                    (self.lower[:, axis] - origin[axis]) * inverse,
+                    (self.upper[:, axis] - origin[axis]) * inverse,
+                )
                 np.maximum(enter, np.fmin(a, b), out=enter)
                 np.minimum(leave, np.fmax(a, b), out=leave)
         enter = np.where((enter < leave) & (enter > 0), enter, np.inf)
         nearest = enter.argmin(axis=1)
         distance = np.minimum(enter[np.arange(len(enter)), nearest], ground)
-        place = np.abs(origin[:2] + np.where(np.isfinite(distance), distance, 0)[:, None] * directions[:, :2]).min(
-            axis=1
-        )
+        place = np.abs(
+            origin[:2] + np.where(np.isfinite(distance), distance, 0)[:, None] * directions[:, :2]
+        ).min(axis=1)
         surface = np.where(place < 4.0, ROAD, np.where(place < 7.0, SIDEWALK, TERRAIN))
-        return distance, np.where(distance < ground, self.labels[nearest], surface).astype(np.uint32)
+        return distance, np.where(distance < ground, self.labels[nearest], surface).astype(
+            np.uint32
+        )
 
 
 def drive(
-    frames: int, *, speed_m: float = 1.0, turn_rad: float = 0.0, start: tuple[float, float] = (-20.0, 0.0)
+    frames: int,
+    *,
+    speed_m: float = 1.0,
+    turn_rad: float = 0.0,
+    start: tuple[float, float] = (-20.0, 0.0),
 ) -> NDArray[np.float64]:
     """Return (F, 4, 4) world_T_sensor of a drive that goes `speed_m` and turns `turn_rad` a frame."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
@@ -123,7 +161,8 @@ def write_drive(
     labelled: bool = True,
     seed: int = 0,
 ) -> Path:
-    """Write a drive as a sequence of the layout, with grids voted from the scan and three more sensors around it.
+    """Write a drive as a sequence of the layout, with grids voted from the scan and three more
+    sensors around it.
 
     Args:
         folder: the `<coordinates>` folder.
@@ -140,7 +179,9 @@ def write_drive(
     writer = FolderSink(folder.parent).sequence(folder.name)
     for number, pose in enumerate(world_T_sensor):
         points, labels = street.scan(pose, rng)
-        writer.write("points", number, np.column_stack([points * flip, np.zeros(len(points), np.float32)]))
+        writer.write(
+            "points", number, np.column_stack([points * flip, np.zeros(len(points), np.float32)])
+        )
         if labelled:
             writer.write("labels", number, labels)
             writer.write("flow", number, np.zeros((len(points), 3), np.float32))
@@ -150,9 +191,13 @@ def write_drive(
             writer.write("evaluation/counts", number, counts)
     poses = mirror @ relative_to(world_T_sensor[0], world_T_sensor) @ mirror
     writer.write_document(layout.POSES, layout.encode_poses(poses))
-    writer.write_document(layout.TIMES, layout.encode_times(np.arange(len(poses)) * layout.FRAME_PERIOD_S))
+    writer.write_document(
+        layout.TIMES, layout.encode_times(np.arange(len(poses)) * layout.FRAME_PERIOD_S)
+    )
     if frame != "carlasc":
-        writer.write_document(layout.METADATA, Metadata("right" if frame == "kitti" else "left").to_json())
+        writer.write_document(
+            layout.METADATA, Metadata("right" if frame == "kitti" else "left").to_json()
+        )
     if spec is not None:
         write_json(folder / "evaluation" / layout.PARAMS, spec.to_params())
     return folder
@@ -167,7 +212,9 @@ def vote(
     flip: NDArray[np.float32],
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.uint32], NDArray[np.float32]]:
-    """Vote a grid from a scan and three more sensors beside it: a vote a point, a free one every 3 m of its ray."""
+    """Vote a grid from a scan and three more sensors beside it: a vote a point, a free one every 3
+    m of its ray.
+    """
     votes = np.zeros(spec.num_voxels * 25, np.int64)
     for offset in ((0.0, 0.0, 0.0), (12.0, 2.0, 1.0), (-9.0, -3.0, 2.0), (3.0, 5.0, 1.5)):
         other = pose.copy()
@@ -182,7 +229,9 @@ def vote(
             ids.append(np.zeros(int((share > 0).sum()), np.uint32))
         voxels = spec.flat_index(np.concatenate(samples) * flip)
         inside = voxels >= 0
-        votes += np.bincount(voxels[inside] * 25 + np.concatenate(ids)[inside], minlength=len(votes))
+        votes += np.bincount(
+            voxels[inside] * 25 + np.concatenate(ids)[inside], minlength=len(votes)
+        )
     table = votes.reshape(-1, 25)
     return (
         table.argmax(axis=1).astype(np.uint32).reshape(spec.size),
@@ -193,7 +242,9 @@ def vote(
 def cast_image(
     street: Street, world_T_sensor: NDArray[np.float64], camera: CameraModel
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Return (H, W) what a camera on the sensor sees of a street: classes, 13 for the sky, and distances along its rays, metres."""
+    """Return (H, W) what a camera on the sensor sees of a street: classes, 13 for the sky, and
+    distances along its rays, metres.
+    """
     rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
     world_T_camera = world_T_sensor @ camera.sensor_T_camera
     rays = camera.unproject(np.stack([columns, rows], axis=1)) @ world_T_camera[:3, :3].T
@@ -204,8 +255,12 @@ def cast_image(
 
 
 def camera_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the poses of a camera (x right, y down, z forward) on the LiDAR, in a right-handed frame, as KITTI's file has them."""
-    camera_T_lidar = np.array([[0.0, -1, 0, 0.01], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])
+    """Return the poses of a camera (x right, y down, z forward) on the LiDAR, in a right-handed
+    frame, as KITTI's file has them.
+    """
+    camera_T_lidar = np.array(
+        [[0.0, -1, 0, 0.01], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]
+    )
     return camera_T_lidar @ poses @ invert(camera_T_lidar)
 
 

@@ -1,4 +1,6 @@
-"""Small scenes for evidence of motion: boxes on flat ground, seen by a LiDAR whose rays are computed exactly."""
+"""Small scenes for evidence of motion: boxes on flat ground, seen by a LiDAR whose rays are
+computed exactly.
+"""
 
 import numpy as np
 
@@ -14,7 +16,11 @@ LIDAR = Lidar(channels=32, points=32 * 900, range_m=50.0, noise_m=0.0)
 def box(x, y, size, label):
     """Return an upright box that stands on the ground at a place."""
     length, width, height = size
-    return np.array([x - length / 2, y - width / 2, 0.0]), np.array([x + length / 2, y + width / 2, height]), label
+    return (
+        np.array([x - length / 2, y - width / 2, 0.0]),
+        np.array([x + length / 2, y + width / 2, height]),
+        label,
+    )
 
 
 def car(x, y):
@@ -48,14 +54,29 @@ def cast(world_T_sensor, boxes, lidar=LIDAR):
 
 
 def rays_towards(azimuth, lower, upper):
-    """Return the indices of the rays, of which some may hit a box whose corners are given from their origin: others cannot."""
-    corners = np.arctan2([lower[1], lower[1], upper[1], upper[1]], [lower[0], upper[0], lower[0], upper[0]])
-    if lower[0] < 0 and lower[1] <= 0 <= upper[1]:  # behind, where angles jump, or around the sensor
+    """Return the indices of the rays, of which some may hit a box whose corners are given from
+    their origin: others cannot.
+    """
+    corners = np.arctan2(
+        [lower[1], lower[1], upper[1], upper[1]], [lower[0], upper[0], lower[0], upper[0]]
+    )
+    # behind, where angles jump, or around the sensor
+    if lower[0] < 0 and lower[1] <= 0 <= upper[1]:
         return np.arange(len(azimuth))
     return np.flatnonzero((azimuth > corners.min() - 1e-6) & (azimuth < corners.max() + 1e-6))
 
 
-def film(scene, frames=40, *, period_s=0.1, ego_m_s=0.0, noise_m=0.0, noise_deg=0.0, labels=False, lidar=LIDAR):
+def film(
+    scene,
+    frames=40,
+    *,
+    period_s=0.1,
+    ego_m_s=0.0,
+    noise_m=0.0,
+    noise_deg=0.0,
+    labels=False,
+    lidar=LIDAR,
+):
     """Yield the scans of a scene, a function of time that returns boxes; poses get errors."""
     rng = np.random.default_rng(5)
     for frame in range(frames):

@@ -1,4 +1,7 @@
-"""A street with a parked car and a passing car, scanned from a moving sensor. All positions are known at any time."""
+"""A street with a parked car and a passing car, scanned from a moving sensor.
+
+All positions are known at any time.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,9 @@ CAR = (4.4, 1.9, 1.5)
 
 
 def street(frame: int) -> Street:
-    """Return two houses, a pole, a parked car, and (the last box) a car that overtakes on the right."""
+    """Return two houses, a pole, a parked car, and (the last box) a car that overtakes on the
+    right.
+    """
     x = -20.0 + SPEED_M_S * frame * 0.1
     boxes = [
         ((-15, -14, 0), (10, -9, 6), BUILDING),
@@ -38,23 +43,32 @@ def sensor_pose(frame: int) -> np.ndarray:
     return translation((-3.0 + 0.1 * frame, 0.0, SENSOR_HEIGHT_M))
 
 
-def scan(frame: int, pose: np.ndarray, columns: int = 500) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def scan(
+    frame: int, pose: np.ndarray, columns: int = 500
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the points, their labels, and which of them are on the passing car."""
     here = street(frame)
     points, labels = here.scan(pose, np.random.default_rng(frame), channels=48, columns=columns)
     world = transform_points(pose, points)
-    moving = ((world > here.lower[-1] - 0.05) & (world < here.upper[-1] + 0.05)).all(axis=1) & (labels == VEHICLE)
+    moving = ((world > here.lower[-1] - 0.05) & (world < here.upper[-1] + 0.05)).all(axis=1) & (
+        labels == VEHICLE
+    )
     return points, labels, moving
 
 
 def write_sequence(
-    folder: Path, fields: tuple[str, ...] = ("labels", "flow"), frames: int = FRAMES, poses: bool = True
+    folder: Path,
+    fields: tuple[str, ...] = ("labels", "flow"),
+    frames: int = FRAMES,
+    poses: bool = True,
 ) -> Path:
     """Write the drive as a sequence. Return the folder of the sequence."""
     writer = FolderSink(folder).sequence("Val/Street/cartesian")
     trajectory = np.stack([sensor_pose(frame) for frame in range(frames)])
     if poses:
-        writer.write_document(layout.POSES, layout.encode_poses(relative_to(trajectory[0], trajectory)))
+        writer.write_document(
+            layout.POSES, layout.encode_poses(relative_to(trajectory[0], trajectory))
+        )
     writer.write_document(layout.TIMES, layout.encode_times(np.arange(frames) * 0.1))
     for frame in range(frames):
         points, labels, moving = scan(frame, trajectory[frame])

@@ -26,8 +26,11 @@ def write_blocks(
     shift: float = 0.0,
     points: bool = True,
 ) -> Path:
-    """Write a road with a red block ahead on the side of +y, which moves forward by 1 m per frame, and a blue block that does not move."""
-    spec = spec or GridSpec.published().with_size((64, 64, 4))  # few voxels: browsers in tests have no GPU
+    """Write a road with a red block ahead on the side of +y, which moves forward by 1 m per frame,
+    and a blue block that does not move.
+    """
+    # few voxels: browsers in tests have no GPU
+    spec = spec or GridSpec.published().with_size((64, 64, 4))
     writer = FolderSink(folder.parent).sequence(folder.name)
     writer.write_document(layout.params_file(layout.EVALUATION), to_json(spec.to_params()))
     if metadata:
@@ -47,28 +50,42 @@ def write_blocks(
             block = np.array([10 + frame, 5, 0]) + rng.uniform(-1, 1, (400, 3))
             cloud = np.concatenate([ground, block, [[10 + frame, 5, 0]]]).astype(np.float32)
             moving = np.arange(len(cloud)) >= len(ground)
-            writer.write("points", frame, np.column_stack([cloud, np.zeros(len(cloud), np.float32)]))
+            writer.write(
+                "points", frame, np.column_stack([cloud, np.zeros(len(cloud), np.float32)])
+            )
             writer.write("labels", frame, np.where(moving, RED, ROAD).astype(np.uint32))
-            writer.write("flow", frame, (moving[:, None] * np.array([10.0, 0, 0])).astype(np.float32))
+            writer.write(
+                "flow", frame, (moving[:, None] * np.array([10.0, 0, 0])).astype(np.float32)
+            )
     if points:
         writer.write_document(layout.TIMES, layout.encode_times(np.arange(frames) * 0.1))
     return folder
 
 
 def add_evidence(folder: Path, frames: int = 3) -> None:
-    """Write how certain each voxel of `write_blocks` is: the red block was inferred, the blue one is in an actor, the road was seen."""
+    """Write how certain each voxel of `write_blocks` is: the red block was inferred, the blue one
+    is in an actor, the road was seen.
+    """
     writer = FolderSink(folder.parent).sequence(folder.name)
     for frame in range(frames):
         labels = np.fromfile(folder / f"evaluation/{frame:06d}.label", np.uint32).reshape(64, 64, 4)
         kinds = [labels == RED, labels == BLUE, labels == ROAD]
-        flags = np.select(kinds, [VoxelFlag.INFERRED, VoxelFlag.IN_ACTOR | VoxelFlag.SEEN_NOW, VoxelFlag.SEEN_NOW], 0)
+        flags = np.select(
+            kinds,
+            [VoxelFlag.INFERRED, VoxelFlag.IN_ACTOR | VoxelFlag.SEEN_NOW, VoxelFlag.SEEN_NOW],
+            0,
+        )
         writer.write("evaluation/flags", frame, flags.astype(np.uint8))
-        writer.write("evaluation/occupied", frame, np.select(kinds, [0.6, 0.8, 1.0], 0.0).astype(np.float16))
+        writer.write(
+            "evaluation/occupied", frame, np.select(kinds, [0.6, 0.8, 1.0], 0.0).astype(np.float16)
+        )
         writer.write("evaluation/views", frame, np.select(kinds, [0, 3, 40], 0).astype(np.uint16))
 
 
 def add_actors(folder: Path, frames: int = 3, number: int = 70_003, speed_m_s: float = 3.0) -> None:
-    """Write who is in each voxel of `write_blocks`: the red block is an actor that moves ahead, the blue one is actor 6 and stands."""
+    """Write who is in each voxel of `write_blocks`: the red block is an actor that moves ahead, the
+    blue one is actor 6 and stands.
+    """
     writer = FolderSink(folder.parent).sequence(folder.name)
     for frame in range(frames):
         labels = np.fromfile(folder / f"evaluation/{frame:06d}.label", np.uint32)
@@ -80,7 +97,9 @@ def add_actors(folder: Path, frames: int = 3, number: int = 70_003, speed_m_s: f
 
 
 def add_poses(folder: Path, yaws_rad: list[float], step_m: float = 5.0) -> None:
-    """Write poses of a vehicle that drives `step_m` between two frames, in the direction that it has in the first of them."""
+    """Write poses of a vehicle that drives `step_m` between two frames, in the direction that it
+    has in the first of them.
+    """
     writer = FolderSink(folder.parent).sequence(folder.name)
     pose, place = [], np.zeros(3)
     for yaw in yaws_rad:

@@ -1,4 +1,6 @@
-"""A drive that turns left and right, faster and slower, between houses: it shows where the sensor is, and whether poses are late."""
+"""A drive that turns left and right, faster and slower, between houses: it shows where the sensor
+is, and whether poses are late.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def houses(seed=2):
 def record(kind=None, *, rolling=False, frames=40):
     """Return the points of each scan, and first_T_sensor."""
     things = tuple(houses())
-    drive = (kind or Winding)(frames=frames, speed=8.0, channels=32, columns=400, things=things, rolling=rolling)
+    drive = (kind or Winding)(
+        frames=frames, speed=8.0, channels=32, columns=400, things=things, rolling=rolling
+    )
     poses = drive.world_T_vehicle(drive.times) @ drive.sensors[0].vehicle_T_sensor
     rng, scans = np.random.default_rng(0), []
     for frame in range(drive.frames):

@@ -1,9 +1,11 @@
 """A stand-in for a CARLA server that keeps the contract of the API, as far as recording uses it.
 
-Locations, rotations and settings are those of the official package. As on a server, sensors deliver their measurements from other threads, after the
-tick and in any order; spawning at an occupied place returns None; a call on a destroyed actor raises RuntimeError; and `tick` fails in asynchronous
-mode. Vehicles on autopilot drive straight ahead at 5 m/s, and the ground is level. A semantic LiDAR sees the ground around it, and a cloud of points in
-every vehicle and pedestrian within its range, also in its own vehicle.
+Locations, rotations and settings are those of the official package. As on a server, sensors deliver
+their measurements from other threads, after the tick and in any order; spawning at an occupied
+place returns None; a call on a destroyed actor raises RuntimeError; and `tick` fails in
+asynchronous mode. Vehicles on autopilot drive straight ahead at 5 m/s, and the ground is level. A
+semantic LiDAR sees the ground around it, and a cloud of points in every vehicle and pedestrian
+within its range, also in its own vehicle.
 """
 
 from __future__ import annotations
@@ -41,7 +43,15 @@ class Blueprint:
         self.attributes[name] = value
 
 
-LIDAR = ("channels", "range", "points_per_second", "rotation_frequency", "upper_fov", "lower_fov", "sensor_tick")
+LIDAR = (
+    "channels",
+    "range",
+    "points_per_second",
+    "rotation_frequency",
+    "upper_fov",
+    "lower_fov",
+    "sensor_tick",
+)
 CAMERA = ("image_size_x", "image_size_y", "fov", "sensor_tick")
 
 
@@ -52,7 +62,10 @@ def blueprint_library():
         Blueprint("walker.pedestrian.0001", ()),
         Blueprint("controller.ai.walker", ()),
         Blueprint("sensor.lidar.ray_cast_semantic", LIDAR),
-        *(Blueprint(f"sensor.camera.{kind}", CAMERA) for kind in ("rgb", "semantic_segmentation", "depth")),
+        *(
+            Blueprint(f"sensor.camera.{kind}", CAMERA)
+            for kind in ("rgb", "semantic_segmentation", "depth")
+        ),
     ]
 
 
@@ -69,17 +82,21 @@ class Actor:
     def _alive(self):
         if not self.is_alive:
             raise RuntimeError(
-                "trying to operate on a destroyed actor; an actor's function was called, but the actor is already destroyed."
+                "trying to operate on a destroyed actor; an actor's function was called, but the "
+                "actor is already destroyed."
             )
 
     def get_transform(self):
         self._alive()
         if self.parent is None:
             return self.transform
-        place = np.array(self.parent.get_transform().get_matrix()) @ np.array(self.offset.get_matrix())
+        place = np.array(self.parent.get_transform().get_matrix()) @ np.array(
+            self.offset.get_matrix()
+        )
         turn = self.parent.get_transform().rotation
         return carla.Transform(
-            carla.Location(*map(float, place[:3, 3])), carla.Rotation(self.offset.rotation.pitch, turn.yaw, 0.0)
+            carla.Location(*map(float, place[:3, 3])),
+            carla.Rotation(self.offset.rotation.pitch, turn.yaw, 0.0),
         )
 
     def velocity(self):
@@ -132,7 +149,12 @@ class World:
         self.settings = carla.WorldSettings()
         for place in ((100.0, 100.0), (120.0, 100.0)):  # traffic lights are actors too
             self.actors.append(
-                Actor(self, Blueprint("traffic.traffic_light", ()), carla.Transform(carla.Location(*place, 4.0)), None)
+                Actor(
+                    self,
+                    Blueprint("traffic.traffic_light", ()),
+                    carla.Transform(carla.Location(*place, 4.0)),
+                    None,
+                )
             )
 
     def get_settings(self):
@@ -150,13 +172,16 @@ class World:
 
     def get_blueprint_library(self):
         return SimpleNamespace(
-            filter=lambda pattern: [b for b in blueprint_library() if b.id.startswith(pattern.removesuffix("*"))]
+            filter=lambda pattern: [
+                b for b in blueprint_library() if b.id.startswith(pattern.removesuffix("*"))
+            ]
         )
 
     def get_map(self):
         points = [
             carla.Transform(
-                carla.Location(8.0 * (i % 5), 8.0 * (i // 5), 0.3), carla.Rotation(0.0, 90.0 * (i % 4), 0.0)
+                carla.Location(8.0 * (i % 5), 8.0 * (i // 5), 0.3),
+                carla.Rotation(0.0, 90.0 * (i % 4), 0.0),
             )
             for i in range(self.server.places)
         ]
@@ -164,7 +189,11 @@ class World:
 
     def get_random_location_from_navigation(self):
         at = self.server.navigation
-        return None if at.random() < 0.2 else carla.Location(at.uniform(0, 60), at.uniform(-30, -5), 1.0)
+        return (
+            None
+            if at.random() < 0.2
+            else carla.Location(at.uniform(0, 60), at.uniform(-30, -5), 1.0)
+        )
 
     def set_pedestrians_seed(self, seed):
         self.server.navigation, self.server.pedestrians_seed = random.Random(seed), seed
@@ -184,11 +213,15 @@ class World:
 
     def get_snapshot(self):
         alive = {actor.id: actor for actor in self.get_actors()}
-        return SimpleNamespace(find=lambda i: SimpleNamespace(get_velocity=alive[i].velocity) if i in alive else None)
+        return SimpleNamespace(
+            find=lambda i: SimpleNamespace(get_velocity=alive[i].velocity) if i in alive else None
+        )
 
     def tick(self, seconds=10.0):
         if not self.settings.synchronous_mode:
-            raise RuntimeError(f"time-out of {seconds * 1000:.0f}ms while waiting for the simulator")
+            raise RuntimeError(
+                f"time-out of {seconds * 1000:.0f}ms while waiting for the simulator"
+            )
         assert self.settings.fixed_delta_seconds == 0.1
         self.server.check_failure("tick")
         self.server.ticks += 1
@@ -198,7 +231,8 @@ class World:
                 at = actor.transform.location
                 drift = self.server.drift
                 actor.transform = carla.Transform(
-                    carla.Location(at.x + 0.1 * v.x + drift, at.y + 0.1 * v.y, at.z), actor.transform.rotation
+                    carla.Location(at.x + 0.1 * v.x + drift, at.y + 0.1 * v.y, at.z),
+                    actor.transform.rotation,
                 )
         sensors = [actor for actor in self.get_actors() if actor.callback is not None]
         random.shuffle(sensors)
@@ -271,14 +305,23 @@ class FakeServer:
         ]
 
     def measure(self, sensor):
-        common = {"frame": self.ticks, "timestamp": 3.0 + 0.1 * self.ticks, "transform": sensor.get_transform()}
+        common = {
+            "frame": self.ticks,
+            "timestamp": 3.0 + 0.1 * self.ticks,
+            "transform": sensor.get_transform(),
+        }
         if sensor.type_id.startswith("sensor.camera"):
-            width, height = int(sensor.attributes["image_size_x"]), int(sensor.attributes["image_size_y"])
+            width, height = (
+                int(sensor.attributes["image_size_x"]),
+                int(sensor.attributes["image_size_y"]),
+            )
             pixels = np.zeros((height, width, 4), np.uint8)
             pixels[..., :] = (250, 120, 10, 255)  # BGRA: a blue
             if sensor.type_id.endswith("depth"):
                 pixels[..., :3] = (0, 128, 64)  # 64 + 128 * 256 of 2**24 - 1, a kilometre
-            return SimpleNamespace(raw_data=memoryview(pixels.tobytes()), width=width, height=height, **common)
+            return SimpleNamespace(
+                raw_data=memoryview(pixels.tobytes()), width=width, height=height, **common
+            )
         return SimpleNamespace(raw_data=memoryview(self.sweep(sensor).tobytes()), **common)
 
     def sweep(self, sensor):
@@ -290,14 +333,22 @@ class FakeServer:
             (
                 0,
                 tags[ROAD],
-                np.column_stack([rng.uniform(-20, 20, (40, 2)) + (at.location.x, at.location.y), np.zeros(40)]),
+                np.column_stack(
+                    [rng.uniform(-20, 20, (40, 2)) + (at.location.x, at.location.y), np.zeros(40)]
+                ),
             )
         ]
         for actor in sensor.world.get_actors():
             kind = {"vehicle": VEHICLE, "walker.": PEDESTRIAN}.get(actor.type_id[:7])
             if kind and actor.distance_to(at.location) < float(sensor.attributes["range"]):
                 place = actor.get_transform().location
-                parts.append((actor.id, tags[kind], rng.uniform(-0.4, 0.4, (10, 3)) + (place.x, place.y, place.z)))
+                parts.append(
+                    (
+                        actor.id,
+                        tags[kind],
+                        rng.uniform(-0.4, 0.4, (10, 3)) + (place.x, place.y, place.z),
+                    )
+                )
         sensor_T_world = np.array(at.get_inverse_matrix())
         found = []
         for actor_id, tag, points in parts:

@@ -1,4 +1,6 @@
-"""Schedulers and workers of Dask as processes of their own, and classes that start clusters, for the tests of `--cluster`."""
+"""Schedulers and workers of Dask as processes of their own, and classes that start clusters, for
+the tests of `--cluster`.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,15 @@ def scheduler(folder: Path, port: int = 0) -> Iterator[tuple[str, subprocess.Pop
     """Yield the address of a scheduler and its process."""
     file = folder / "scheduler.json"
     file.unlink(missing_ok=True)
-    options = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard", "--scheduler-file", str(file)]
+    options = [
+        "--host",
+        "127.0.0.1",
+        "--port",
+        str(port),
+        "--no-dashboard",
+        "--scheduler-file",
+        str(file),
+    ]
     with _process("dask_scheduler", *options) as process:
         end = time.monotonic() + 30
         while not file.exists() or not file.read_text():

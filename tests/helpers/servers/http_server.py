@@ -22,7 +22,8 @@ class Site:
         weak: whether these are weak ETags, to which no If-Range may refer.
         lengths: whether it tells a file's Content-Length.
         drop_after: closes the connection after so many bytes of a body, None never.
-        ignore_ranges_after: after so many requests, sends the whole file where a range was asked for.
+        ignore_ranges_after: after so many requests, sends the whole file where a range was asked
+            for.
         shift_range: sends the right bytes under a Content-Range that is off by so many.
         content_type: what it calls its files.
         redirect: path -> path that it sends the client on to.
@@ -76,7 +77,10 @@ def serve(site: Site) -> Iterator[Site]:
         def _answer(self, content: bytes) -> None:
             etag = f'{"W/" if site.weak else ""}"{hashlib.md5(content).hexdigest()}"'
             wanted = self.headers.get("Range")
-            ignored = site.ignore_ranges_after is not None and len(site.requests) > site.ignore_ranges_after
+            ignored = (
+                site.ignore_ranges_after is not None
+                and len(site.requests) > site.ignore_ranges_after
+            )
             partial = site.ranges and wanted is not None and not ignored
             if site.etags and self.headers.get("If-Range") not in (None, "" if site.weak else etag):
                 partial = False
@@ -93,7 +97,9 @@ def serve(site: Site) -> Iterator[Site]:
             if site.etags:
                 self.send_header("ETag", etag)
             if site.lengths:
-                self.send_header("Content-Length", str(len(body) + (site.length_off if len(body) > 2 else 0)))
+                self.send_header(
+                    "Content-Length", str(len(body) + (site.length_off if len(body) > 2 else 0))
+                )
             self.send_header("Content-Type", site.content_type)
             self.end_headers()
             if site.drop_after is not None and len(body) > site.drop_after:

@@ -1,4 +1,6 @@
-"""A server that answers as the Hugging Face Hub does, for data sets that are folders of this machine."""
+"""A server that answers as the Hugging Face Hub does, for data sets that are folders of this
+machine.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ class Hub(ThreadingHTTPServer):
     Attributes:
         folders: the folder of each data set, by "ORG/NAME".
         private: names of data sets that nobody may read without the token "secret".
-        faults: statuses that the next requests for files are answered with; 0 sends the whole file instead of a range.
+        faults: statuses that the next requests for files are answered with; 0 sends the whole file
+            instead of a range.
         requests: paths of all requests.
     """
 
@@ -99,11 +102,19 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(416, b"")
         else:
             part = data[int(wanted[1]) : int(wanted[2]) + 1]
-            self._send(206, part, content_range=f"bytes {wanted[1]}-{int(wanted[1]) + len(part) - 1}/{len(data)}")
+            self._send(
+                206,
+                part,
+                content_range=f"bytes {wanted[1]}-{int(wanted[1]) + len(part) - 1}/{len(data)}",
+            )
 
     def _folder(self, name: str) -> Path | None:
-        """Return the folder of a data set; answer and return None if there is none that the client may see."""
-        hidden = name in self.server.private and self.headers.get("authorization") != "Bearer secret"
+        """Return the folder of a data set; answer and return None if there is none that the client
+        may see.
+        """
+        hidden = (
+            name in self.server.private and self.headers.get("authorization") != "Bearer secret"
+        )
         if name not in self.server.folders or hidden:
             self._send(401, b"{}", "RepoNotFound")
             return None

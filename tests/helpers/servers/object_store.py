@@ -17,7 +17,8 @@ import fsspec
 import pytest
 
 KEY, SECRET, BUCKET = "AKIAEXAMPLEOFAKEY", "a-very-secret-secret", "carlasc-tests"
-Fault = Callable[[int, str, str], str | None]  # (number of the request, method, path) -> name of a fault
+# (number of the request, method, path) -> name of a fault
+Fault = Callable[[int, str, str], str | None]
 
 
 @contextmanager
@@ -32,10 +33,10 @@ def s3_server() -> Iterator[str]:
     endpoint = f"http://{host}:{port}"
     fsspec.filesystem("s3", **options_for(endpoint)).mkdir(BUCKET)
     yield endpoint
-    fsspec.filesystem(
-        "s3", **options_for(endpoint)
-    ).clear_instance_cache()  # others may be of the same environment variables
-    request = urllib.request.Request(f"{endpoint}/moto-api/reset", method="POST")  # buckets outlive a server
+    # others may be of the same environment variables
+    fsspec.filesystem("s3", **options_for(endpoint)).clear_instance_cache()
+    # buckets outlive a server
+    request = urllib.request.Request(f"{endpoint}/moto-api/reset", method="POST")
     urllib.request.urlopen(request).close()
     server.stop()
 
@@ -118,15 +119,24 @@ class _Handler(BaseHTTPRequestHandler):
         answer = connection.getresponse()
         data = answer.read()
         connection.close()
-        kept = {n: v for n, v in answer.getheaders() if n.lower() not in ("connection", "transfer-encoding", "server")}
+        kept = {
+            n: v
+            for n, v in answer.getheaders()
+            if n.lower() not in ("connection", "transfer-encoding", "server")
+        }
         return answer.status, kept, data
 
-    def _answer(self, status: int, headers: dict[str, str], data: bytes, length: int | None = None) -> None:
+    def _answer(
+        self, status: int, headers: dict[str, str], data: bytes, length: int | None = None
+    ) -> None:
         headers = dict(headers)
         if self.command != "HEAD":
             headers["Content-Length"] = str(len(data) if length is None else length)
         lines = [f"HTTP/1.1 {status} -", *(f"{name}: {value}" for name, value in headers.items())]
-        self.wfile.write("\r\n".join([*lines, "", ""]).encode("latin-1") + (b"" if self.command == "HEAD" else data))
+        self.wfile.write(
+            "\r\n".join([*lines, "", ""]).encode("latin-1")
+            + (b"" if self.command == "HEAD" else data)
+        )
         self.close_connection = length is not None
 
 

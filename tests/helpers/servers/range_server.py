@@ -1,7 +1,10 @@
-"""A local HTTP server of a folder, with ranges, HEAD and ETags, as object stores have them. It counts what it sends.
+"""A local HTTP server of a folder, with ranges, HEAD and ETags, as object stores have them.
 
-`python tests/helpers/servers/range_server.py FOLDER DELAY_S` prints its URL and serves until its input is closed, in a process of its own. It waits
-before it answers, as a store does that is far away.
+It counts what it sends.
+
+`python tests/helpers/servers/range_server.py FOLDER DELAY_S` prints its URL and serves until its
+input is closed, in a process of its own. It waits before it answers, as a store does that is far
+away.
 """
 
 from __future__ import annotations
@@ -92,7 +95,9 @@ def serve_folder(folder: Path) -> Iterator[Served]:
             served.sent[self.path.strip("/")] += end - start
             try:
                 while start < end:
-                    start += os.sendfile(self.connection.fileno(), source, start, min(_BLOCK, end - start))
+                    start += os.sendfile(
+                        self.connection.fileno(), source, start, min(_BLOCK, end - start)
+                    )
             except (BrokenPipeError, ConnectionResetError):
                 self.close_connection = True  # the client was ended
 

@@ -1,4 +1,6 @@
-"""Stands in for Slurm itself: `sbatch` starts a job script as a process of this machine, and `scancel` ends it. dask-jobqueue is the real one."""
+"""Stands in for Slurm itself: `sbatch` starts a job script as a process of this machine, and
+`scancel` ends it. dask-jobqueue is the real one.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ kill -KILL -- "-$1"
 
 
 def install(folder: Path) -> dict[str, str]:
-    """Write the commands to a folder; return the environment in which they are found, and in which Dask asks for small jobs."""
+    """Write the commands to a folder; return the environment in which they are found, and in which
+    Dask asks for small jobs.
+    """
     for name, text in (("sbatch", _SBATCH), ("scancel", _SCANCEL)):
         (folder / name).write_text(text.format(folder=folder))
         (folder / name).chmod(0o755)
@@ -26,7 +30,8 @@ def install(folder: Path) -> dict[str, str]:
         "PATH": f"{folder}{os.pathsep}{os.environ['PATH']}",
         "DASK_JOBQUEUE__SLURM__CORES": "1",
         "DASK_JOBQUEUE__SLURM__MEMORY": "2GB",
-        "DASK_JOBQUEUE__SLURM__SCHEDULER_OPTIONS": '{"host": "127.0.0.1", "dashboard_address": ":0"}',
+        "DASK_JOBQUEUE__SLURM__SCHEDULER_OPTIONS": '{"host": "127.0.0.1", "dashboard_address": '
+        '":0"}',
     }
 
 

@@ -1,4 +1,6 @@
-"""The cache of a remote store: real processes that share it, are killed in it, and fill the disk; eviction; files that change."""
+"""The cache of a remote store: real processes that share it, are killed in it, and fill the disk;
+eviction; files that change.
+"""
 
 from __future__ import annotations
 
@@ -99,7 +101,9 @@ def test_a_fork_reads_what_was_fetched_before_and_after_it(served, tmp_path):
 @pytest.mark.parametrize(
     "kill_at", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 3, 5, 6, 7, 8, 9, 10))]
 )
-def test_a_process_that_is_killed_while_it_fetches_leaves_nothing_that_is_read(served, tmp_path, kill_at):
+def test_a_process_that_is_killed_while_it_fetches_leaves_nothing_that_is_read(
+    served, tmp_path, kill_at
+):
     requests, reached, go_on = [], threading.Event(), threading.Event()
 
     def before(_):
@@ -111,9 +115,8 @@ def test_a_process_that_is_killed_while_it_fetches_leaves_nothing_that_is_read(s
     served.before = before
     victim, _ = start(tree_at(served.url, tmp_path / "cache"), ["0.bin"])
     assert reached.wait(60)
-    waiting, digests = start(
-        tree_at(served.url, tmp_path / "cache"), ["0.bin"]
-    )  # it waits for the first, then takes over
+    # it waits for the first, then takes over
+    waiting, digests = start(tree_at(served.url, tmp_path / "cache"), ["0.bin"])
     time.sleep(0.5 if kill_at % 2 else 0)
     victim.kill()
     victim.join()
@@ -157,7 +160,9 @@ def test_the_cache_never_grows_beyond_its_size_and_keeps_what_was_used_last(serv
     assert served.sent["1.bin"] == 2 * SIZE, "it had given way"
     for k in range(2, 6):
         tree.read(f"{k}.bin")
-    assert bytes(first) == (served.folder / "0.bin").read_bytes(), "what is in use outlives its file"
+    assert bytes(first) == (served.folder / "0.bin").read_bytes(), (
+        "what is in use outlives its file"
+    )
 
 
 def test_processes_together_keep_to_the_size(served, tmp_path):
@@ -167,7 +172,9 @@ def test_processes_together_keep_to_the_size(served, tmp_path):
     while any(process.is_alive() and digests.empty() for process, digests in started):
         with caching._locked(tmp_path / "cache" / ".lock"):  # files come and go under this lock
             largest = max(largest, sum(kept(tmp_path / "cache").values()))
-    for (process, digests), order in zip(started, ((0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)), strict=True):
+    for (process, digests), order in zip(
+        started, ((0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)), strict=True
+    ):
         assert digests.get(timeout=60) == digests_of(served, [f"{k}.bin" for k in order])
         process.join()
     assert SIZE <= largest <= 4 * SIZE
@@ -208,7 +215,10 @@ def test_a_copy_that_was_cut_short_is_fetched_again(served, tmp_path):
     tree_at(served.url, tmp_path / "cache").read("0.bin")
     (copy,) = (tmp_path / "cache").glob("??/*")
     os.truncate(copy, 10)
-    assert bytes(tree_at(served.url, tmp_path / "cache").read("0.bin")) == (served.folder / "0.bin").read_bytes()
+    assert (
+        bytes(tree_at(served.url, tmp_path / "cache").read("0.bin"))
+        == (served.folder / "0.bin").read_bytes()
+    )
 
 
 def test_a_fetch_ahead_does_not_wait_for_another_process(served, tmp_path):
@@ -227,7 +237,10 @@ def test_a_fetch_ahead_does_not_wait_for_another_process(served, tmp_path):
 def test_stores_of_one_name_behind_two_endpoints_are_kept_apart(tmp_path):
     options = ({"endpoint_url": "http://a"}, {"client_kwargs": {"endpoint_url": "http://b"}}, {})
     pytest.importorskip("s3fs")
-    keys = {CachedTree(RemoteTree("s3://bucket/x", o), Cache(tmp_path))._key("zarr.json") for o in options}
+    keys = {
+        CachedTree(RemoteTree("s3://bucket/x", o), Cache(tmp_path))._key("zarr.json")
+        for o in options
+    }
     assert len(keys) == 3
 
 
@@ -269,9 +282,13 @@ def test_an_empty_file_is_cached(served, tmp_path):
 
 def test_errors_name_the_remote_file(served, tmp_path):
     tree = tree_at(served.url, tmp_path / "cache")
-    with pytest.raises(MissingDataError, match=rf"{served.url}/none\.bin: expected a file, found nothing"):
+    with pytest.raises(
+        MissingDataError, match=rf"{served.url}/none\.bin: expected a file, found nothing"
+    ):
         tree.read("none.bin")
-    with pytest.raises(FormatError, match=rf"{served.url}/0\.bin.*expected 20 bytes in this range, found 10"):
+    with pytest.raises(
+        FormatError, match=rf"{served.url}/0\.bin.*expected 20 bytes in this range, found 10"
+    ):
         tree.read_range("0.bin", SIZE - 10, SIZE + 10)
     served.broken = True
     with pytest.raises(CarlascError, match=rf"{served.url}/1\.bin: cannot be read"):
@@ -280,7 +297,9 @@ def test_errors_name_the_remote_file(served, tmp_path):
 
 
 def test_bad_caches_are_refused(served, tmp_path):
-    with pytest.raises(ArgumentError, match="max_bytes: expected a number of bytes above 0, found 0"):
+    with pytest.raises(
+        ArgumentError, match="max_bytes: expected a number of bytes above 0, found 0"
+    ):
         Cache(tmp_path, 0)
     (tmp_path / "file").touch()
     with pytest.raises(StorageError, match="cannot be used as a cache: .*choose another folder"):
@@ -298,7 +317,9 @@ def test_a_store_that_cannot_be_cached_says_so(published, tmp_path, kind):
     store = pack(published, tmp_path / f"x.{kind}").out
     for path, data in (files_of(store) if store.is_dir() else {"": store.read_bytes()}).items():
         fs.pipe(f"/{tmp_path.name}.{kind}/{path}".rstrip("/"), data)
-    with pytest.raises(ArgumentError, match=r"cache: expected a packed zarr store, or a folder.*pack the data into"):
+    with pytest.raises(
+        ArgumentError, match=r"cache: expected a packed zarr store, or a folder.*pack the data into"
+    ):
         carlasc.open(f"memory://{tmp_path.name}.{kind}", cache=tmp_path / "cache")
 
 

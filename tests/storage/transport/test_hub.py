@@ -39,7 +39,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hub]:
     from huggingface_hub import HfFileSystem
 
     with hub_server() as hub, pytest.MonkeyPatch.context() as patch:
-        patch.setitem(fsspec.config.conf, "hf", {"endpoint": hub.url, "token": False, "use_listings_cache": False})
+        patch.setitem(
+            fsspec.config.conf,
+            "hf",
+            {"endpoint": hub.url, "token": False, "use_listings_cache": False},
+        )
         hub.folders["lab/town"] = write_dataset(tmp_path_factory.mktemp("hub") / "data")
         yield hub
         HfFileSystem.clear_instance_cache()
@@ -77,7 +81,9 @@ class TestHubFolder(SourceContract):
 
 
 @pytest.mark.parametrize("kind", ["zip", "zarr", "h5", "parquet"])
-def test_every_kind_is_read_from_a_data_set(server: Hub, published: Path, tmp_path: Path, kind: str) -> None:
+def test_every_kind_is_read_from_a_data_set(
+    server: Hub, published: Path, tmp_path: Path, kind: str
+) -> None:
     folder = tmp_path / "files"
     folder.mkdir()
     if kind == "zip":
@@ -104,7 +110,17 @@ def test_commands_read_a_data_set(server: Hub, tmp_path: Path) -> None:
 def test_the_card_of_a_data_set_of_the_hub_is_written_here(server: Hub, tmp_path: Path) -> None:
     result = CliRunner().invoke(
         app,
-        ["card", URL, "-o", str(tmp_path / "card"), "--license", "mit", "--no-pictures", "--published", "2026-11-22"],
+        [
+            "card",
+            URL,
+            "-o",
+            str(tmp_path / "card"),
+            "--license",
+            "mit",
+            "--no-pictures",
+            "--published",
+            "2026-11-22",
+        ],
     )
     assert result.exit_code == 0, result.output
     assert 'pretty_name: "town"' in (tmp_path / "card" / "README.md").read_text()
@@ -114,7 +130,9 @@ def test_a_revision_and_a_folder_in_a_data_set_are_read(server: Hub) -> None:
     assert set(carlasc.open(f"{URL}@main/{WHOLE}").sequences()) == {""}
 
 
-def test_a_folder_with_the_name_of_the_data_set_is_listed(server: Hub, published: Path, tmp_path: Path) -> None:
+def test_a_folder_with_the_name_of_the_data_set_is_listed(
+    server: Hub, published: Path, tmp_path: Path
+) -> None:
     shutil.copytree(published, tmp_path / "files" / "town")
     server.folders["lab2/town"] = tmp_path / "files"
     assert f"town/{WHOLE}" in carlasc.open("hf://datasets/lab2/town").sequences()
@@ -136,11 +154,15 @@ def test_a_cache_fetches_each_file_once(server: Hub, published: Path, tmp_path: 
 def test_requests_that_fail_are_sent_again(server: Hub, published: Path) -> None:
     sequence = carlasc.open(URL).sequences()[WHOLE]
     server.faults += [503, 429, 500]
-    assert np.array_equal(sequence.read("points", 5), FolderSource(published).sequences()[WHOLE].read("points", 5))
+    assert np.array_equal(
+        sequence.read("points", 5), FolderSource(published).sequences()[WHOLE].read("points", 5)
+    )
     assert not server.faults
 
 
-def test_a_whole_file_instead_of_a_range_is_asked_for_again(server: Hub, published: Path, tmp_path: Path) -> None:
+def test_a_whole_file_instead_of_a_range_is_asked_for_again(
+    server: Hub, published: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "files"
     folder.mkdir()
     carlasc.pack(published, folder / "x.h5")
@@ -151,7 +173,9 @@ def test_a_whole_file_instead_of_a_range_is_asked_for_again(server: Hub, publish
     assert not server.faults
 
 
-def test_a_server_that_keeps_failing_is_one_line(server: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_keeps_failing_is_one_line(
+    server: Hub, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CARLASC_REMOTE_ATTEMPTS", "2")
     sequence = carlasc.open(URL).sequences()[WHOLE]
     server.faults += [503] * 10
@@ -164,7 +188,9 @@ def test_a_server_that_keeps_failing_is_one_line(server: Hub, monkeypatch: pytes
 
 
 def test_a_data_set_that_does_not_exist_is_one_line_with_advice(server: Hub) -> None:
-    with pytest.raises(MissingDataError, match="hf://datasets/lab/nothing: .*check the name; private and gated"):
+    with pytest.raises(
+        MissingDataError, match="hf://datasets/lab/nothing: .*check the name; private and gated"
+    ):
         carlasc.open("hf://datasets/lab/nothing")
     result = CliRunner().invoke(app, ["info", "hf://datasets/lab/nothing"])
     assert (result.exit_code, len(result.stderr.splitlines())) == (1, 1)
@@ -177,7 +203,9 @@ def test_a_private_data_set_needs_a_token_that_no_message_shows(server: Hub) -> 
     assert WHOLE in carlasc.open(URL, token="secret").sequences()
 
 
-def test_a_file_that_is_removed_meanwhile_is_missing(server: Hub, published: Path, tmp_path: Path) -> None:
+def test_a_file_that_is_removed_meanwhile_is_missing(
+    server: Hub, published: Path, tmp_path: Path
+) -> None:
     copy = Path(shutil.copytree(published, tmp_path / "copy"))
     server.folders["lab/copy"] = copy
     sequence = carlasc.open("hf://datasets/lab/copy").sequences()[WHOLE]
@@ -196,7 +224,9 @@ def test_offline_is_one_line_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_nothing_is_written_to_the_hub() -> None:
-    with pytest.raises(ArgumentError, match="found the Hugging Face Hub, where each file would be a commit"):
+    with pytest.raises(
+        ArgumentError, match="found the Hugging Face Hub, where each file would be a commit"
+    ):
         RemoteTarget(URL)
 
 

@@ -62,7 +62,9 @@ class RangeHandler(SimpleHTTPRequestHandler):
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str, type[RangeHandler]]]:
+def site(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[Path, str, type[RangeHandler]]]:
     """A folder, the URL it is served at, and the handler with its counter."""
     folder = tmp_path_factory.mktemp("site")
     handler = type("Handler", (RangeHandler,), {"sent": 0, "ranges": True})
@@ -122,7 +124,9 @@ class TestMemoryHDF5(SourceContract):
     processes = ()
 
     def build(self, published: Path, folder: Path) -> Source:
-        fsspec.filesystem("memory").pipe(f"/{folder.name}.h5", pack(published, folder / "x.h5").out.read_bytes())
+        fsspec.filesystem("memory").pipe(
+            f"/{folder.name}.h5", pack(published, folder / "x.h5").out.read_bytes()
+        )
         return carlasc.open(f"memory://{folder.name}.h5")
 
 
@@ -141,7 +145,9 @@ class TestFileURL(SourceContract):
 
 
 @pytest.mark.parametrize("kind", ["folder", "zip", "zarr", "h5", "parquet"])
-def test_every_kind_is_read_over_http(published: Path, site: tuple[Path, str, type[RangeHandler]], kind: str) -> None:
+def test_every_kind_is_read_over_http(
+    published: Path, site: tuple[Path, str, type[RangeHandler]], kind: str
+) -> None:
     folder, url, _ = site
     if kind == "folder":
         write_dataset(folder / "data")
@@ -155,7 +161,9 @@ def test_every_kind_is_read_over_http(published: Path, site: tuple[Path, str, ty
     assert sequence.fields() == here.fields()
     for name in sorted(here.fields()):
         frames = here.frames(name).tolist()
-        for found, wanted in zip(sequence.read_many(name, frames), here.read_many(name, frames), strict=True):
+        for found, wanted in zip(
+            sequence.read_many(name, frames), here.read_many(name, frames), strict=True
+        ):
             assert np.array_equal(found, wanted)
     assert sequence.read_document("carlasc.json") == here.read_document("carlasc.json")
 
@@ -208,7 +216,9 @@ def test_a_server_without_ranges_is_an_error_before_anything_is_fetched(
     folder, url, handler = site
     write_zip(files_of(published), folder / "other.zip")
     monkeypatch.setattr(handler, "ranges", False)
-    with pytest.raises(CarlascError, match=r"other\.zip: expected a server that supports range requests.*download"):
+    with pytest.raises(
+        CarlascError, match=r"other\.zip: expected a server that supports range requests.*download"
+    ):
         carlasc.open(f"{url}/other.zip")
 
 
@@ -218,7 +228,9 @@ def read_all(source: Source) -> dict[str, Any]:
         for path, sequence in source.sequences().items()
         for name in sorted(sequence.fields())
         for frame, array in zip(
-            sequence.frames(name).tolist(), sequence.read_many(name, sequence.frames(name).tolist()), strict=True
+            sequence.frames(name).tolist(),
+            sequence.read_many(name, sequence.frames(name).tolist()),
+            strict=True,
         )
     }
 
@@ -231,14 +243,23 @@ def test_a_zip_is_read_from_a_web_server_that_fails_now_and_then(
     write_zip(files_of(published), folder / "faulty.zip")
     with faulty_server(url) as server:
         # not the first one, by which a server without ranges is recognised
-        server.reset(lambda number, method, path: fault if number > 3 and number % 5 == 0 and method == "GET" else None)
-        assert read_all(carlasc.open(f"{server.url}/faulty.zip")) == read_all(carlasc.open(published))
+        server.reset(
+            lambda number, method, path: (
+                fault if number > 3 and number % 5 == 0 and method == "GET" else None
+            )
+        )
+        assert read_all(carlasc.open(f"{server.url}/faulty.zip")) == read_all(
+            carlasc.open(published)
+        )
         assert server.made[fault] >= 3
 
 
 @pytest.mark.parametrize("kind", ["zip", "zarr"])
 def test_the_signature_of_a_url_is_sent_with_each_request_and_never_shown(
-    published: Path, site: tuple[Path, str, type[RangeHandler]], monkeypatch: pytest.MonkeyPatch, kind: str
+    published: Path,
+    site: tuple[Path, str, type[RangeHandler]],
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
 ) -> None:
     folder, url, handler = site
     place = folder / f"signed.{kind}"
@@ -288,7 +309,9 @@ def test_every_kind_is_read_from_s3(
     assert sequence.fields() == here.fields()
     for name in sorted(here.fields()):
         frames = here.frames(name).tolist()
-        for found, wanted in zip(sequence.read_many(name, frames), here.read_many(name, frames), strict=True):
+        for found, wanted in zip(
+            sequence.read_many(name, frames), here.read_many(name, frames), strict=True
+        ):
             assert np.array_equal(found, wanted)
     assert np.array_equal(sequence.poses, here.poses)
 
@@ -317,7 +340,12 @@ def test_a_corrupted_remote_chunk_names_field_and_frame(published: Path, tmp_pat
     ],
 )
 def test_a_missing_package_says_which_extra_brings_it(
-    published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, make: Any, extra: str
+    published: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    module: str,
+    make: Any,
+    extra: str,
 ) -> None:
     target = make(tmp_path)
     if isinstance(target, Path):

@@ -15,11 +15,26 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
-from helpers.servers.object_store import BUCKET, SECRET, FaultyServer, every, faulty_server, options_for, s3_server
+from helpers.servers.object_store import (
+    BUCKET,
+    SECRET,
+    FaultyServer,
+    every,
+    faulty_server,
+    options_for,
+    s3_server,
+)
 
 import carlasc
 from carlasc import Run
-from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingDataError, StorageError, without_credentials
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    FormatError,
+    MissingDataError,
+    StorageError,
+    without_credentials,
+)
 from carlasc.storage import FolderSink
 from carlasc.storage.opening import as_sink
 from carlasc.storage.packing import pack
@@ -29,7 +44,14 @@ from carlasc.storage.transport.targets import RemoteTarget, Target, check_shared
 from carlasc.testing import SinkContract
 
 pytest.importorskip("s3fs")
-FAULTS = {"503": "", "drop": "", "cut": "GET", "too long": "GET", "too short": "GET", "other range": "GET"}
+FAULTS = {
+    "503": "",
+    "drop": "",
+    "cut": "GET",
+    "too long": "GET",
+    "too short": "GET",
+    "other range": "GET",
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -65,7 +87,9 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def files_in(target: Target) -> dict[str, bytes]:
     paths = sorted(target.paths())
-    return {path: bytes(data) for path, data in zip(paths, target.tree.read_many(paths), strict=True)}
+    return {
+        path: bytes(data) for path, data in zip(paths, target.tree.read_many(paths), strict=True)
+    }
 
 
 def upload(folder: Path, url: str, **options: Any) -> RemoteTarget:
@@ -85,7 +109,9 @@ def copy(source: carlasc.Source, sink: carlasc.Sink) -> None:
                 writer.write_frames(
                     {
                         frame: {name: array}
-                        for frame, array in zip(frames, sequence.read_many(name, frames), strict=True)
+                        for frame, array in zip(
+                            frames, sequence.read_many(name, frames), strict=True
+                        )
                     }
                 )
 
@@ -142,7 +168,11 @@ def test_files_and_folders_are_removed(target: Target) -> None:
 
 @pytest.mark.parametrize("path", ["../x", "/x", "a/../../x", "C:x"])
 def test_a_path_that_leads_out_of_a_target_is_refused(target: Target, path: str) -> None:
-    for attempt in (lambda: target.put(path, b""), lambda: target.remove(path), lambda: target.below(path)):
+    for attempt in (
+        lambda: target.put(path, b""),
+        lambda: target.remove(path),
+        lambda: target.below(path),
+    ):
         with pytest.raises(FormatError, match="leads out of it"):
             attempt()
 
@@ -161,14 +191,17 @@ def test_of_several_processes_that_create_one_object_one_succeeds(endpoint: str)
 
 def test_a_create_only_put_whose_answer_is_lost_knows_its_own_object(faulty: FaultyServer) -> None:
     target = target_of(f"s3://{BUCKET}/lost", **options_for(faulty.url))
-    faulty.reset(lambda number, method, path: "lose the answer" if method == "PUT" and number == 1 else None)
+    faulty.reset(
+        lambda number, method, path: "lose the answer" if method == "PUT" and number == 1 else None
+    )
     assert target.put("lock", b"mine", create=True)
     assert faulty.requests["PUT"] == 2
     assert not target.put("lock", b"mine", create=True)
 
 
 @pytest.mark.parametrize(
-    "fault", [pytest.param(f, marks=[pytest.mark.slow] if f != "other range" else []) for f in FAULTS]
+    "fault",
+    [pytest.param(f, marks=[pytest.mark.slow] if f != "other range" else []) for f in FAULTS],
 )
 def test_a_whole_data_set_is_read_from_a_server_that_fails_now_and_then(
     published: Path, tmp_path: Path, endpoint: str, faulty: FaultyServer, fault: str
@@ -183,7 +216,9 @@ def test_a_whole_data_set_is_read_from_a_server_that_fails_now_and_then(
         assert files_of(tmp_path / kind) == files_of(published)
 
 
-@pytest.mark.parametrize("fault", [pytest.param(f, marks=[pytest.mark.slow] if f != "503" else []) for f in FAULTS])
+@pytest.mark.parametrize(
+    "fault", [pytest.param(f, marks=[pytest.mark.slow] if f != "503" else []) for f in FAULTS]
+)
 def test_a_whole_data_set_is_written_to_a_server_that_fails_now_and_then(
     published: Path, endpoint: str, faulty: FaultyServer, fault: str
 ) -> None:
@@ -223,7 +258,10 @@ def test_a_server_that_always_fails_is_one_line_after_a_bounded_time(faulty: Fau
         faulty.reset(lambda number, method, path: "503")
         began = time.perf_counter()
         message = failing(call, StorageError if name in ("put", "create") else CarlascError)
-        assert "s3://carlasc-tests/never" in message and "failed at each attempt, last with 503" in message
+        assert (
+            "s3://carlasc-tests/never" in message
+            and "failed at each attempt, last with 503" in message
+        )
         assert faulty.requests.total() == RemoteSettings().attempts, name
         assert time.perf_counter() - began < 5
 
@@ -235,7 +273,9 @@ def test_a_silent_server_is_one_line_after_a_bounded_time(
     monkeypatch.setenv("CARLASC_REMOTE_ATTEMPTS", "2")
     faulty.reset(lambda number, method, path: "silence")
     began = time.perf_counter()
-    message = failing(lambda: RemoteTree(f"s3://{BUCKET}/x", options_for(faulty.url)).read("a"), CarlascError)
+    message = failing(
+        lambda: RemoteTree(f"s3://{BUCKET}/x", options_for(faulty.url)).read("a"), CarlascError
+    )
     assert "failed at each attempt, last with ReadTimeoutError" in message
     assert time.perf_counter() - began < 3
 
@@ -253,27 +293,43 @@ def test_a_bucket_that_does_not_exist_is_one_line(endpoint: str) -> None:
     target = target_of("s3://no-such-bucket/x", **options_for(endpoint))
     for name, call in calls(target).items():
         message = failing(call, StorageError if name in ("put", "create") else MissingDataError)
-        assert message.startswith("s3://no-such-bucket/x") and "found no such bucket" in message, name
+        assert message.startswith("s3://no-such-bucket/x") and "found no such bucket" in message, (
+            name
+        )
     assert "no such bucket" in failing(
         lambda: carlasc.open("s3://no-such-bucket/x", **options_for(endpoint)), MissingDataError
     )
 
 
-def test_missing_credentials_are_one_line(endpoint: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_credentials_are_one_line(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_PROFILE"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     target = target_of(f"s3://{BUCKET}/x", endpoint_url=endpoint)
     for name, call in calls(target).items():
-        assert "no credentials were found: set AWS_ACCESS_KEY_ID" in failing(call, CarlascError), name
+        assert "no credentials were found: set AWS_ACCESS_KEY_ID" in failing(call, CarlascError), (
+            name
+        )
 
 
 def test_nothing_at_a_key_and_a_short_object_are_one_line(endpoint: str) -> None:
     tree = upload_bytes(endpoint, "short/a", b"12345").tree
-    assert "short/b: expected a file, found nothing" in failing(lambda: tree.read("b"), MissingDataError)
-    assert "expected 9 bytes in this range, found 4" in failing(lambda: tree.read_range("a", 1, 10), FormatError)
-    assert "expected 3 bytes in this range, found 0" in failing(lambda: tree.read_range("a", 7, 10), FormatError)
-    assert [bytes(part) for part in tree.read_ranges([("a", -2, 0), ("a", 1, 3), ("a", 2, 2)])] == [b"45", b"23", b""]
+    assert "short/b: expected a file, found nothing" in failing(
+        lambda: tree.read("b"), MissingDataError
+    )
+    assert "expected 9 bytes in this range, found 4" in failing(
+        lambda: tree.read_range("a", 1, 10), FormatError
+    )
+    assert "expected 3 bytes in this range, found 0" in failing(
+        lambda: tree.read_range("a", 7, 10), FormatError
+    )
+    assert [bytes(part) for part in tree.read_ranges([("a", -2, 0), ("a", 1, 3), ("a", 2, 2)])] == [
+        b"45",
+        b"23",
+        b"",
+    ]
 
 
 def upload_bytes(endpoint: str, path: str, data: bytes) -> RemoteTarget:
@@ -291,15 +347,28 @@ def test_a_replaced_object_is_read_although_its_folder_was_listed_before(endpoin
     assert tree.read("a") == b"longer than before"
 
 
-def test_credentials_appear_neither_in_messages_nor_in_representations(caplog: pytest.LogCaptureFixture) -> None:
+def test_credentials_appear_neither_in_messages_nor_in_representations(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     caplog.set_level("DEBUG", "carlasc")
     signed = f"http://user:{SECRET}@127.0.0.1:9/data.zip?X-Amz-Signature={SECRET}&x=1"
-    for call in (lambda: carlasc.open(signed), lambda: target_of(signed), lambda: carlasc.info(signed)):
+    for call in (
+        lambda: carlasc.open(signed),
+        lambda: target_of(signed),
+        lambda: carlasc.info(signed),
+    ):
         message = failing(call, CarlascError)
         assert "http://127.0.0.1:9/data.zip" in message and "user" not in message
     target = target_of(f"s3://{BUCKET}/x", key="a key", secret=SECRET)
     tree = target.tree
-    for thing in (target, tree, tree.requests, FolderSink(target), FolderSink(target).sequence("a"), as_sink(target)):
+    for thing in (
+        target,
+        tree,
+        tree.requests,
+        FolderSink(target),
+        FolderSink(target).sequence("a"),
+        as_sink(target),
+    ):
         assert SECRET not in repr(thing) and SECRET not in str(vars(thing).get("location", ""))
     assert SECRET not in caplog.text
 
@@ -317,7 +386,9 @@ def test_urls_are_shown_without_credentials(text: str, shown: str) -> None:
     assert without_credentials(text) == shown
 
 
-def test_a_folder_writer_knows_what_exists_and_what_it_has_written(published: Path, faulty: FaultyServer) -> None:
+def test_a_folder_writer_knows_what_exists_and_what_it_has_written(
+    published: Path, faulty: FaultyServer
+) -> None:
     url = f"s3://{BUCKET}/known"
     upload(published, url, **options_for(faulty.url))
     sequence = carlasc.open(published).sequences()["Train/Town01_Light/cartesian"]
@@ -331,7 +402,9 @@ def test_a_folder_writer_knows_what_exists_and_what_it_has_written(published: Pa
     assert np.array_equal(writer.read("points", 99), sequence.read("points", frames[-1]))
     assert writer.read_document("none.txt") is None
     writer.remove_grid("evaluation")
-    left = {path for path in target_of(url, **options_for(faulty.url)).paths() if "/evaluation/" in path}
+    left = {
+        path for path in target_of(url, **options_for(faulty.url)).paths() if "/evaluation/" in path
+    }
     assert not any(path.startswith("Train/Town01_Light/cartesian/") for path in left)
 
 
@@ -347,10 +420,16 @@ def test_the_last_field_of_a_frame_is_written_after_its_others(endpoint: str) ->
 
     sink = FolderSink(Recorder(f"s3://{BUCKET}/order", options_for(endpoint)))
     points = np.zeros((2, 4), np.float32)
-    fields = {"points": points, "labels": np.zeros(2, np.uint32), "flow": np.zeros((2, 3), np.float32)}
+    fields = {
+        "points": points,
+        "labels": np.zeros(2, np.uint32),
+        "flow": np.zeros((2, 3), np.float32),
+    }
     sink.sequence("x").write_frames({0: fields, 1: {"points": points}})
     first, last = put
-    assert [path.partition("/")[2] for path in last] == ["000000.txt", "000001.bin"] or len(last) == 2
+    assert [path.partition("/")[2] for path in last] == ["000000.txt", "000001.bin"] or len(
+        last
+    ) == 2
     assert len(first) == 2 and not set(first) & set(last)
 
 
@@ -377,12 +456,16 @@ def test_memory_is_for_one_process() -> None:
         check_shared("memory://x", Run(workers=2))
 
 
-@pytest.mark.parametrize(("name", "value"), [("REQUESTS", "many"), ("TIMEOUT_S", "0"), ("ATTEMPTS", "-1")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("REQUESTS", "many"), ("TIMEOUT_S", "0"), ("ATTEMPTS", "-1")]
+)
 def test_a_setting_that_is_not_a_positive_number_is_named(
     monkeypatch: pytest.MonkeyPatch, name: str, value: str
 ) -> None:
     monkeypatch.setenv(f"CARLASC_REMOTE_{name}", value)
-    with pytest.raises(ArgumentError, match=f"CARLASC_REMOTE_{name}: expected a positive .*found '{value}'"):
+    with pytest.raises(
+        ArgumentError, match=f"CARLASC_REMOTE_{name}: expected a positive .*found '{value}'"
+    ):
         RemoteTree("memory://x")
 
 
@@ -408,9 +491,9 @@ def test_a_remote_file_reads_as_a_local_one_in_few_requests() -> None:
 def test_threads_share_one_file_system(endpoint: str) -> None:
     tree = upload_bytes(endpoint, "threads/a", b"12345").tree
     with ThreadPoolExecutor(4) as pool:
-        assert {id(fs) for fs in pool.map(lambda _: (tree.read("a"), tree.requests.fs)[1], range(8))} == {
-            id(tree.requests.fs)
-        }
+        assert {
+            id(fs) for fs in pool.map(lambda _: (tree.read("a"), tree.requests.fs)[1], range(8))
+        } == {id(tree.requests.fs)}
 
 
 @contextmanager

@@ -18,15 +18,21 @@ def installed(module: str) -> str:
     return f"{found[0]} {version(found[0])}" if found else "Python"
 
 
-@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, names in PRIVATE.items() for name in names])
+@pytest.mark.parametrize(
+    ("kind", "name"), [(kind, name) for kind, names in PRIVATE.items() for name in names]
+)
 def test_the_installed_version_has_each_undocumented_name(kind: str, name: str) -> None:
     module, _, class_name = kind.rpartition(".")
     holder = getattr(pytest.importorskip(module), class_name)
     advice = "see carlasc.storage.transport.servers.PRIVATE"
-    assert callable(getattr(holder, name, None)), f"{installed(module)} has no {kind}.{name}: {advice}"
+    assert callable(getattr(holder, name, None)), (
+        f"{installed(module)} has no {kind}.{name}: {advice}"
+    )
 
 
-@pytest.mark.parametrize(("module", "name"), [(module, name) for module, names in TEMPORARY.items() for name in names])
+@pytest.mark.parametrize(
+    ("module", "name"), [(module, name) for module, names in TEMPORARY.items() for name in names]
+)
 def test_the_installed_version_has_each_error_of_the_connection(module: str, name: str) -> None:
     pytest.importorskip(module.partition(".")[0])
     kind = getattr(importlib.import_module(module), name, None)
@@ -43,7 +49,9 @@ def test_each_scheme_of_object_stores_is_one_of_s3fs() -> None:
 
 
 @pytest.mark.parametrize("header", [None, "bytes 5-9/100", "bytes 5-7/8"])
-def test_a_range_that_was_asked_for_is_taken_also_where_the_file_ends_before_it(header: str | None) -> None:
+def test_a_range_that_was_asked_for_is_taken_also_where_the_file_ends_before_it(
+    header: str | None,
+) -> None:
     check_range(header, 5, 10)
 
 

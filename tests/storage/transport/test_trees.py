@@ -26,9 +26,19 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> LocalTree:
 
 @pytest.mark.parametrize(
     ("start", "end"),
-    [(0, LARGE), (1, LARGE), (4095, LARGE - 1), (700, (4 << 20) + 700), (701, (4 << 20) + 700), (-LARGE, 0), (-9, -4)],
+    [
+        (0, LARGE),
+        (1, LARGE),
+        (4095, LARGE - 1),
+        (700, (4 << 20) + 700),
+        (701, (4 << 20) + 700),
+        (-LARGE, 0),
+        (-9, -4),
+    ],
 )
-def test_ranges_are_the_bytes_of_the_file_mapped_or_not(tree: LocalTree, start: int, end: int) -> None:
+def test_ranges_are_the_bytes_of_the_file_mapped_or_not(
+    tree: LocalTree, start: int, end: int
+) -> None:
     content = (tree.root / "large").read_bytes()
     assert bytes(tree.read_range("large", start, end)) == content[start : end or None]
 
@@ -37,8 +47,12 @@ def test_a_start_before_the_file_is_its_beginning(tree: LocalTree) -> None:
     assert bytes(tree.read_range("small", -1000, 0)) == b"0123456789"
 
 
-@pytest.mark.parametrize(("name", "start", "end"), [("small", 5, 11), ("large", 1000, LARGE + 1), ("small", 20, 30)])
-def test_a_range_beyond_the_end_is_one_clear_error(tree: LocalTree, name: str, start: int, end: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "start", "end"), [("small", 5, 11), ("large", 1000, LARGE + 1), ("small", 20, 30)]
+)
+def test_a_range_beyond_the_end_is_one_clear_error(
+    tree: LocalTree, name: str, start: int, end: int
+) -> None:
     with pytest.raises(FormatError, match=rf"{name}: expected .* bytes.*truncated"):
         tree.read_range(name, start, end)
 
@@ -61,11 +75,15 @@ def test_errors_name_the_file(tree: LocalTree) -> None:
         tree.read_range("inside", 0, 1)
 
 
-@pytest.mark.parametrize("name", ["../a", "a/../b", "..", "/a", "\\a", "a\\b", "C:a", "z:/a", "a\0"])
+@pytest.mark.parametrize(
+    "name", ["../a", "a/../b", "..", "/a", "\\a", "a\\b", "C:a", "z:/a", "a\0"]
+)
 def test_names_that_lead_outside(name: str) -> None:
     assert leads_outside(name)
 
 
-@pytest.mark.parametrize("name", ["", "a", "a/b", "..a", "a../b", "a/10:30", "1:a", "Übersicht", ".a"])
+@pytest.mark.parametrize(
+    "name", ["", "a", "a/b", "..a", "a../b", "a/10:30", "1:a", "Übersicht", ".a"]
+)
 def test_names_that_stay_inside(name: str) -> None:
     assert not leads_outside(name)

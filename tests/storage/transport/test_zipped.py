@@ -17,7 +17,9 @@ from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 
 
-def write_zip(files: dict[str, bytes], path: Path, method: int = zipfile.ZIP_STORED, **flags: bool) -> Path:
+def write_zip(
+    files: dict[str, bytes], path: Path, method: int = zipfile.ZIP_STORED, **flags: bool
+) -> Path:
     with zipfile.ZipFile(path, "w", method, **flags) as archive:
         for name, data in files.items():
             archive.writestr(name, data)
@@ -33,7 +35,8 @@ class TestDeflatedZip(SourceContract):
     processes = ("fork",)
 
     def build(self, published: Path, folder: Path) -> Source:
-        return carlasc.open(write_zip(files_of(published), folder / "data", zipfile.ZIP_DEFLATED))  # by its signature
+        # by its signature
+        return carlasc.open(write_zip(files_of(published), folder / "data", zipfile.ZIP_DEFLATED))
 
 
 class TestZipWithAFolderAroundAndFolderEntries(SourceContract):
@@ -54,7 +57,10 @@ class _Inside(Source):
         self.location = source.location
 
     def sequences(self):  # type: ignore[no-untyped-def]
-        return {path.removeprefix("Cartesian/"): sequence for path, sequence in self.source.sequences().items()}
+        return {
+            path.removeprefix("Cartesian/"): sequence
+            for path, sequence in self.source.sequences().items()
+        }
 
 
 @pytest.fixture(scope="module")
@@ -107,18 +113,24 @@ def test_a_damaged_record_of_the_directory_is_one_clear_error(archive: Path) -> 
         carlasc.open(archive).sequences()
 
 
-def test_a_directory_that_points_elsewhere_names_the_member(files: dict[str, bytes], archive: Path) -> None:
+def test_a_directory_that_points_elsewhere_names_the_member(
+    files: dict[str, bytes], archive: Path
+) -> None:
     data = bytearray(archive.read_bytes())
     name = f"{WHOLE}/velodyne/000005.bin".encode()
     record = data.index(b"PK\x01\x02", data.rindex(name) - 46)
     struct.pack_into("<I", data, record + 42, 11)
     archive.write_bytes(data)
-    with pytest.raises(FormatError, match=r"velodyne/000005\.bin: expected a member's header at byte 11"):
+    with pytest.raises(
+        FormatError, match=r"velodyne/000005\.bin: expected a member's header at byte 11"
+    ):
         carlasc.open(archive).sequences()[WHOLE].read("points", 5)
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_a_flipped_bit_in_a_member_names_it(files: dict[str, bytes], tmp_path: Path, method: int) -> None:
+def test_a_flipped_bit_in_a_member_names_it(
+    files: dict[str, bytes], tmp_path: Path, method: int
+) -> None:
     archive = write_zip(files, tmp_path / "data.zip", method)
     name = f"{WHOLE}/velodyne/000005.bin"
     with zipfile.ZipFile(archive) as reader:
@@ -132,8 +144,12 @@ def test_a_flipped_bit_in_a_member_names_it(files: dict[str, bytes], tmp_path: P
     assert len(sequence.read("points", 2)) == 777
 
 
-@pytest.mark.parametrize("name", ["../evil.bin", "/etc/evil", "a/../../evil", "C:/evil", "a\\..\\evil", "Train\\evil"])
-def test_names_that_lead_out_of_the_folder_are_refused(files: dict[str, bytes], tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["../evil.bin", "/etc/evil", "a/../../evil", "C:/evil", "a\\..\\evil", "Train\\evil"]
+)
+def test_names_that_lead_out_of_the_folder_are_refused(
+    files: dict[str, bytes], tmp_path: Path, name: str
+) -> None:
     archive = write_zip(files | {"x" * len(name): b"evil"}, tmp_path / "data.zip")
     archive.write_bytes(archive.read_bytes().replace(b"x" * len(name), name.encode()))
     with pytest.raises(FormatError, match="the name leads out of the folder"):
@@ -141,12 +157,16 @@ def test_names_that_lead_out_of_the_folder_are_refused(files: dict[str, bytes], 
 
 
 @pytest.mark.parametrize("name", ["a..b.txt", "Train/10:30.txt", "Übersicht.txt"])
-def test_harmless_names_with_odd_signs_are_taken(files: dict[str, bytes], tmp_path: Path, name: str) -> None:
+def test_harmless_names_with_odd_signs_are_taken(
+    files: dict[str, bytes], tmp_path: Path, name: str
+) -> None:
     archive = write_zip(files | {name: b"1"}, tmp_path / "data.zip")
     assert len(carlasc.open(archive).sequences()) == 3
 
 
-def test_compression_of_another_kind_says_to_unpack(files: dict[str, bytes], tmp_path: Path) -> None:
+def test_compression_of_another_kind_says_to_unpack(
+    files: dict[str, bytes], tmp_path: Path
+) -> None:
     archive = write_zip(files, tmp_path / "data.zip", zipfile.ZIP_LZMA)
     with pytest.raises(FormatError, match="compression 14: unpack the zip"):
         carlasc.open(archive).sequences()[WHOLE].read("points", 5)
@@ -160,7 +180,8 @@ def test_64_bit_sizes_and_offsets_are_read(tmp_path: Path, files: dict[str, byte
                 member.write(data)
     data = bytearray(path.read_bytes())
     name = f"{WHOLE}/velodyne/000005.bin".encode()
-    record = data.rindex(name) - 46  # rewrite its directory record with the 64-bit extra field, as a 40 GB zip has it
+    # rewrite its directory record with the 64-bit extra field, as a 40 GB zip has it
+    record = data.rindex(name) - 46
     packed, size = struct.unpack_from("<2I", data, record + 20)
     offset = struct.unpack_from("<I", data, record + 42)[0]
     extra = struct.pack("<2H3Q", 1, 24, size, packed, offset)
@@ -171,7 +192,9 @@ def test_64_bit_sizes_and_offsets_are_read(tmp_path: Path, files: dict[str, byte
     data[at:at] = extra
     end = data.rindex(b"PK\x05\x06")
     count, length, start = struct.unpack_from("<H2I", data, end + 10)
-    record64 = struct.pack("<4sQ2H2L4Q", b"PK\x06\x06", 44, 45, 45, 0, 0, count, count, length + len(extra), start)
+    record64 = struct.pack(
+        "<4sQ2H2L4Q", b"PK\x06\x06", 44, 45, 45, 0, 0, count, count, length + len(extra), start
+    )
     locator = struct.pack("<4sLQL", b"PK\x06\x07", 0, end, 1)
     struct.pack_into("<2H2I", data, end + 8, 2**16 - 1, 2**16 - 1, 2**32 - 1, 2**32 - 1)
     data[end:end] = record64 + locator
@@ -199,12 +222,14 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
 def test_a_big_directory_is_opened_without_touching_its_members(tmp_path: Path) -> None:
     count = 3000
     files = {
-        f"Train/Town01/cartesian/velodyne/{frame:06d}.bin": np.zeros((1, 4), "<f4").tobytes() for frame in range(count)
+        f"Train/Town01/cartesian/velodyne/{frame:06d}.bin": np.zeros((1, 4), "<f4").tobytes()
+        for frame in range(count)
     }
     archive = write_zip(files, tmp_path / "data.zip")
     data = bytearray(archive.read_bytes())
     directory = data.index(b"PK\x01\x02")
-    data[: directory - 4] = bytes(directory - 4)  # local headers and members gone, but for the signature that says zip
+    # local headers and members gone, but for the signature that says zip
+    data[: directory - 4] = bytes(directory - 4)
     data[:4] = b"PK\x03\x04"
     archive.write_bytes(data)
     (sequence,) = carlasc.open(archive).sequences().values()
@@ -212,7 +237,9 @@ def test_a_big_directory_is_opened_without_touching_its_members(tmp_path: Path) 
 
 
 def tiny(tmp_path: Path, method: int = zipfile.ZIP_STORED) -> tuple[Path, bytearray, int, int]:
-    """Return a zip of one scan, its bytes, where its directory starts, and where its end record does."""
+    """Return a zip of one scan, its bytes, where its directory starts, and where its end record
+    does.
+    """
     path = write_zip({"velodyne/000000.bin": bytes(range(160))}, tmp_path / "tiny.zip", method)
     data = bytearray(path.read_bytes())
     end = data.rindex(b"PK\x05\x06")
@@ -278,7 +305,9 @@ def widen(data: bytearray, start: int, end: int, extra: bytes) -> bytearray:
         (b"", False),
     ],
 )
-def test_a_size_of_64_bits_is_read_or_is_one_clear_error(tmp_path: Path, extra: bytes, fits: bool) -> None:
+def test_a_size_of_64_bits_is_read_or_is_one_clear_error(
+    tmp_path: Path, extra: bytes, fits: bool
+) -> None:
     path, data, start, end = tiny(tmp_path)
     if fits:
         assert read_scan(path, widen(data, start, end, extra)) == bytes(range(160))
@@ -291,7 +320,10 @@ def test_a_size_of_64_bits_is_read_or_is_one_clear_error(tmp_path: Path, extra: 
 def test_a_locator_that_points_elsewhere_is_one_clear_error(tmp_path: Path, offset: int) -> None:
     path, data, _, end = tiny(tmp_path)
     data[end:end] = struct.pack("<4sLQL", b"PK\x06\x07", 0, offset, 1)
-    with pytest.raises(FormatError, match=r"tiny\.zip: expected a zip's central directory, found .*64-bit end record"):
+    with pytest.raises(
+        FormatError,
+        match=r"tiny\.zip: expected a zip's central directory, found .*64-bit end record",
+    ):
         read_scan(path, data)
 
 
@@ -328,4 +360,6 @@ def test_names_in_utf_8_and_in_the_old_code_page_are_read(tmp_path: Path) -> Non
     start = data.rindex(b"PK\x01\x02")
     data[start + 9] &= ~8  # without the flag of UTF-8, the name is one of code page 437
     path.write_bytes(data)
-    assert set(ZipTree(LocalTree(tmp_path), "x.zip").entries()) == {"Übersicht.txt".encode().decode("cp437")}
+    assert set(ZipTree(LocalTree(tmp_path), "x.zip").entries()) == {
+        "Übersicht.txt".encode().decode("cp437")
+    }

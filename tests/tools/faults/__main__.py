@@ -1,6 +1,8 @@
-"""`python -m faults`: many faults of every kind, a row for each, and the figures in the documentation.
+"""`python -m faults`: many faults of every kind, a row for each, and the figures in the
+documentation.
 
-The figures are kept in `docs/studies/faults.json`. The table of `docs/reliability.md` and a line of `README.md` are made from it.
+The figures are kept in `docs/studies/faults.json`. The table of `docs/reliability.md` and a line of
+`README.md` are made from it.
 """
 
 from __future__ import annotations
@@ -22,14 +24,23 @@ from faults.figures import KINDS, keep
 def main() -> int:
     """Run the kinds that are asked for; returns 1 if a fault was found."""
     parser = argparse.ArgumentParser(prog="faults", description=__doc__)
-    parser.add_argument("--size", choices=("quick", "long"), default="quick", help="minutes or hours")
     parser.add_argument(
-        "--only", choices=tuple(KINDS), action="append", help="only this kind; may be given several times"
+        "--size", choices=("quick", "long"), default="quick", help="minutes or hours"
     )
-    parser.add_argument("--count", type=int, help="number of cases of each kind, instead of those of the size")
+    parser.add_argument(
+        "--only",
+        choices=tuple(KINDS),
+        action="append",
+        help="only this kind; may be given several times",
+    )
+    parser.add_argument(
+        "--count", type=int, help="number of cases of each kind, instead of those of the size"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random numbers")
     parser.add_argument(
-        "--keep-figures", action="store_true", help="leave the figures in the documentation as they are"
+        "--keep-figures",
+        action="store_true",
+        help="leave the figures in the documentation as they are",
     )
     given = parser.parse_args()
     found = []
@@ -39,8 +50,13 @@ def main() -> int:
             print(f"{name}: there is no {kind.module}")
             continue
         folder = Path(tempfile.mkdtemp(prefix=f"faults-{name}-"))
-        outcome = import_module(kind.module).run(given.count or getattr(kind, given.size), given.seed, folder)
-        print(f"{name}: {outcome.tried:,} tried, {len(outcome.found)} faults, {outcome.seconds:.0f} s", flush=True)
+        outcome = import_module(kind.module).run(
+            given.count or getattr(kind, given.size), given.seed, folder
+        )
+        print(
+            f"{name}: {outcome.tried:,} tried, {len(outcome.found)} faults, {outcome.seconds:.0f} s",
+            flush=True,
+        )
         print(*outcome.found, sep="\n", end="\n" if outcome.found else "")
         found += outcome.found
         if not outcome.found:

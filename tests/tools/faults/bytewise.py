@@ -74,14 +74,18 @@ def number(data: bytes, rng: Random) -> bytes:
         return value.to_bytes(width, "little")
     start = min(_place(data, rng), len(data) - width)
     if rng.random() < 0.3:  # a value near the one that is there
-        value = (int.from_bytes(data[start : start + width], "little") + rng.randint(-3, 3)) % (1 << 8 * width)
+        value = (int.from_bytes(data[start : start + width], "little") + rng.randint(-3, 3)) % (
+            1 << 8 * width
+        )
     order = "little" if rng.random() < 0.8 else "big"
     return data[:start] + value.to_bytes(width, order) + data[start + width :]
 
 
 def truncate(data: bytes, rng: Random) -> bytes:
     """Cut the end off."""
-    return data[: rng.choice((0, 1, len(data) // 2, max(0, len(data) - 1), rng.randint(0, len(data))))]
+    return data[
+        : rng.choice((0, 1, len(data) // 2, max(0, len(data) - 1), rng.randint(0, len(data))))
+    ]
 
 
 def extend(data: bytes, rng: Random) -> bytes:
@@ -94,7 +98,11 @@ def zero(data: bytes, rng: Random) -> bytes:
     """Fill a range with zeros or ones."""
     start = _place(data, rng) if data else 0
     count = min(len(data) - start, rng.choice((1, 4, 16, 64, 512, 4096)))
-    return data[:start] + (bytes(count) if rng.random() < 0.7 else b"\xff" * count) + data[start + count :]
+    return (
+        data[:start]
+        + (bytes(count) if rng.random() < 0.7 else b"\xff" * count)
+        + data[start + count :]
+    )
 
 
 def copy(data: bytes, rng: Random) -> bytes:

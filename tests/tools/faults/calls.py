@@ -1,4 +1,6 @@
-"""Commands of which one system call fails: they say so in one line, leave whole files only, and the next run finishes the work."""
+"""Commands of which one system call fails: they say so in one line, leave whole files only, and the
+next run finishes the work.
+"""
 
 from __future__ import annotations
 
@@ -41,18 +43,22 @@ ALONE = [name for name, command in COMMANDS.items() if command.workers in (None,
 """Commands that work in one process: calls of others cannot be numbered."""
 
 GOES_ON = ("convert", "convert-zarr", "convert-parquet", "regrid-hdf5", "regrid-parquet")
-"""Commands that go on past a frame of the input that cannot be read, and whose next run does not replace what was made without it: the frames beside it, or
+"""Commands that go on past a frame of the input that cannot be read, and whose next run does not
+replace what was made without it: the frames beside it, or
 a store of one writer, which is finished. docs/reliability.md says so."""
 
 PARTIAL = ("card", "report", "stats")
-"""Commands that say what they found in the frames that can be read, name the others, and end with exit code 1."""
+"""Commands that say what they found in the frames that can be read, name the others, and end with
+exit code 1.
+"""
 
 
 def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None) -> Outcome:
     """Let `count` calls fail, one in each run of a command.
 
     Args:
-        count: number of calls, shared among the commands; 0 for every call of every command with every error, once and from then on.
+        count: number of calls, shared among the commands; 0 for every call of every command with
+            every error, once and from then on.
         seed: of the random numbers that choose them.
         folder: an empty folder to work in.
         names: the commands; None for all that work in one process.
@@ -65,7 +71,9 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
     return Outcome("calls", tried, found, time.monotonic() - began)
 
 
-def _try_command(command: Command, count: int | None, seed: int, base: Path, work: Path) -> tuple[int, list[str]]:
+def _try_command(
+    command: Command, count: int | None, seed: int, base: Path, work: Path
+) -> tuple[int, list[str]]:
     warm(command, base, work / "warm")
     case = work / "case"
     undisturbed = run_undisturbed(command, base, case)
@@ -74,12 +82,19 @@ def _try_command(command: Command, count: int | None, seed: int, base: Path, wor
     for k, error, always in _chosen(calls, count, np.random.default_rng(seed)):
         tried += 1
         story = f"{command.name}, call {k} of {calls[error]}: {_named(error, always)}"
-        found += [f"{story}: {fault}" for fault in _try_call(command, k, error, always, base, case, undisturbed)]
+        found += [
+            f"{story}: {fault}"
+            for fault in _try_call(command, k, error, always, base, case, undisturbed)
+        ]
     return tried, found
 
 
 def _named(error: int, always: bool) -> str:
-    return "the end" if error == END else f"{errno.errorcode[error]} {'from then on' if always else 'once'}"
+    return (
+        "the end"
+        if error == END
+        else f"{errno.errorcode[error]} {'from then on' if always else 'once'}"
+    )
 
 
 def _count(command: Command, kinds: Kind, base: Path, case: Path) -> int:
@@ -90,7 +105,9 @@ def _count(command: Command, kinds: Kind, base: Path, case: Path) -> int:
     return preload.counted_calls()
 
 
-def _chosen(calls: dict[int, int], count: int | None, rng: np.random.Generator) -> Iterator[tuple[int, int, bool]]:
+def _chosen(
+    calls: dict[int, int], count: int | None, rng: np.random.Generator
+) -> Iterator[tuple[int, int, bool]]:
     every = [
         (k, error, always)
         for error, most in calls.items()
@@ -98,14 +115,22 @@ def _chosen(calls: dict[int, int], count: int | None, rng: np.random.Generator) 
         for always in ((False,) if error == END else (False, True))
     ]
     numbers = (
-        range(len(every)) if count is None else sorted(rng.choice(len(every), min(count, len(every)), replace=False))
+        range(len(every))
+        if count is None
+        else sorted(rng.choice(len(every), min(count, len(every)), replace=False))
     )
     for number in numbers:
         yield every[int(number)]
 
 
 def _try_call(
-    command: Command, k: int, error: int, always: bool, base: Path, case: Path, undisturbed: Undisturbed
+    command: Command,
+    k: int,
+    error: int,
+    always: bool,
+    base: Path,
+    case: Path,
+    undisturbed: Undisturbed,
 ) -> list[str]:
     """Let a call fail, then let the command finish; returns what is wrong."""
     shutil.rmtree(case, ignore_errors=True)
@@ -122,7 +147,11 @@ def _try_call(
         code = wait(child, 60)
     except TimeoutError as problem:
         return [str(problem)]
-    failed, messages, found = preload.failed_call(), (case / MESSAGES).read_text(errors="replace"), content_of(case)
+    failed, messages, found = (
+        preload.failed_call(),
+        (case / MESSAGES).read_text(errors="replace"),
+        content_of(case),
+    )
     if failed is None:
         return []  # threads made fewer calls this time
     kind, path = failed
@@ -142,15 +171,22 @@ def _try_call(
     if not (command.name in PARTIAL and code == 1):
         faults += torn(found, case, command, undisturbed)
     if kind != Kind.UNLINK and not always and error != END:
-        faults += [f"{name} is left" for name in found if _is_temporary(name) and Path(name).name.startswith(".")]
+        faults += [
+            f"{name} is left"
+            for name in found
+            if _is_temporary(name) and Path(name).name.startswith(".")
+        ]
     try:
         again = run_command(command, case)
     except TimeoutError as problem:
         return [f"{what}: {fault}" for fault in [*faults, str(problem)]]
     if again != (undisturbed.code if finished else 0):
-        faults.append(f"the next run ends with exit code {again}: {(case / MESSAGES).read_text()[-300:]}")
+        faults.append(
+            f"the next run ends with exit code {again}: {(case / MESSAGES).read_text()[-300:]}"
+        )
     left = content_of(case)
-    if error == END or always:  # the system's own folder for temporary files is emptied by the system
+    # the system's own folder for temporary files is emptied by the system
+    if error == END or always:
         left = {name: data for name, data in left.items() if Path(name).parent.name != TEMPORARY}
     elif kind == Kind.UNLINK:
         left = _without_refused(left)
@@ -159,7 +195,9 @@ def _try_call(
 
 
 def _said(code: int, messages: str, path: str | None, case: Path) -> list[str]:
-    """Check the exit code, and what the command said on stderr: lines of its own that name the file."""
+    """Check the exit code, and what the command said on stderr: lines of its own that name the
+    file.
+    """
     if code == 0:
         return []
     if code != 1:
@@ -175,7 +213,9 @@ def _said(code: int, messages: str, path: str | None, case: Path) -> list[str]:
 
 
 def _names(line: str, path: str, case: Path) -> bool:
-    """Whether a message names a file, by the name that it gets when it is whole, or the folder or store that it is in."""
+    """Whether a message names a file, by the name that it gets when it is whole, or the folder or
+    store that it is in.
+    """
     relative = Path(path).relative_to(case).as_posix()
     final = re.sub(r"\.([^/]+)\.[^./]+-[0-9]+\.[0-9a-f]{8}\.part$", r"\1", relative)
     names = {final, *(parent.as_posix() for parent in Path(final).parents if parent != Path())}
@@ -183,7 +223,9 @@ def _names(line: str, path: str, case: Path) -> bool:
 
 
 def _without_refused(content: Content) -> Content:
-    """Leave out the temporary files that could not be removed, and that no later run of the same command looks for."""
+    """Leave out the temporary files that could not be removed, and that no later run of the same
+    command looks for.
+    """
     return {
         name: data
         for name, data in content.items()

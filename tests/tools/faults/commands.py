@@ -1,6 +1,7 @@
 """Every command that writes, on data of two frames.
 
-A case is a folder: the command runs in it with relative paths, so that its whole content can be compared with that of an undisturbed run.
+A case is a folder: the command runs in it with relative paths, so that its whole content can be
+compared with that of an undisturbed run.
 
     build_inputs(base)                   # once: what all commands read
     for command in COMMANDS.values():
@@ -45,12 +46,14 @@ class Command:
 
     Attributes:
         name: what it is called in reports.
-        arguments: what a user types after `carlasc`, with spaces between; paths are relative to the folder of the case.
+        arguments: what a user types after `carlasc`, with spaces between; paths are relative to the
+            folder of the case.
         inputs: what it needs in that folder, out of what `build_inputs` made.
         output: what it writes there.
         needs: packages that must be installed.
         workers: processes that it works with; None for a command without `--workers`.
-        timed: whether its bytes hold a time or the duration of the run, so that only what it reads as can be compared.
+        timed: whether its bytes hold a time or the duration of the run, so that only what it reads
+            as can be compared.
     """
 
     name: str
@@ -68,7 +71,9 @@ class Command:
         return given if self.workers is None else [*given, "--workers", str(self.workers)]
 
     def copy_inputs(self, base: Path, case: Path) -> None:
-        """Copy what the command reads from the folder of `build_inputs` into the new folder of a case."""
+        """Copy what the command reads from the folder of `build_inputs` into the new folder of a
+        case.
+        """
         case.mkdir(parents=True)
         for name in self.inputs:
             if (base / name).is_dir():
@@ -87,10 +92,16 @@ _ALL = (
     Command("regrid", f"regrid drive -o out {GRID} --keep-votes", ("drive",), "out"),
     Command("regrid-zarr", f"regrid drive -o out.zarr {GRID}", ("drive",), "out.zarr", _ZARR),
     Command("regrid-hdf5", f"regrid drive -o out.h5 {GRID}", ("drive",), "out.h5", _HDF5),
-    Command("regrid-parquet", f"regrid drive -o out.parquet {GRID}", ("drive",), "out.parquet", _PARQUET),
+    Command(
+        "regrid-parquet", f"regrid drive -o out.parquet {GRID}", ("drive",), "out.parquet", _PARQUET
+    ),
     Command("regrid-workers", f"regrid drive -o out {GRID}", ("drive",), "out", workers=2),
-    Command("regrid-zarr-workers", f"regrid drive -o out.zarr {GRID}", ("drive",), "out.zarr", _ZARR, 2),
-    Command("regrid-scans", f"regrid scene {GRID} --observe scans --name merged", ("scene",), "scene"),
+    Command(
+        "regrid-zarr-workers", f"regrid drive -o out.zarr {GRID}", ("drive",), "out.zarr", _ZARR, 2
+    ),
+    Command(
+        "regrid-scans", f"regrid scene {GRID} --observe scans --name merged", ("scene",), "scene"
+    ),
     Command(
         "regrid-overwrite",
         "regrid scene --size 8,8,4 --observe grid --name evaluation_copy --overwrite",
@@ -98,16 +109,38 @@ _ALL = (
         "scene",
     ),
     Command("convert", f"convert kitti kitti out {GRID} --force", ("kitti",), "out"),
-    Command("convert-zarr", f"convert kitti kitti out.zarr {GRID} --force", ("kitti",), "out.zarr", _ZARR),
     Command(
-        "convert-parquet", "convert kitti kitti out.parquet --grids none --force", ("kitti",), "out.parquet", _PARQUET
+        "convert-zarr",
+        f"convert kitti kitti out.zarr {GRID} --force",
+        ("kitti",),
+        "out.zarr",
+        _ZARR,
+    ),
+    Command(
+        "convert-parquet",
+        "convert kitti kitti out.parquet --grids none --force",
+        ("kitti",),
+        "out.parquet",
+        _PARQUET,
     ),
     Command("pack-zarr", "pack scene out.zarr", ("scene",), "out.zarr", _ZARR),
     Command("pack-hdf5", "pack scene out.h5", ("scene",), "out.h5", _HDF5),
     Command("pack-parquet", "pack scene out.parquet", ("scene",), "out.parquet", _PARQUET),
     Command("pack-workers", "pack scene out.zarr", ("scene",), "out.zarr", _ZARR, 2),
-    Command("pack-zarr-overwrite", "pack scene scene.zarr --overwrite", ("scene", "scene.zarr"), "scene.zarr", _ZARR),
-    Command("pack-hdf5-overwrite", "pack scene scene.h5 --overwrite", ("scene", "scene.h5"), "scene.h5", _HDF5),
+    Command(
+        "pack-zarr-overwrite",
+        "pack scene scene.zarr --overwrite",
+        ("scene", "scene.zarr"),
+        "scene.zarr",
+        _ZARR,
+    ),
+    Command(
+        "pack-hdf5-overwrite",
+        "pack scene scene.h5 --overwrite",
+        ("scene", "scene.h5"),
+        "scene.h5",
+        _HDF5,
+    ),
     Command(
         "pack-parquet-overwrite",
         "pack scene scene.parquet --overwrite",
@@ -117,19 +150,39 @@ _ALL = (
     ),
     Command("unpack", "unpack scene.zarr out", ("scene.zarr",), "out", _ZARR),
     Command("export-kitti", "export kitti scene out", ("scene",), "out"),
-    Command("render-picture", f"render scene -o out.png {PICTURE}", ("scene",), "out.png", _PICTURES),
+    Command(
+        "render-picture", f"render scene -o out.png {PICTURE}", ("scene",), "out.png", _PICTURES
+    ),
     Command("render-gif", f"render scene -o out.gif {PICTURE}", ("scene",), "out.gif", _PICTURES),
     Command("render-film", f"render scene -o out.mp4 {PICTURE}", ("scene",), "out.mp4", _PICTURES),
-    Command("report", "report scene --html out.html --save --remake --holdout", ("scene",), "out.html", timed=True),
+    Command(
+        "report",
+        "report scene --html out.html --save --remake --holdout",
+        ("scene",),
+        "out.html",
+        timed=True,
+    ),
     Command(
         "card",
         "card scene -o out --license cc0-1.0 --published 2026-11-22 --no-pictures --overwrite",
         ("scene",),
         "out",
     ),
-    Command("stats", "stats scene --grid evaluation_16x16x8 --plot out.png", ("scene",), "out.png", ("matplotlib",)),
+    Command(
+        "stats",
+        "stats scene --grid evaluation_16x16x8 --plot out.png",
+        ("scene",),
+        "out.png",
+        ("matplotlib",),
+    ),
     Command("download", f"download out --split val --base-url {URL}", (), "out", workers=None),
-    Command("download-extract", f"download out --split val --extract --base-url {URL}", (), "out", workers=None),
+    Command(
+        "download-extract",
+        f"download out --split val --extract --base-url {URL}",
+        (),
+        "out",
+        workers=None,
+    ),
     Command("finish", "finish parts.zarr --incomplete", ("parts.zarr",), "parts.zarr", _ZARR, None),
 )
 
@@ -138,7 +191,10 @@ COMMANDS = {
     for command in _ALL
     if all(find_spec(package) for package in (*command.needs, "trimesh", "embreex"))
 }
-"""The commands whose packages are installed, by name. The data come from the simulated town, which needs two packages itself."""
+"""The commands whose packages are installed, by name.
+
+The data come from the simulated town, which needs two packages itself.
+"""
 
 
 _MADE_BY = {
@@ -160,7 +216,8 @@ _MADE_FROM = {
 
 
 def build_inputs(base: Path, commands: Iterable[Command] | None = None) -> None:
-    """Write what commands read: a capture, scans with grids, the same as a store, one part of a store, and KITTI's files.
+    """Write what commands read: a capture, scans with grids, the same as a store, one part of a
+    store, and KITTI's files.
 
     Args:
         base: a folder, which is made.
@@ -197,9 +254,11 @@ TEMPORARY = "tmp"
 
 
 def start(argv: list[str], case: Path, before: Callable[[], None] | None = None) -> int:
-    """Run a command in a forked child, in the folder of a case, as the leader of a process group of its own.
+    """Run a command in a forked child, in the folder of a case, as the leader of a process group of
+    its own.
 
-    The child starts with the modules that this process has imported, so that most of its time is the command's own work.
+    The child starts with the modules that this process has imported, so that most of its time is
+    the command's own work.
 
     Args:
         argv: the arguments of `carlasc`.
@@ -238,15 +297,20 @@ def _become_fresh(case: Path) -> None:
     """Make a forked child behave as a process that a shell has just started."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    sys.modules["__main__"] = ModuleType("__main__")  # a worker process imports the file of this one again
+    # a worker process imports the file of this one again
+    sys.modules["__main__"] = ModuleType("__main__")
     os.chdir(case)
     Path(TEMPORARY).mkdir(exist_ok=True)  # what is left there is seen, too
     os.environ["TMPDIR"], tempfile.tempdir = str(case / TEMPORARY), None
-    null, messages = os.open(os.devnull, os.O_RDONLY), os.open(MESSAGES, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    null, messages = (
+        os.open(os.devnull, os.O_RDONLY),
+        os.open(MESSAGES, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644),
+    )
     os.dup2(null, 0)
     os.dup2(messages, 1)
     os.dup2(messages, 2)
-    sys.stdout, sys.stderr = (os.fdopen(number, "w", 1, closefd=False) for number in (1, 2))  # pytest has replaced both
+    # pytest has replaced both
+    sys.stdout, sys.stderr = (os.fdopen(number, "w", 1, closefd=False) for number in (1, 2))
 
 
 def run_here(argv: list[str]) -> int:
@@ -261,9 +325,11 @@ def run_here(argv: list[str]) -> int:
 
 
 def warm(command: Command, base: Path, case: Path) -> None:
-    """Run a command once in this process, so that children which are forked from now on have its modules and its compiled code.
+    """Run a command once in this process, so that children which are forked from now on have its
+    modules and its compiled code.
 
-    For a process that is itself a child: it stays in the folder `case`, and has no input and no output any more.
+    For a process that is itself a child: it stays in the folder `case`, and has no input and no
+    output any more.
 
     Raises:
         RuntimeError: the command fails.
@@ -271,11 +337,15 @@ def warm(command: Command, base: Path, case: Path) -> None:
     command.copy_inputs(base, case)
     _become_fresh(case)
     if code := run_here(command.argv):
-        raise RuntimeError(f"carlasc {command.arguments}: exit code {code}: {(case / MESSAGES).read_text()}")
+        raise RuntimeError(
+            f"carlasc {command.arguments}: exit code {code}: {(case / MESSAGES).read_text()}"
+        )
 
 
 def run_command(command: Command, case: Path, limit_s: float = 60.0) -> int:
-    """Run a command in a child to its end and return its exit code; minus the number of the signal that ended it, as `subprocess` does."""
+    """Run a command in a child to its end and return its exit code; minus the number of the signal
+    that ended it, as `subprocess` does.
+    """
     return wait(start(command.argv, case), limit_s)
 
 
@@ -305,7 +375,9 @@ _ADDRESS = "CARLASC_FAULTS_URL"
 
 @contextmanager
 def serving() -> Iterator[None]:
-    """Serve the zip that `download` fetches, in a process of its own: a thread would not live on in forked children."""
+    """Serve the zip that `download` fetches, in a process of its own: a thread would not live on in
+    forked children.
+    """
     from helpers.servers.http_server import Site, serve
 
     readable, writable = os.pipe()

@@ -17,7 +17,9 @@ Content = dict[str, bytes | None]
 
 
 def content_of(folder: Path) -> Content:
-    """Return what is in a folder, without the messages of commands, and without the file by which Python tries the folder for temporary files."""
+    """Return what is in a folder, without the messages of commands, and without the file by which
+    Python tries the folder for temporary files.
+    """
     found: Content = {}
     for path in sorted(folder.rglob("*")):
         if path.name != MESSAGES and not _is_trial(path):
@@ -27,12 +29,18 @@ def content_of(folder: Path) -> Content:
 
 
 def _is_trial(path: Path) -> bool:
-    """Whether `tempfile` made a file to see whether it can; a process that is killed at that moment leaves these four bytes."""
-    return path.parent.name == TEMPORARY and path.is_file() and b"blat".startswith(path.read_bytes())
+    """Whether `tempfile` made a file to see whether it can; a process that is killed at that moment
+    leaves these four bytes.
+    """
+    return (
+        path.parent.name == TEMPORARY and path.is_file() and b"blat".startswith(path.read_bytes())
+    )
 
 
 def differences(expected: Content, found: Content) -> list[str]:
-    """Describe how a folder differs: one line per file that is missing, too many, or has other bytes."""
+    """Describe how a folder differs: one line per file that is missing, too many, or has other
+    bytes.
+    """
     missing = [f"{name} is missing" for name in expected if name not in found]
     left = [f"{name} is left over" for name in found if name not in expected]
     return missing + left + changed(expected, found)
@@ -64,7 +72,10 @@ def arrays_of(store: Path) -> dict[str, str]:
 
 
 def wrong_arrays(store: Path, expected: dict[str, str]) -> list[str]:
-    """Describe the arrays of a store that are not those of the finished one. A store that is not finished may refuse to be opened."""
+    """Describe the arrays of a store that are not those of the finished one.
+
+    A store that is not finished may refuse to be opened.
+    """
     try:
         source = carlasc.open(store)
         source.sequences()
@@ -74,7 +85,9 @@ def wrong_arrays(store: Path, expected: dict[str, str]) -> list[str]:
         found = arrays_of(store)
     except CarlascError as error:
         return [f"the store opens, but {error}"]
-    return [f"{name} is another array" for name, digest in found.items() if expected.get(name) != digest]
+    return [
+        f"{name} is another array" for name, digest in found.items() if expected.get(name) != digest
+    ]
 
 
 def _size(content: bytes | None) -> str:

@@ -1,7 +1,9 @@
-"""Coverage-guided mutations: libFuzzer, through atheris, keeps the changes by which readers come to lines that no earlier ones reached.
+"""Coverage-guided mutations: libFuzzer, through atheris, keeps the changes by which readers come to
+lines that no earlier ones reached.
 
-An input is a byte that says which file is replaced, and its new content. `python -m faults.coverage TARGET RUNS SEED FOLDER` runs one
-target. Inputs that once found a fault are in `corpus/TARGET`, and are tried first. Without atheris, nothing is tried.
+An input is a byte that says which file is replaced, and its new content. `python -m faults.coverage
+TARGET RUNS SEED FOLDER` runs one target. Inputs that once found a fault are in `corpus/TARGET`, and
+are tried first. Without atheris, nothing is tried.
 """
 
 from __future__ import annotations
@@ -20,7 +22,18 @@ from types import ModuleType
 
 from faults.outcome import Outcome
 
-NAMES = ("folder", "zip", "zarr", "parquet", "capture", "results", "kitti", "nuscenes", "paris-carla-3d", "carlaocc")
+NAMES = (
+    "folder",
+    "zip",
+    "zarr",
+    "parquet",
+    "capture",
+    "results",
+    "kitti",
+    "nuscenes",
+    "paris-carla-3d",
+    "carlaocc",
+)
 """The targets that read thousands of inputs a minute."""
 CORPUS = Path(__file__).parent / "corpus"
 _PACKAGES = ("carlasc", "carlasc_converters")
@@ -47,9 +60,13 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
         tried += int(match[1]) if match else 0
         if done.returncode:
             lines = [
-                line for line in done.stderr.splitlines() if "Error" in line or "ERROR" in line or "Test unit" in line
+                line
+                for line in done.stderr.splitlines()
+                if "Error" in line or "ERROR" in line or "Test unit" in line
             ]
-            found.append(f"coverage {name} seed {seed}: {' | '.join(lines[-3:]) or done.stderr[-300:]}")
+            found.append(
+                f"coverage {name} seed {seed}: {' | '.join(lines[-3:]) or done.stderr[-300:]}"
+            )
     return Outcome("coverage", tried, found, time.monotonic() - started)
 
 
@@ -72,7 +89,9 @@ def fuzz(name: str, runs: int, seed: int, folder: Path) -> None:
 
     def read(data: bytes) -> None:
         if data:
-            fault = mutations.read_case(target, folder / "valid", files, {paths[data[0] % len(paths)]: data[1:]})
+            fault = mutations.read_case(
+                target, folder / "valid", files, {paths[data[0] % len(paths)]: data[1:]}
+            )
             if fault:
                 raise RuntimeError(fault)
 
@@ -82,7 +101,11 @@ def fuzz(name: str, runs: int, seed: int, folder: Path) -> None:
             return atheris.Mutate(data, most)
         return (data[:1] + damage.change(data[1:], rng))[:most]
 
-    _write_corpus(folder / "corpus", name, [bytes([place]) + files[path] for place, path in enumerate(paths[:256])])
+    _write_corpus(
+        folder / "corpus",
+        name,
+        [bytes([place]) + files[path] for place, path in enumerate(paths[:256])],
+    )
     _start(atheris, read, mutate, runs, seed, folder, 2 * max(map(len, files.values())))
 
 
@@ -94,8 +117,22 @@ def _write_corpus(corpus: Path, name: str, inputs: list[bytes]) -> None:
         shutil.copy(file, corpus)
 
 
-def _start(atheris: ModuleType, read: object, mutate: object, runs: int, seed: int, folder: Path, longest: int) -> None:
-    options = [f"-runs={runs}", f"-seed={seed + 1}", "-timeout=30", "-print_final_stats=1", "-verbosity=0"]
+def _start(
+    atheris: ModuleType,
+    read: object,
+    mutate: object,
+    runs: int,
+    seed: int,
+    folder: Path,
+    longest: int,
+) -> None:
+    options = [
+        f"-runs={runs}",
+        f"-seed={seed + 1}",
+        "-timeout=30",
+        "-print_final_stats=1",
+        "-verbosity=0",
+    ]
     options += [f"-max_len={longest}", f"-artifact_prefix={folder}/", str(folder / "corpus")]
     atheris.Setup([sys.argv[0], *options], read, custom_mutator=mutate)
     atheris.Fuzz()

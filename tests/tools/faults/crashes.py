@@ -1,7 +1,9 @@
-"""Power failures: what a command did is recorded, and the folder is built as a disk may hold it after each of its calls.
+"""Power failures: what a command did is recorded, and the folder is built as a disk may hold it
+after each of its calls.
 
-A disk keeps what was synced. Of the rest it keeps any part: the bytes of a file that were not synced may be there, missing, cut short or zeros, and names that
-were given or removed since their folder was synced may be as before or as after, in any combination or in their order (`Disk`).
+A disk keeps what was synced. Of the rest it keeps any part: the bytes of a file that were not
+synced may be there, missing, cut short or zeros, and names that were given or removed since their
+folder was synced may be as before or as after, in any combination or in their order (`Disk`).
 """
 
 from __future__ import annotations
@@ -33,10 +35,14 @@ from faults.outcome import Outcome
 from faults.trying import main, run_with_library
 
 LOSSES = ("all", "prefix", "zeros", "some")
-"""What is lost of what was not synced: everything; names in order from some point on, and the ends of files; likewise, but bytes become zeros; any part."""
+"""What is lost of what was not synced: everything; names in order from some point on, and the ends
+of files; likewise, but bytes become zeros; any part.
+"""
 
 RECORDED = [name for name in ALONE if name != "render-film"]
-"""Commands whose bytes are all written by this process: the encoder of films is a program of its own."""
+"""Commands whose bytes are all written by this process: the encoder of films is a program of its
+own.
+"""
 
 
 def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None) -> Outcome:
@@ -56,7 +62,9 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
     return Outcome("crashes", tried, found, time.monotonic() - began)
 
 
-def _try_command(command: Command, count: int | None, seed: int, base: Path, work: Path) -> tuple[int, list[str]]:
+def _try_command(
+    command: Command, count: int | None, seed: int, base: Path, work: Path
+) -> tuple[int, list[str]]:
     warm(command, base, work / "warm")
     case, log = work / "case", work / "log"
     undisturbed = run_undisturbed(command, base, case)
@@ -67,7 +75,11 @@ def _try_command(command: Command, count: int | None, seed: int, base: Path, wor
     calls, finished = read_log(log, case), content_of(case)
     every = [(moment, loss) for moment in range(1, len(calls) + 1) for loss in LOSSES]
     rng = np.random.default_rng(seed)
-    chosen = range(len(every)) if count is None else sorted(rng.choice(len(every), min(count, len(every)), False))
+    chosen = (
+        range(len(every))
+        if count is None
+        else sorted(rng.choice(len(every), min(count, len(every)), False))
+    )
     tried, found = 0, []
     for number in chosen:
         moment, loss = every[int(number)]
@@ -79,12 +91,16 @@ def _try_command(command: Command, count: int | None, seed: int, base: Path, wor
             disk.apply(call)
         disk.fail(loss, np.random.default_rng([seed, moment, LOSSES.index(loss)]))
         story = f"{command.name}, seed {seed}, after call {moment} of {len(calls)} ({calls[moment - 1]}), lost: {loss}"
-        faults = _judge(command, case, undisturbed, whole=finished if moment == len(calls) else None)
+        faults = _judge(
+            command, case, undisturbed, whole=finished if moment == len(calls) else None
+        )
         found += [f"{story}: {fault}" for fault in faults]
     return tried, found
 
 
-def _judge(command: Command, case: Path, undisturbed: Undisturbed, whole: dict[str, bytes | None] | None) -> list[str]:
+def _judge(
+    command: Command, case: Path, undisturbed: Undisturbed, whole: dict[str, bytes | None] | None
+) -> list[str]:
     """Check what the power failure left, then let the command finish; returns what is wrong.
 
     Args:
@@ -95,15 +111,22 @@ def _judge(command: Command, case: Path, undisturbed: Undisturbed, whole: dict[s
     """
     faults, found = torn(content_of(case), case, command, undisturbed), content_of(case)
     if whole is not None:
-        faults += [f"lost after the command had ended: {line}" for line in differences(whole, found)[:3]]
+        faults += [
+            f"lost after the command had ended: {line}" for line in differences(whole, found)[:3]
+        ]
     finished = not differences(undisturbed.after, found)
     try:
         code = run_command(command, case)
     except TimeoutError as problem:
         return [*faults, str(problem)]
     if code != (undisturbed.code if finished else 0):
-        faults.append(f"the next run ends with exit code {code}: {(case / MESSAGES).read_text()[-300:]}")
-    return faults + [f"after the next run {line}" for line in differences(undisturbed.after, content_of(case))[:3]]
+        faults.append(
+            f"the next run ends with exit code {code}: {(case / MESSAGES).read_text()[-300:]}"
+        )
+    return faults + [
+        f"after the next run {line}"
+        for line in differences(undisturbed.after, content_of(case))[:3]
+    ]
 
 
 @dataclass(frozen=True)
@@ -163,11 +186,16 @@ class _Folder:
 
 
 _Changes = list[tuple[_Folder, str, _File | _Folder | None]]
-"""What one call does to names: in a folder, a name gets a file or a folder, or goes (None). It happens whole or not at all."""
+"""What one call does to names: in a folder, a name gets a file or a folder, or goes (None).
+
+It happens whole or not at all.
+"""
 
 
 class Disk:
-    """A folder, and what a disk may hold of it after a power failure: a name is stored once its folder has been synced."""
+    """A folder, and what a disk may hold of it after a power failure: a name is stored once its
+    folder has been synced.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root, self._top = root, _read(root)
@@ -177,7 +205,9 @@ class Disk:
         """Do what a call did."""
         folder, name = self._at(call.path)
         if call.kind in ("create", "mkdir"):
-            self._change([(folder, name, _File(bytearray()) if call.kind == "create" else _Folder())])
+            self._change(
+                [(folder, name, _File(bytearray()) if call.kind == "create" else _Folder())]
+            )
         elif call.kind in ("unlink", "rmdir"):
             self._change([(folder, name, None)])
         elif call.kind in ("link", "rename"):
@@ -270,7 +300,9 @@ def _write(data: bytearray, call: Call) -> None:
 
 
 def _after(file: _File, loss: str, rng: np.random.Generator) -> bytes:
-    """Return the bytes of a file after a power failure: the synced ones, with any part of what came later."""
+    """Return the bytes of a file after a power failure: the synced ones, with any part of what came
+    later.
+    """
     synced, now = file.synced, bytes(file.now)
     if now == synced:
         return now

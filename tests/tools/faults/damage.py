@@ -1,6 +1,8 @@
-"""How files are damaged: a few operators for any bytes, and some for the containers that carlasc reads.
+"""How files are damaged: a few operators for any bytes, and some for the containers that carlasc
+reads.
 
-All of them are functions of the bytes and of a random number generator, so that a seed repeats a case.
+All of them are functions of the bytes and of a random number generator, so that a seed repeats a
+case.
 """
 
 from __future__ import annotations
@@ -44,7 +46,9 @@ _NAMES = (
 
 
 def damage(files: Files, rng: Random) -> Changes:
-    """Return what one case changes: mostly the content of one file, sometimes of several, or which files exist."""
+    """Return what one case changes: mostly the content of one file, sometimes of several, or which
+    files exist.
+    """
     changes: Changes = {}
     for _ in range(1 if rng.random() < 0.8 else rng.randint(2, 4)):
         path = _choose_file(files, rng)
@@ -66,18 +70,22 @@ def change(data: bytes, rng: Random) -> bytes:
 
 
 def _choose_file(files: Files, rng: Random) -> str:
-    """Return a file: kinds of files have equal chances, so that scans do not hide the few documents."""
+    """Return a file: kinds of files have equal chances, so that scans do not hide the few
+    documents.
+    """
     kinds: dict[str, list[str]] = {}
     for path in files:
         folder, name = PurePosixPath(path).parent, PurePosixPath(path).name
-        kinds.setdefault(f"{folder.name if '/c/' not in path else folder}/{re.sub('[0-9]+', '0', name)}", []).append(
-            path
-        )
+        kinds.setdefault(
+            f"{folder.name if '/c/' not in path else folder}/{re.sub('[0-9]+', '0', name)}", []
+        ).append(path)
     return rng.choice(kinds[rng.choice(sorted(kinds))])
 
 
 def _rearrange(files: Files, path: str, rng: Random) -> Changes:
-    """Remove a file, make a folder in its place, rename it, give it another one's name, or add one with an odd name."""
+    """Remove a file, make a folder in its place, rename it, give it another one's name, or add one
+    with an odd name.
+    """
     other, kind = rng.choice(sorted(files)), rng.randrange(5)
     beside = str(PurePosixPath(path).with_name(rng.choice(_NAMES)))
     if kind == 0:
@@ -90,7 +98,9 @@ def _rearrange(files: Files, path: str, rng: Random) -> Changes:
 
 
 def _from_others(data: bytes, files: Files, path: str, rng: Random) -> bytes:
-    """Return bytes made of two files: the head of one and the tail of the other, or all of the other."""
+    """Return bytes made of two files: the head of one and the tail of the other, or all of the
+    other.
+    """
     alike = [name for name in files if PurePosixPath(name).suffix == PurePosixPath(path).suffix]
     other = files[rng.choice(alike if rng.random() < 0.7 else sorted(files))]
     if rng.random() < 0.3:
@@ -102,7 +112,9 @@ def _from_others(data: bytes, files: Files, path: str, rng: Random) -> bytes:
 
 
 def _suited(data: bytes) -> Sequence[Operator]:
-    """Return the operators for the format of some bytes; those for any bytes are among them where offsets matter."""
+    """Return the operators for the format of some bytes; those for any bytes are among them where
+    offsets matter.
+    """
     head = data[:8]
     if head.startswith(b"PK"):
         return (_zip, _zip, number)
@@ -118,7 +130,10 @@ def _suited(data: bytes) -> Sequence[Operator]:
 
 
 def _is_text(data: bytes) -> bool:
-    return sum((byte < 32 and byte not in (9, 10, 13)) or byte > 126 for byte in data) <= len(data) // 50
+    return (
+        sum((byte < 32 and byte not in (9, 10, 13)) or byte > 126 for byte in data)
+        <= len(data) // 50
+    )
 
 
 def _json(data: bytes, rng: Random) -> bytes:
@@ -140,7 +155,9 @@ def _json(data: bytes, rng: Random) -> bytes:
         other, name = rng.choice(places)
         container[key] = deepcopy(other[name])
     elif isinstance(container, dict):
-        container[rng.choice(("", "x", "../x", str(key) + " ", "format", "carlasc", "classes"))] = container.pop(key)
+        container[rng.choice(("", "x", "../x", str(key) + " ", "format", "carlasc", "classes"))] = (
+            container.pop(key)
+        )
     else:
         container.insert(key, deepcopy(container[key]))
     text = json.dumps(value)
@@ -152,12 +169,29 @@ def _near(value: Any, rng: Random) -> Any:
     if isinstance(value, bool):
         return not value
     if isinstance(value, int | float):
-        return rng.choice((value + 1, value - 1, -value, value * 2, value * 1000, value // 3, str(value)))
+        return rng.choice(
+            (value + 1, value - 1, -value, value * 2, value * 1000, value // 3, str(value))
+        )
     if isinstance(value, str):
-        return rng.choice((value[:-1], value + "x", value.upper(), value + "\n", value.replace("/", "/../"), [value]))
+        return rng.choice(
+            (
+                value[:-1],
+                value + "x",
+                value.upper(),
+                value + "\n",
+                value.replace("/", "/../"),
+                [value],
+            )
+        )
     if isinstance(value, list):
         return rng.choice(
-            (value[:-1], value * 2, value[::-1], value[:1] * 100, {str(i): v for i, v in enumerate(value)})
+            (
+                value[:-1],
+                value * 2,
+                value[::-1],
+                value[:1] * 100,
+                {str(i): v for i, v in enumerate(value)},
+            )
         )
     return list(value.values()) if isinstance(value, dict) else value
 
@@ -181,7 +215,15 @@ def _words(data: bytes, rng: Random) -> bytes:
     words = list(re.finditer(r"[\w.+-]+", text)) or [re.match("", text)]
     match = rng.choice(words)
     assert match is not None
-    word = rng.choice((rng.choice(_WORDS), rng.choice(_WORDS), "", match[0] * 2, words[-1][0] if words[-1] else ""))  # type: ignore[index]
+    word = rng.choice(
+        (
+            rng.choice(_WORDS),
+            rng.choice(_WORDS),
+            "",
+            match[0] * 2,
+            words[-1][0] if words[-1] else "",
+        )
+    )  # type: ignore[index]
     return (text[: match.start()] + word + text[match.end() :]).encode("utf-8", "surrogateescape")
 
 
@@ -224,9 +266,18 @@ def _zip(data: bytes, rng: Random) -> bytes:
                 elif kind < 0.8:
                     continue
                 elif kind < 0.9:
-                    name = rng.choice(("x", "../x", "/x", name + "/", name.upper(), members[0][0].filename))
+                    name = rng.choice(
+                        ("x", "../x", "/x", name + "/", name.upper(), members[0][0].filename)
+                    )
                 else:
-                    method = rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))
+                    method = rng.choice(
+                        (
+                            zipfile.ZIP_STORED,
+                            zipfile.ZIP_DEFLATED,
+                            zipfile.ZIP_BZIP2,
+                            zipfile.ZIP_LZMA,
+                        )
+                    )
             _add(archive, name, content, method)
     return out.getvalue()
 
@@ -238,7 +289,22 @@ def _add(archive: zipfile.ZipFile, name: str, content: bytes, method: int) -> No
     archive.writestr(info, content)
 
 
-_TYPES = ("<f4", "<f8", ">f4", "<i8", "|u1", "|b1", "|O", "<U3", "|S0", "<c16", "<M8[s]", "|V8", "<f2", "<f16")
+_TYPES = (
+    "<f4",
+    "<f8",
+    ">f4",
+    "<i8",
+    "|u1",
+    "|b1",
+    "|O",
+    "<U3",
+    "|S0",
+    "<c16",
+    "<M8[s]",
+    "|V8",
+    "<f2",
+    "<f16",
+)
 
 
 def _npy(data: bytes, rng: Random) -> bytes:
@@ -303,7 +369,9 @@ def _is_checked(data: bytes) -> bool:
 
 
 def _checked(data: bytes, rng: Random) -> bytes:
-    """Change a chunk, or the index of a shard, and make the checksums right again: what a decoder meets that trusts them."""
+    """Change a chunk, or the index of a shard, and make the checksums right again: what a decoder
+    meets that trusts them.
+    """
     if _is_sealed(data):
         return _seal(change(data[:-4], rng))
     place = _find_index(data)
@@ -311,12 +379,18 @@ def _checked(data: bytes, rng: Random) -> bytes:
         return number(data, rng)
     first, last = place
     index = bytearray(data[first : last - 4])
-    entries = [entry for entry in range(0, len(index), 16) if struct.unpack_from("<Q", index, entry)[0] < len(data)]
+    entries = [
+        entry
+        for entry in range(0, len(index), 16)
+        if struct.unpack_from("<Q", index, entry)[0] < len(data)
+    ]
     if not entries or rng.random() < 0.25:
         return data[:first] + _seal(number(bytes(index), rng)) + data[last:]
     entry = rng.choice(entries)
     start, length = struct.unpack_from("<QQ", index, entry)
-    body = rng.choice((flip, put, number, zero, truncate, copy))(data[start : start + length - 4], rng)
+    body = rng.choice((flip, put, number, zero, truncate, copy))(
+        data[start : start + length - 4], rng
+    )
     body = _seal(body[: length - 4])
     struct.pack_into("<Q", index, entry + 8, len(body))
     changed = bytearray(data)

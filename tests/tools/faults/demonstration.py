@@ -1,4 +1,6 @@
-"""What the library of calls.c does, shown with plain calls: run by test_calls.py in a process that has loaded it."""
+"""What the library of calls.c does, shown with plain calls: run by test_calls.py in a process that
+has loaded it.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,9 @@ def main(work: Path) -> None:
 
     preload.record_calls(folder, log)
     _write(folder)
-    found = [(call.kind, call.offset, call.data, call.path, call.other) for call in read_log(log, folder)]
+    found = [
+        (call.kind, call.offset, call.data, call.path, call.other) for call in read_log(log, folder)
+    ]
     assert found == [
         ("empty", 0, b"", "a", ""),
         ("write", 0, b"abc", "a", ""),

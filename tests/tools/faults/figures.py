@@ -1,4 +1,6 @@
-"""The kinds of faults, and what was found, as the documentation shows it: `measuring` puts it into the pages."""
+"""The kinds of faults, and what was found, as the documentation shows it: `measuring` puts it into
+the pages.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ KINDS = {
     "kills": Kind(
         "faults.kills",
         "kills",
-        "A command is ended by a signal (SIGKILL, SIGTERM, SIGINT) at a random moment and run again, up to three times: "
+        "A command is ended by a signal (SIGKILL, SIGTERM, SIGINT) at a random moment and run "
+        "again, up to three times: "
         "the bytes are those of an undisturbed run, and nothing is left over",
         100,
         1000,
@@ -46,7 +49,8 @@ KINDS = {
     "calls": Kind(
         "faults.calls",
         "failed system calls",
-        "The k-th open, write, rename, sync or read of a command fails (EIO, ENOSPC, EDQUOT), or the process ends there: "
+        "The k-th open, write, rename, sync or read of a command fails (EIO, ENOSPC, EDQUOT), or "
+        "the process ends there: "
         "one line, and the next run completes",
         500,
         100_000,
@@ -54,7 +58,8 @@ KINDS = {
     "crashes": Kind(
         "faults.crashes",
         "power losses",
-        "The writes of a command are replayed up to a random point, and what was not synced is dropped, reordered or zeroed: "
+        "The writes of a command are replayed up to a random point, and what was not synced is "
+        "dropped, reordered or zeroed: "
         "every reader finds a file whole or not at all",
         500,
         100_000,
@@ -69,14 +74,16 @@ KINDS = {
     "coverage": Kind(
         "faults.coverage",
         "inputs of libFuzzer",
-        "The same, guided by the lines of carlasc that an input reaches (atheris, where it is installed)",
+        "The same, guided by the lines of carlasc that an input reaches (atheris, where it is "
+        "installed)",
         5_000,
         500_000,
     ),
     "hostile": Kind(
         "faults.hostile",
         "hostile files",
-        "Files and servers that were made to do harm: each is refused in one line that names it, and nothing outside the output is created",
+        "Files and servers that were made to do harm: each is refused in one line that names it, "
+        "and nothing outside the output is created",
         1_000,
         1_000,
     ),
@@ -87,8 +94,14 @@ KINDS = {
 def keep(outcome: Outcome, date: datetime.date) -> None:
     """Write an outcome into the figures, in place of the one of its kind."""
     rows = read()
-    rows[outcome.kind] = {"date": date.isoformat(), **dataclasses.asdict(outcome), "seconds": round(outcome.seconds)}
-    FIGURES.write_text(json.dumps({kind: rows[kind] for kind in KINDS if kind in rows}, indent=2) + "\n")
+    rows[outcome.kind] = {
+        "date": date.isoformat(),
+        **dataclasses.asdict(outcome),
+        "seconds": round(outcome.seconds),
+    }
+    FIGURES.write_text(
+        json.dumps({kind: rows[kind] for kind in KINDS if kind in rows}, indent=2) + "\n"
+    )
 
 
 def read() -> dict[str, dict[str, Any]]:
@@ -105,7 +118,8 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     for name, row in rows.items():
         minutes = max(1, round(row["seconds"] / 60))
         lines.append(
-            f"| {name} | {KINDS[name].what} | {row['tried']:,} | {len(row['found'])} | {minutes} | {row['date']} |"
+            f"| {name} | {KINDS[name].what} | {row['tried']:,} | {len(row['found'])} | {minutes} "
+            f"| {row['date']} |"
         )
     return "\n".join(lines)
 
@@ -119,6 +133,8 @@ def line(rows: dict[str, dict[str, Any]]) -> str:
     kills = rows.get("kills", {}).get("tried", 0)
     # None of n independent tries failed: with a confidence of 95 %, fewer than 3 / n of all do.
     bound = (
-        f" (of kills, at most {3 / kills:.1%} can do harm, with a confidence of 95 %)" if kills and not found else ""
+        f" (of kills, at most {3 / kills:.1%} can do harm, with a confidence of 95 %)"
+        if kills and not found
+        else ""
     )
     return f"**Reliability**, tried on small data of two frames: {listed}, {result}{bound}. [Figures and promises](docs/reliability.md)."

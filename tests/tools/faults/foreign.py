@@ -93,7 +93,8 @@ def _scans(root: Path) -> None:
     from helpers.converters.scan_writers import write_with_open3d
 
     root.mkdir()
-    drive = SimulatedDrive(2, rolling=True, channels=6, columns=40)  # enough points to find the motion
+    # enough points to find the motion
+    drive = SimulatedDrive(2, rolling=True, channels=6, columns=40)
     for frame in range(drive.frames):
         scan = drive.scan(frame)
         fields = dict(zip(("x", "y", "z", "intensity"), scan.points.T, strict=True))

@@ -1,4 +1,5 @@
-"""Files, stores and servers that were made to do harm: each is refused in one line that names it, and nothing outside the output is touched.
+"""Files, stores and servers that were made to do harm: each is refused in one line that names it,
+and nothing outside the output is touched.
 
 A case lies in a folder of its own:
 
@@ -6,8 +7,9 @@ A case lies in a folder of its own:
     work/                      where the command runs; `Case.make` puts the hostile file here
     work/out*                  what the command may create
 
-The command runs in a forked child whose memory and time are bounded. Before and after, all files outside of the output are compared; during
-the run, an audit hook notes every file that Python opens for writing, creates, renames or links outside of it.
+The command runs in a forked child whose memory and time are bounded. Before and after, all files
+outside of the output are compared; during the run, an audit hook notes every file that Python opens
+for writing, creates, renames or links outside of it.
 """
 
 from __future__ import annotations
@@ -57,13 +59,16 @@ class Case:
     Attributes:
         name: what it is.
         make: puts it into a folder.
-        arguments: those of `carlasc` that meet it, with spaces between; "{url}" stands for the address of the server.
+        arguments: those of `carlasc` that meet it, with spaces between; "{url}" stands for the
+            address of the server.
         names: what each error must contain: the name of the file or of the server.
         serve: runs a server, and yields its address; it is given the folder of the case.
-        harmless: whether the command may succeed, because only what it prints and writes has to be safe.
+        harmless: whether the command may succeed, because only what it prints and writes has to be
+            safe.
         forbidden: what no file of the output may contain.
         environment: variables of the command.
-        read: called in the folder, in the place of a command; what it raises must be an error of carlasc.
+        read: called in the folder, in the place of a command; what it raises must be an error of
+            carlasc.
     """
 
     name: str
@@ -78,7 +83,8 @@ class Case:
 
 
 def run(count: int, seed: int, folder: Path) -> Outcome:
-    """Try the cases, at most `count` of them: every one that there is, in an order that depends on `seed`, if it is 0 the table's.
+    """Try the cases, at most `count` of them: every one that there is, in an order that depends on
+    `seed`, if it is 0 the table's.
 
     The folders of cases that did harm stay in `folder`.
     """
@@ -96,7 +102,9 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
     if seed:
         table = [table[place] for place in sorted(range(len(table)), key=lambda k: hash((seed, k)))]
     chosen = table[:count]
-    found = [f"{case.name}: {fault}" for case in chosen for fault in try_case(case, folder / "cases")]
+    found = [
+        f"{case.name}: {fault}" for case in chosen for fault in try_case(case, folder / "cases")
+    ]
     return Outcome("hostile", len(chosen), found, time.monotonic() - began)
 
 
@@ -120,7 +128,9 @@ def try_case(case: Case, folder: Path) -> list[str]:
     messages = (work / MESSAGES).read_bytes()
     faults = [*_judge_messages(case, code, messages), *_judge_files(case, before, place)]
     if noted.exists():
-        faults += [f"wrote outside: {line}" for line in sorted(set(noted.read_text().splitlines()))[:5]]
+        faults += [
+            f"wrote outside: {line}" for line in sorted(set(noted.read_text().splitlines()))[:5]
+        ]
     if not faults:
         shutil.rmtree(place)
     return [f"{fault} ({time.monotonic() - began:.1f} s)" for fault in faults]
@@ -190,7 +200,9 @@ def listing(place: Path) -> dict[str, str]:
         if path.is_symlink():
             found[str(inside)] = f"link to {path.readlink()}"
         else:
-            found[str(inside)] = hashlib.md5(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+            found[str(inside)] = (
+                hashlib.md5(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+            )
     return found
 
 
@@ -223,4 +235,6 @@ def _judge_files(case: Case, before: dict[str, str], place: Path) -> Iterable[st
                 yield f"{file} is a link that leads outside"
             elif file.is_file():
                 content = file.read_bytes()
-                yield from (f"{file} contains {text!r}" for text in case.forbidden if text in content)
+                yield from (
+                    f"{file} contains {text!r}" for text in case.forbidden if text in content
+                )

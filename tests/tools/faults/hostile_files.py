@@ -63,8 +63,12 @@ def put(path: Path, content: Content) -> None:
     path.write_bytes(made(content))
 
 
-def edit(base: Path, name: str, change: Callable[[Path], object], copy: str = "data") -> Callable[[Path], None]:
-    """Return a function that puts a copy of `base/<copy>` into a folder, and changes the file `name` in it."""
+def edit(
+    base: Path, name: str, change: Callable[[Path], object], copy: str = "data"
+) -> Callable[[Path], None]:
+    """Return a function that puts a copy of `base/<copy>` into a folder, and changes the file
+    `name` in it.
+    """
 
     def make(work: Path) -> None:
         shutil.copytree(base / copy, work / copy)
@@ -105,7 +109,9 @@ class Runs:
 
 
 def zeros(name: str, shape: int, size: int) -> bytes:
-    """Return an .npz of 8 MB or less that unpacks to `size` zeros, whose header claims `shape` of them."""
+    """Return an .npz of 8 MB or less that unpacks to `size` zeros, whose header claims `shape` of
+    them.
+    """
     buffer = io.BytesIO()
     with (
         zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as made,
@@ -118,10 +124,16 @@ def zeros(name: str, shape: int, size: int) -> bytes:
 
 
 def _arrays(base: Path) -> Iterator[Case]:
-    good = {"voxel": npy(np.zeros(3, "<i4")), "label": npy(np.ones(3, "u1")), "votes": npy(np.ones(3, "<u2"))}
+    good = {
+        "voxel": npy(np.zeros(3, "<i4")),
+        "label": npy(np.ones(3, "u1")),
+        "votes": npy(np.ones(3, "<u2")),
+    }
     pickled = npy(np.array([Runs()], object))
     table = {
-        "claims more than it unpacks to": npz(good | {"label": npy(header=header("|u1", (10**15,)))}),
+        "claims more than it unpacks to": npz(
+            good | {"label": npy(header=header("|u1", (10**15,)))}
+        ),
         "claims as much as it unpacks to, 1 GB": partial(zeros, "label", 1 << 30, 1 << 30),
         "unpacks to 1 GB and claims little": partial(zeros, "label", 10, 1 << 30),
         "has a pickle": npz(good | {"label": pickled}),
@@ -130,7 +142,9 @@ def _arrays(base: Path) -> Iterator[Case]:
         ),
         "has a broken header": npz(good | {"label": npy(header="{'descr': '|u1', 'shape': (3")}),
         "has a deep header": npz(good | {"label": npy(header="(" * 9000)}),
-        "has a header that is code": npz(good | {"label": npy(header="__import__('os').mkdir('../header-was-run')")}),
+        "has a header that is code": npz(
+            good | {"label": npy(header="__import__('os').mkdir('../header-was-run')")}
+        ),
         "has a negative shape": npz(good | {"label": npy(header=header("|u1", (-3,)))}),
         "is packed by LZMA": npz(good, method=zipfile.ZIP_LZMA),
         "is a bomb packed by bzip2": npz({"label": bytes(1 << 26)}, method=zipfile.ZIP_BZIP2),
@@ -145,7 +159,10 @@ def _arrays(base: Path) -> Iterator[Case]:
             "pack data out.zarr",
             "000004.votes.npz",
         )
-    huge = lambda path: path.write_bytes(np.full(path.stat().st_size // 4, 2**32 - 1, "<u4").tobytes())  # noqa: E731
+
+    def huge(path):
+        return path.write_bytes(np.full(path.stat().st_size // 4, 2**32 - 1, "<u4").tobytes())
+
     for command in (
         "stats data",
         "report data",
@@ -187,17 +204,36 @@ def _numbers(base: Path) -> Iterator[Case]:
     line = "1 0 0 {0} 0 1 0 {0} 0 0 1 0\n"
     for command in commands:
         for name, value in huge.items():
-            fill = lambda path, value=value: path.write_bytes(np.full(path.stat().st_size // 4, value, "<f4").tobytes())  # noqa: E731
+
+            def fill(path, value=value):
+                return path.write_bytes(np.full(path.stat().st_size // 4, value, "<f4").tobytes())
+
             verb = command.split()[0]
             yield Case(
-                f"points of {name} in {verb}", edit(base, f"{SCANS}/velodyne/000002.bin", fill), command, harmless=True
+                f"points of {name} in {verb}",
+                edit(base, f"{SCANS}/velodyne/000002.bin", fill),
+                command,
+                harmless=True,
             )
             poses = partial(
-                put, content=(line.format(0) + line.format(value * 1e260 if name[-1] == "8" else value) * 9).encode()
+                put,
+                content=(
+                    line.format(0) + line.format(value * 1e260 if name[-1] == "8" else value) * 9
+                ).encode(),
             )
-            yield Case(f"poses of {name} in {verb}", edit(base, f"{SCANS}/poses.txt", poses), command, harmless=True)
+            yield Case(
+                f"poses of {name} in {verb}",
+                edit(base, f"{SCANS}/poses.txt", poses),
+                command,
+                harmless=True,
+            )
         ones = lambda path: path.write_bytes(b"\xff" * path.stat().st_size)  # noqa: E731
-        yield Case(f"boxes of ones in {verb}", edit(base, f"{SCANS}/boxes/000005.bin", ones), command, harmless=True)
+        yield Case(
+            f"boxes of ones in {verb}",
+            edit(base, f"{SCANS}/boxes/000005.bin", ones),
+            command,
+            harmless=True,
+        )
 
 
 def _documents(base: Path) -> Iterator[Case]:
@@ -215,7 +251,8 @@ def _documents(base: Path) -> Iterator[Case]:
             harmless=True,
         )
     table = {
-        "carlasc.json": [("nested arrays", DEEP), ("nested objects", DEEP_OBJECT), ("a number of 5,000 digits", b'{"format": ' + b"9" * 5000 + b"}"), ("an infinite range", b'{"min_range_m": -Infinity}'), ("bytes", bytes(range(256))), ("deep classes", b'{"classes": ' + DEEP_OBJECT + b"}"), ("classes of other types", b'{"classes": {"name": [1], "names": {"x": {}}, "colors": 7}}'), ("nothing", b"")],
+        "carlasc.json": [("nested arrays", DEEP), ("nested objects", DEEP_OBJECT), ("a number of "
+                                                                                    "5,000 digits", b'{"format": ' + b"9" * 5000 + b"}"), ("an infinite range", b'{"min_range_m": -Infinity}'), ("bytes", bytes(range(256))), ("deep classes", b'{"classes": ' + DEEP_OBJECT + b"}"), ("classes of other types", b'{"classes": {"name": [1], "names": {"x": {}}, "colors": 7}}'), ("nothing", b"")],
         "evaluation/params.json": [
             (what, json.dumps(spec | change).encode())
             for what, change in {
@@ -245,7 +282,8 @@ def _captures(base: Path) -> Iterator[Case]:
         "has a deep header": npy(header="-" * 9000 + "1"),
         "claims 10^15 points": npy(header=header("<f4", (10**15, 3)), values=bytes(120)),
         "has negative numbers of points": npy(header=header("<f4", (-10, 3)), values=bytes(120)),
-        "has a dictionary of types": npy(header="{'descr': {'names': ['a'], 'formats': ['O']}, 'fortran_order': False, 'shape': (1, 3), }"),
+        "has a dictionary of types": npy(header="{'descr': {'names': ['a'], 'formats': ['O']}, "
+                                                "'fortran_order': False, 'shape': (1, 3), }"),
     }  # fmt: skip
     for name, content in table.items():
         change = lambda path, content=content: path.write_bytes(content)  # noqa: E731
@@ -255,7 +293,10 @@ def _captures(base: Path) -> Iterator[Case]:
             "regrid drive -o out --size 8,8,4 --workers 1",
             "100.npy",
         )
-    times = lambda path: path.write_text("9" * 6000 + ", Timestamp(frame=1, elapsed_seconds=1e1e1)\n")  # noqa: E731
+
+    def times(path):
+        return path.write_text("9" * 6000 + ", Timestamp(frame=1, elapsed_seconds=1e1e1)\n")
+
     yield Case(
         "times of a capture with 6,000 digits",
         edit(base, "Town01/cartesian/raw/times0.txt", times, "drive"),
@@ -287,7 +328,9 @@ def link_zip(target: str) -> bytes:
 
 def scans_zip(extra: dict[str, bytes]) -> bytes:
     """Return a zip of a sequence of two scans, and other members."""
-    return archive({f"Val/Town07_Light/cartesian/velodyne/{k:06d}.bin": bytes(160) for k in range(2)} | extra)
+    return archive(
+        {f"Val/Town07_Light/cartesian/velodyne/{k:06d}.bin": bytes(160) for k in range(2)} | extra
+    )
 
 
 def overwritten(data: bytes, offset: int, value: bytes) -> bytes:
@@ -303,7 +346,9 @@ def bomb_zip(size: int) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as made:
         made.writestr("Val/Town07_Light/cartesian/velodyne/000000.bin", bytes(160))
-        with made.open("Val/Town07_Light/cartesian/velodyne/000001.bin", "w", force_zip64=True) as member:
+        with made.open(
+            "Val/Town07_Light/cartesian/velodyne/000001.bin", "w", force_zip64=True
+        ) as member:
             for _ in range(size >> 24):
                 member.write(bytes(1 << 24))
     return buffer.getvalue()
@@ -353,10 +398,26 @@ def _names(base: Path) -> Iterator[Case]:
 
         return make
 
-    for kind, name in {"terminal codes": ESCAPE, "HTML": HTML.replace("/", ""), "markup": "[/bold][red]"}.items():
-        for command in ("info data", "validate data", "stats data", "unpack data out", "pack data out.h5"):
-            yield Case(f"names with {kind} in {command.split()[0]}", name_it(name), command, harmless=True)
-    for command in ("view data -o out.html --frames 2:6", "stats data --plot out.svg", "report data --html out.html"):
+    for kind, name in {
+        "terminal codes": ESCAPE,
+        "HTML": HTML.replace("/", ""),
+        "markup": "[/bold][red]",
+    }.items():
+        for command in (
+            "info data",
+            "validate data",
+            "stats data",
+            "unpack data out",
+            "pack data out.h5",
+        ):
+            yield Case(
+                f"names with {kind} in {command.split()[0]}", name_it(name), command, harmless=True
+            )
+    for command in (
+        "view data -o out.html --frames 2:6",
+        "stats data --plot out.svg",
+        "report data --html out.html",
+    ):
         yield Case(
             f"names with HTML in {command}",
             name_it(HTML.replace("/", "")),

@@ -1,4 +1,6 @@
-"""Hostile servers: what they send is refused, and nothing that they say leads to other files, to other hosts with credentials, or to no end."""
+"""Hostile servers: what they send is refused, and nothing that they say leads to other files, to
+other hosts with credentials, or to no end.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,11 @@ from faults.hostile import Case
 from faults.hostile_files import Content, hostile_zips, made, scans_zip
 
 DOWNLOAD = "download out --split val --extract --base-url {url}"
-QUICK = (("CARLASC_REMOTE_ATTEMPTS", "2"), ("CARLASC_REMOTE_BACKOFF_S", "0.01"), ("CARLASC_REMOTE_TIMEOUT_S", "2"))
+QUICK = (
+    ("CARLASC_REMOTE_ATTEMPTS", "2"),
+    ("CARLASC_REMOTE_BACKOFF_S", "0.01"),
+    ("CARLASC_REMOTE_TIMEOUT_S", "2"),
+)
 Answer = Callable[[BaseHTTPRequestHandler], None]
 
 
@@ -28,7 +34,9 @@ def cases() -> Iterator[Case]:
 
 
 def serving(answer: Answer, path: str = "") -> Callable[[Path], AbstractContextManager[str]]:
-    """Return a function that runs a server in a process of its own, whose every answer is `answer`'s, and yields its address."""
+    """Return a function that runs a server in a process of its own, whose every answer is
+    `answer`'s, and yields its address.
+    """
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -86,7 +94,14 @@ def sent(content: Content) -> Answer:
             first, last = (int(number) for number in wanted.removeprefix("bytes=").split("-"))
             body = content[first : last + 1]
             span = f"bytes {first}-{first + len(body) - 1}/{len(content)}"
-            head(handler, 206, Content_Length=str(len(body)), Content_Range=span, ETag='"1"', Accept_Ranges="bytes")
+            head(
+                handler,
+                206,
+                Content_Length=str(len(body)),
+                Content_Range=span,
+                ETag='"1"',
+                Accept_Ranges="bytes",
+            )
         if handler.command == "GET":
             handler.wfile.write(body)
 
@@ -98,7 +113,9 @@ def redirect(place: str) -> Answer:
     return lambda handler: head(handler, 302, Location=place, Content_Length="0")
 
 
-def endless(first: bytes = b"", pause_s: float = 0.0, piece: int = 1 << 20, **headers: str) -> Answer:
+def endless(
+    first: bytes = b"", pause_s: float = 0.0, piece: int = 1 << 20, **headers: str
+) -> Answer:
     """Return answers whose body has no end."""
 
     def answer(handler: BaseHTTPRequestHandler) -> None:
@@ -113,7 +130,13 @@ def endless(first: bytes = b"", pause_s: float = 0.0, piece: int = 1 << 20, **he
 
 def _downloads() -> Iterator[Case]:
     for name, content in hostile_zips().items():
-        yield Case(f"download of a zip with {name}", _nothing, DOWNLOAD, "val_cartesian.zip", serving(sent(content)))
+        yield Case(
+            f"download of a zip with {name}",
+            _nothing,
+            DOWNLOAD,
+            "val_cartesian.zip",
+            serving(sent(content)),
+        )
     whole = scans_zip({})
     answers: dict[str, Answer] = {
         "that redirects to a file": redirect("file:///etc/passwd"),
@@ -122,7 +145,8 @@ def _downloads() -> Iterator[Case]:
         "that redirects to no host": redirect("http://"),
         "that redirects in a circle": redirect("/val_cartesian.zip"),
         "that claims 10^17 bytes": lambda handler: (
-            head(handler, 206, Content_Range=f"bytes 0-1/{10**17}", Content_Length="2") or handler.wfile.write(b"PK")
+            head(handler, 206, Content_Range=f"bytes 0-1/{10**17}", Content_Length="2")
+            or handler.wfile.write(b"PK")
         ),
         "that sends a page": sent(b"<html>\x1b[2J</html>"),
         "that sends PK and no zip": sent(b"PK" + bytes(5000)),
@@ -172,7 +196,12 @@ def _remote() -> Iterator[Case]:
     }  # fmt: skip
     for name, (answer, path) in answers.items():
         yield Case(
-            f"a server {name}", _nothing, "unpack {url} out", "127.0.0.1", serving(answer, path), environment=QUICK
+            f"a server {name}",
+            _nothing,
+            "unpack {url} out",
+            "127.0.0.1",
+            serving(answer, path),
+            environment=QUICK,
         )
     serve = _with_password(serving(_leak, "/x.zarr"))
     yield Case(

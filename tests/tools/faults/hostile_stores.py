@@ -1,4 +1,6 @@
-"""Hostile packed stores: zarr, HDF5 and Parquet, made from stores of ours by changing what a reader believes."""
+"""Hostile packed stores: zarr, HDF5 and Parquet, made from stores of ours by changing what a reader
+believes.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +87,10 @@ def _grow(root: Json) -> None:
 
 
 def _zarr(base: Path) -> Iterator[Case]:
-    inner, outer = ("codecs", 0, "configuration", "chunk_shape"), ("chunk_grid", "configuration", "chunk_shape")
+    inner, outer = (
+        ("codecs", 0, "configuration", "chunk_shape"),
+        ("chunk_grid", "configuration", "chunk_shape"),
+    )
     changes: dict[str, Callable[[Json], object]] = {
         "a shape of 10^15 frames": _set(POINTS, "shape", value=[10**15, 3, 1 << 18]),
         "a shape of 10^15 elements": _set(POINTS, "shape", value=[16, 3, 10**15]),
@@ -125,17 +130,22 @@ def _zarr(base: Path) -> Iterator[Case]:
         "attributes that are no object": lambda root: root.update(attributes=[1]),
     }  # fmt: skip
     for name in NAMES:
-        changes[f"a sequence in {name!r}"] = _set("", "attributes", "sequences", value={WHOLE: name})
-        changes[f"a sequence called {name!r}"] = _set("", "attributes", "sequences", value={name: WHOLE})
+        changes[f"a sequence in {name!r}"] = _set(
+            "", "attributes", "sequences", value={WHOLE: name}
+        )
+        changes[f"a sequence called {name!r}"] = _set(
+            "", "attributes", "sequences", value={name: WHOLE}
+        )
         changes[f"a field {name!r}"] = _set(WHOLE, "attributes", "fields", value=[f"{name}/labels"])
         changes[f"a text file {name!r}"] = _set(WHOLE, "attributes", "documents", value=[name])
     for what, change in changes.items():
+        # no byte more is read than the frames have
         unread = what in (
             "a shape of 10^15 frames",
             "frames in 10^12 elements",
             "a block of 10^18 frames",
             "a block that is text",
-        )  # no byte more is read than the frames have
+        )
         yield Case(
             f"zarr with {what}",
             edit(base, "zarr.json", _changed(change), "x.zarr"),
@@ -150,7 +160,12 @@ def _zarr(base: Path) -> Iterator[Case]:
         "a list": b"[]",
     }.items():
         write = lambda path, content=content: path.write_bytes(content)  # noqa: E731
-        yield Case(f"zarr.json with {what}", edit(base, "zarr.json", write, "x.zarr"), "info x.zarr", "x.zarr")
+        yield Case(
+            f"zarr.json with {what}",
+            edit(base, "zarr.json", write, "x.zarr"),
+            "info x.zarr",
+            "x.zarr",
+        )
     shard = f"{POINTS}/c/0/0/0"
     for what, spoil in {
         "offsets beyond the file": lambda table: table.__setitem__(
@@ -159,12 +174,22 @@ def _zarr(base: Path) -> Iterator[Case]:
         "lengths of 2^62 bytes": lambda table: table.__setitem__(
             (..., 1), np.where(table[:, 1] < 2**63, 2**62, table[:, 1])
         ),
-        "offsets and lengths that overflow": lambda table: table.__setitem__((table[:, 0] < 2**63), 2**64 - 2),
+        "offsets and lengths that overflow": lambda table: table.__setitem__(
+            (table[:, 0] < 2**63), 2**64 - 2
+        ),
     }.items():
-        yield Case(f"zarr shard with {what}", edit(base, shard, _index(spoil), "x.zarr"), "unpack x.zarr out", "x.zarr")
+        yield Case(
+            f"zarr shard with {what}",
+            edit(base, shard, _index(spoil), "x.zarr"),
+            "unpack x.zarr out",
+            "x.zarr",
+        )
     for what, content in _chunks().items():
         yield Case(
-            f"zarr chunk that {what}", edit(base, shard, _first_chunk(content), "x.zarr"), "unpack x.zarr out", "x.zarr"
+            f"zarr chunk that {what}",
+            edit(base, shard, _first_chunk(content), "x.zarr"),
+            "unpack x.zarr out",
+            "x.zarr",
         )
     for what, content in {"is no PCodec": b"\xff" * 64, "is empty": b""}.items():
         yield Case(
@@ -175,7 +200,10 @@ def _zarr(base: Path) -> Iterator[Case]:
         )
     links = lambda path: (path.unlink(), path.symlink_to("/dev/zero"))  # noqa: E731
     yield Case(
-        "zarr shard that is an endless device", edit(base, shard, links, "x.zarr"), "unpack x.zarr out", "x.zarr"
+        "zarr shard that is an endless device",
+        edit(base, shard, links, "x.zarr"),
+        "unpack x.zarr out",
+        "x.zarr",
     )
 
 
@@ -190,7 +218,11 @@ def _index(spoil: Callable[[np.ndarray], object]) -> Callable[[Path], None]:
 
     def change(path: Path) -> None:
         data = path.read_bytes()
-        slots = next(n for n in range(1, len(data) // 16) if _with_checksum(data[: 16 * n]) == data[: 16 * n + 4])
+        slots = next(
+            n
+            for n in range(1, len(data) // 16)
+            if _with_checksum(data[: 16 * n]) == data[: 16 * n + 4]
+        )
         table = np.frombuffer(data[: 16 * slots], "<u8").reshape(-1, 2).copy()
         spoil(table)
         path.write_bytes(_with_checksum(table.tobytes()) + data[16 * slots + 4 :])
@@ -277,7 +309,9 @@ def _hdf5(base: Path) -> Iterator[Case]:
         plan[:] = h5py.VirtualSource("other.h5", "secret", (28,))
         file.create_virtual_dataset(node, plan)
 
-    def late(shape: tuple[int, ...], dtype: str = "<i8", **options: Any) -> Callable[[Any, str], object]:
+    def late(
+        shape: tuple[int, ...], dtype: str = "<i8", **options: Any
+    ) -> Callable[[Any, str], object]:
         return lambda file, node: file.create_dataset(node, shape, dtype, **options)
 
     def bomb(file: Any, node: str) -> None:
@@ -328,21 +362,29 @@ def _parquet(base: Path) -> Iterator[Case]:
     import pyarrow as pa
     from pyarrow import parquet
 
-    def table(change: Callable[[Path, Json], object], name: str = "labels") -> Callable[[Path], None]:
+    def table(
+        change: Callable[[Path, Json], object], name: str = "labels"
+    ) -> Callable[[Path], None]:
         def write(path: Path) -> None:
             change(path, json.loads(parquet.ParquetFile(path).metadata.metadata[b"carlasc"]))
             seal_tables(path.parent)
 
         return edit(base, f"{WHOLE}/{name}.parquet", write, "x.parquet")
 
-    def rewritten(columns: dict[str, Any], groups: int = 1, **about: Any) -> Callable[[Path, Json], None]:
+    def rewritten(
+        columns: dict[str, Any], groups: int = 1, **about: Any
+    ) -> Callable[[Path, Json], None]:
         def write(path: Path, found: Json) -> None:
             content = pa.table(columns)
             with parquet.ParquetWriter(path, content.schema, compression="zstd") as writer:
                 for _ in range(groups):
                     writer.write_table(content, row_group_size=len(content))
                 writer.add_key_value_metadata(
-                    {"carlasc": json.dumps({**found, **about}) if "raw" not in about else about["raw"]}
+                    {
+                        "carlasc": json.dumps({**found, **about})
+                        if "raw" not in about
+                        else about["raw"]
+                    }
                 )
 
         return write
@@ -360,7 +402,9 @@ def _parquet(base: Path) -> Iterator[Case]:
         "frames of 10^30": rewritten(one, frames=[10**30], rows=[1]),
         "fewer row groups than frames": rewritten(one, frames=[0, 1, 2, 5], rows=[1, 1, 1, 1]),
         "10^15 rows": rewritten(one, frames=[0], rows=[10**15]),
-        "16 groups of 16 million zeros, and other numbers of rows": rewritten(zeros, 2, frames=[0, 1], rows=[1, 1]),
+        "16 groups of 16 million zeros, and other numbers of rows": rewritten(
+            zeros, 2, frames=[0, 1], rows=[1, 1]
+        ),
         "text in the place of labels": rewritten(one | {"label": pa.array(["a"])}, **rows),
         "no labels": rewritten({"frame": pa.array([0])}, **rows),
         "nested labels": rewritten(one | {"label": pa.array([[1]])}, **rows),
@@ -376,7 +420,10 @@ def _parquet(base: Path) -> Iterator[Case]:
     }.items():  # fmt: skip
         write = lambda path, content=content: path.write_bytes(content)  # noqa: E731
         yield Case(
-            f"sequence.json with {what}", edit(base, sequence, write, "x.parquet"), "unpack x.parquet out", "cartesian"
+            f"sequence.json with {what}",
+            edit(base, sequence, write, "x.parquet"),
+            "unpack x.parquet out",
+            "cartesian",
         )
     documents = f"{WHOLE}/documents.parquet"
     huge = pa.table({"name": ["poses.txt"], "data": pa.array([bytes(1 << 27)], pa.binary())})
@@ -394,7 +441,10 @@ def _parquet(base: Path) -> Iterator[Case]:
         "unpack x.parquet out",
         "documents.parquet",
     )
-    link = lambda path: path.write_bytes(b"PAR1" + b"\xff" * 100 + struct.pack("<I", 2**31 - 1) + b"PAR1")  # noqa: E731
+
+    def link(path):
+        return path.write_bytes(b"PAR1" + b"\xff" * 100 + struct.pack("<I", 2**31 - 1) + b"PAR1")
+
     yield Case(
         "a Parquet footer of 2 GB",
         edit(base, documents, link, "x.parquet"),

@@ -42,5 +42,9 @@ def cases() -> Iterator[Case]:
     }
     for name, content in table.items():
         yield Case(
-            f"a checkpoint {name}", lambda work, content=content: put(work / "net.pt", content), "", "net.pt", read=read
+            f"a checkpoint {name}",
+            lambda work, content=content: put(work / "net.pt", content),
+            "",
+            "net.pt",
+            read=read,
         )

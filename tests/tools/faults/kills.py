@@ -1,4 +1,6 @@
-"""Commands that are ended at random moments, and run again until they finish: the result is that of an undisturbed run."""
+"""Commands that are ended at random moments, and run again until they finish: the result is that of
+an undisturbed run.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +17,36 @@ from pathlib import Path
 import numpy as np
 
 from faults.commands import COMMANDS, MESSAGES, Command, run_command, start, wait, warm
-from faults.comparing import STORES, Content, arrays_of, changed, content_of, differences, wrong_arrays
+from faults.comparing import (
+    STORES,
+    Content,
+    arrays_of,
+    changed,
+    content_of,
+    differences,
+    wrong_arrays,
+)
 from faults.outcome import Outcome
 from faults.trying import try_commands
 
 SIGNALS, SHARES = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT), (0.7, 0.15, 0.15)
-ENDINGS, ENDING_SHARES = (1, 2, 3), (0.6, 0.3, 0.1)  # how often a command is ended before it may finish
-SLOW = (
-    10  # a command that starts processes of its own takes so many times as long, and is ended so many times less often
+# how often a command is ended before it may finish
+ENDINGS, ENDING_SHARES = (
+    (1, 2, 3),
+    (0.6, 0.3, 0.1),
 )
+# a command that starts processes of its own takes so many times as long, and is ended so many times
+# less often
+SLOW = 10
 GRACE_S = 15.0  # within which the workers of a killed process end
-GROWING = ("times.txt", "poses.txt", "times0.txt", "times1.txt", "carlasc-report.json", "sequence.json")
+GROWING = (
+    "times.txt",
+    "poses.txt",
+    "times0.txt",
+    "times1.txt",
+    "carlasc-report.json",
+    "sequence.json",
+)
 
 
 def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None) -> Outcome:
@@ -33,12 +54,16 @@ def run(count: int, seed: int, folder: Path, names: Sequence[str] | None = None)
 
     Args:
         count: number of moments.
-        seed: of the random numbers. The same seed ends the same commands at the same shares of their time.
-        folder: an empty folder to work in. The folders of commands for which something was found stay there.
+        seed: of the random numbers. The same seed ends the same commands at the same shares of
+            their time.
+        folder: an empty folder to work in. The folders of commands for which something was found
+            stay there.
         names: only these commands.
     """
     began = time.monotonic()
-    tried, found = try_commands(_try_command, _shares(list(names or COMMANDS), count, seed), seed, folder)
+    tried, found = try_commands(
+        _try_command, _shares(list(names or COMMANDS), count, seed), seed, folder
+    )
     return Outcome("kills", tried, found, time.monotonic() - began)
 
 
@@ -69,7 +94,9 @@ class Undisturbed:
     seconds: float
 
 
-def _try_command(command: Command, count: int, seed: int, base: Path, work: Path) -> tuple[int, list[str]]:
+def _try_command(
+    command: Command, count: int, seed: int, base: Path, work: Path
+) -> tuple[int, list[str]]:
     warm(command, base, work / "warm")
     case = work / "case"
     undisturbed = run_undisturbed(command, base, case)
@@ -88,7 +115,9 @@ def run_undisturbed(command: Command, base: Path, case: Path) -> Undisturbed:
         command.copy_inputs(base, case)
         before, began = content_of(case), time.monotonic()
         if code := run_command(command, case):
-            raise RuntimeError(f"exit code {code} without a disturbance: {(case / MESSAGES).read_text()}")
+            raise RuntimeError(
+                f"exit code {code} without a disturbance: {(case / MESSAGES).read_text()}"
+            )
         seconds.append(time.monotonic() - began)
         after = content_of(case)
     output = case / command.output
@@ -100,7 +129,9 @@ def run_undisturbed(command: Command, base: Path, case: Path) -> Undisturbed:
 def _try_case(
     command: Command, seed: int, number: int, base: Path, case: Path, undisturbed: Undisturbed
 ) -> tuple[int, list[str]]:
-    """End a command one to three times, then let it finish; returns how often it was ended, and what is wrong."""
+    """End a command one to three times, then let it finish; returns how often it was ended, and
+    what is wrong.
+    """
     rng = np.random.default_rng([seed, zlib.crc32(command.name.encode()), number])
     shutil.rmtree(case, ignore_errors=True)
     command.copy_inputs(base, case)
@@ -114,13 +145,17 @@ def _try_case(
         ended += code != 0
         story.append(f"{chosen.name} at {moment:.3f} s")
         if lived_on:
-            faults.append(f"{lived_on} processes live on {GRACE_S:g} s after the main process ended")
+            faults.append(
+                f"{lived_on} processes live on {GRACE_S:g} s after the main process ended"
+            )
         if code not in (0, -chosen, *([130] if chosen == signal.SIGINT else [])):
             faults.append(f"exit code {code} after {chosen.name}: {_messages(case)}")
         found = content_of(case)
         faults += torn(found, case, command, undisturbed)
         if chosen == signal.SIGINT:
-            faults += [f"{name} is left by Ctrl-C" for name in found.keys() - before if _is_temporary(name)]
+            faults += [
+                f"{name} is left by Ctrl-C" for name in found.keys() - before if _is_temporary(name)
+            ]
         finished = not differences(undisturbed.after, found)
         if code == 0 or finished:
             break
@@ -134,8 +169,12 @@ def _try_case(
     return ended, [f"{fault} ({', '.join(story)})" for fault in faults]
 
 
-def _end(command: Command, case: Path, chosen: signal.Signals, moment: float, whole: bool) -> tuple[int, int]:
-    """Start a command and send a signal to it, or to its whole process group; returns its exit code and how many processes live on."""
+def _end(
+    command: Command, case: Path, chosen: signal.Signals, moment: float, whole: bool
+) -> tuple[int, int]:
+    """Start a command and send a signal to it, or to its whole process group; returns its exit code
+    and how many processes live on.
+    """
     child = start(command.argv, case)
     time.sleep(moment)
     with suppress(ProcessLookupError):  # it has finished
@@ -169,12 +208,18 @@ def _living(group: int) -> int:
 
 
 def torn(found: Content, case: Path, command: Command, undisturbed: Undisturbed) -> list[str]:
-    """Describe what can be read of an unfinished output and is neither as before the run nor as after it."""
+    """Describe what can be read of an unfinished output and is neither as before the run nor as
+    after it.
+    """
     if Path(command.output).suffix in STORES:
         return [f"torn: {line}" for line in wrong_arrays(case / command.output, undisturbed.arrays)]
-    now = {name: data for name, data in found.items() if data != undisturbed.before.get(name, b"\0")}
+    now = {
+        name: data for name, data in found.items() if data != undisturbed.before.get(name, b"\0")
+    }
     return [
-        f"torn: {line}" for line in changed(undisturbed.after, now) if Path(line.split(" has ")[0]).name not in GROWING
+        f"torn: {line}"
+        for line in changed(undisturbed.after, now)
+        if Path(line.split(" has ")[0]).name not in GROWING
     ]
 
 

@@ -1,8 +1,10 @@
-"""Damaged files: every reader is given files with random changes, and may raise nothing but a CarlascError of one line.
+"""Damaged files: every reader is given files with random changes, and may raise nothing but a
+CarlascError of one line.
 
-A child process reads thousands of cases, one after the other, with a limit of memory and of time for each; the parent learns of its
-death. Compiled loops check each index, as one out of bounds may do damage that no error shows. Case `number` of a target depends on the
-seed, the target and the number alone: `python -m faults.mutations TARGET SEED NUMBER` repeats one.
+A child process reads thousands of cases, one after the other, with a limit of memory and of time
+for each; the parent learns of its death. Compiled loops check each index, as one out of bounds may
+do damage that no error shows. Case `number` of a target depends on the seed, the target and the
+number alone: `python -m faults.mutations TARGET SEED NUMBER` repeats one.
 """
 
 from __future__ import annotations
@@ -44,24 +46,39 @@ MEMORY = 1 << 30
 """Bytes of address space that reading a case may take beyond what reading the whole files took."""
 LONGEST = 1000
 """Characters of a message."""
+# categories of characters that end a line or that a terminal obeys, and halves of characters
 _OBEYED = (
     "Cc",
     "Zl",
     "Zp",
     "Cs",
-)  # categories of characters that end a line or that a terminal obeys, and halves of characters
-_TURNED = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # those that turn the direction of writing
+)
+# those that turn the direction of writing
+_TURNED = (
+    "LRE",
+    "RLE",
+    "LRO",
+    "RLO",
+    "PDF",
+    "LRI",
+    "RLI",
+    "FSI",
+    "PDI",
+)
 _ROOT = Path(__file__).parents[3]
 _CHECKING = {
     "NUMBA_BOUNDSCHECK": "1",
-    "NUMBA_CACHE_DIR": str(_ROOT / "build" / "checked-loops"),  # apart from the loops that check nothing
+    # apart from the loops that check nothing
+    "NUMBA_CACHE_DIR": str(_ROOT / "build" / "checked-loops"),
     "OMP_NUM_THREADS": "1",
 }
 _FOUND, _UNREADABLE = "found.txt", "the files cannot be read"
 
 
 class Progress:
-    """Which case a child has reached, and since when, in memory that it shares with its parent: two numbers, each written at once."""
+    """Which case a child has reached, and since when, in memory that it shares with its parent: two
+    numbers, each written at once.
+    """
 
     def __init__(self) -> None:
         self._values = memoryview(mmap.mmap(-1, mmap.PAGESIZE)).cast("q")
@@ -82,7 +99,10 @@ class Progress:
 
 
 class TookTooLongError(BaseException):
-    """A case took longer than `CASE_S`. It is no Exception, so that no reader takes it for one of its own."""
+    """A case took longer than `CASE_S`.
+
+    It is no Exception, so that no reader takes it for one of its own.
+    """
 
 
 class Reading:
@@ -92,7 +112,10 @@ class Reading:
         self.names, self.refused, self.complaint, self.first = names, 0, "", ""
 
     def attempt(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a reader; return what it returns, or None if it refuses with an error of ours. Any other error goes on."""
+        """Call a reader; return what it returns, or None if it refuses with an error of ours.
+
+        Any other error goes on.
+        """
         try:
             return function(*arguments)
         except CarlascError as error:
@@ -103,18 +126,22 @@ class Reading:
 
     def _check(self, message: str, error: CarlascError) -> None:
         if any(
-            unicodedata.category(character) in _OBEYED or unicodedata.bidirectional(character) in _TURNED
+            unicodedata.category(character) in _OBEYED
+            or unicodedata.bidirectional(character) in _TURNED
             for character in message
         ):
             self.complaint = f"a message that is not one line of printable text: {message[:200]!r} {_place_of(error)}"
         elif len(message) > LONGEST:
-            self.complaint = f"a message of {len(message)} characters: {message[:100]!r} {_place_of(error)}"
+            self.complaint = (
+                f"a message of {len(message)} characters: {message[:100]!r} {_place_of(error)}"
+            )
         elif not any(name in message for name in self.names):
             self.complaint = f"a message that names no file: {message[:200]!r} {_place_of(error)}"
 
 
 def run(count: int, seed: int, folder: Path) -> Outcome:
-    """Read `count` damaged cases, divided among the targets, in as many processes as there are processors.
+    """Read `count` damaged cases, divided among the targets, in as many processes as there are
+    processors.
 
     Args:
         count: number of cases in all.
@@ -130,9 +157,16 @@ def run(count: int, seed: int, folder: Path) -> Outcome:
 
 
 def run_apart(names: str, seed: int, count: int) -> str:
-    """Read cases of some targets in a process of its own, and return what it prints: a line for each, and faults after two spaces."""
+    """Read cases of some targets in a process of its own, and return what it prints: a line for
+    each, and faults after two spaces.
+    """
     command = [sys.executable, "-m", "faults.mutations", names, str(seed), "x", str(count)]
-    paths = [str(_ROOT / "tests"), str(_ROOT / "tests" / "tools"), str(_ROOT / "examples"), *filter(None, sys.path)]
+    paths = [
+        str(_ROOT / "tests"),
+        str(_ROOT / "tests" / "tools"),
+        str(_ROOT / "examples"),
+        *filter(None, sys.path),
+    ]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode not in (0, 1) or done.stdout.count(" cases, ") != len(names.split(",")):
@@ -224,7 +258,8 @@ def _read_cases(target: Target, cases: range, seed: int, place: Path, progress: 
         for number in cases:
             progress.reach(number)
             changes = damage(files, Random(f"{seed}/{target.name}/{number}"))
-            root = root.rename(place / f"case-{number}")  # no reader that keeps something by path can mix cases up
+            # no reader that keeps something by path can mix cases up
+            root = root.rename(place / f"case-{number}")
             fault = read_case(target, root, files, changes)
             kind = fault.partition(" [")[0]
             seen[kind] = seen.get(kind, 0) + 1
@@ -236,10 +271,17 @@ def _read_cases(target: Target, cases: range, seed: int, place: Path, progress: 
     progress.reach(cases.stop)
 
 
-def read_case(target: Target, root: Path, files: Files, changes: Changes, show: bool = False) -> str:
-    """Apply changes to a folder, read it, and undo them. Return what was wrong, with its place in brackets, or ""."""
+def read_case(
+    target: Target, root: Path, files: Files, changes: Changes, show: bool = False
+) -> str:
+    """Apply changes to a folder, read it, and undo them.
+
+    Return what was wrong, with its place in brackets, or "".
+    """
     _apply(root, changes)
-    reading = Reading([str(root.parent), *(path.rstrip("/").rpartition("/")[2] for path in changes)])
+    reading = Reading(
+        [str(root.parent), *(path.rstrip("/").rpartition("/")[2] for path in changes)]
+    )
     try:
         signal.setitimer(signal.ITIMER_REAL, CASE_S)
         try:
@@ -259,10 +301,14 @@ def read_case(target: Target, root: Path, files: Files, changes: Changes, show: 
 
 
 def limit_memory(more: int) -> None:
-    """Limit this process's address space to what it has now and some bytes more; only where the system says what it has."""
+    """Limit this process's address space to what it has now and some bytes more; only where the
+    system says what it has.
+    """
     with contextlib.suppress(FileNotFoundError):
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + more, resource.RLIM_INFINITY))
+        resource.setrlimit(
+            resource.RLIMIT_AS, (pages * resource.getpagesize() + more, resource.RLIM_INFINITY)
+        )
 
 
 def stop(number: int, frame: FrameType | None) -> None:
@@ -271,13 +317,16 @@ def stop(number: int, frame: FrameType | None) -> None:
 
 
 def _place_of(error: BaseException) -> str:
-    """Return the last line of the package in an error's traceback: "[carlasc/storage/layout.py:12]"."""
+    """Return the last line of the package in an error's traceback:
+    "[carlasc/storage/layout.py:12]".
+    """
     own, last = "", ""
     for step in traceback.extract_tb(error.__traceback__):
         last = f"[{Path(step.filename).name}:{step.lineno}]"
         for package in ("carlasc", "carlasc_converters", "completion"):
             parts = Path(step.filename).parts
-            if package in parts[:-1] and not {"site-packages", "tests"} & {*parts}:  # a checkout may be named after it
+            # a checkout may be named after it
+            if package in parts[:-1] and not {"site-packages", "tests"} & {*parts}:
                 own = f"[{'/'.join(parts[len(parts) - 1 - parts[::-1].index(package) :])}:{step.lineno}]"
     return own or last
 
@@ -302,7 +351,9 @@ def _kind_of(line: str) -> str:
 def load(folder: Path) -> Files:
     """Return the files of a folder."""
     return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
     }
 
 
@@ -341,9 +392,15 @@ def _place_in_memory(folder: Path) -> Iterator[Path]:
 
 
 def main() -> int:
-    """Repeat one case, `python -m faults.mutations TARGET SEED NUMBER`, or run many: `TARGET,...|all SEED x COUNT`."""
+    """Repeat one case, `python -m faults.mutations TARGET SEED NUMBER`, or run many:
+    `TARGET,...|all SEED x COUNT`.
+    """
     if not _CHECKING.items() <= os.environ.items():
-        os.execve(sys.executable, [sys.executable, "-m", "faults.mutations", *sys.argv[1:]], os.environ | _CHECKING)
+        os.execve(
+            sys.executable,
+            [sys.executable, "-m", "faults.mutations", *sys.argv[1:]],
+            os.environ | _CHECKING,
+        )
     faults = 0
     names, seed, many = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "x"
     chosen = [target for target in TARGETS if names == "all" or target.name in names.split(",")]
@@ -355,7 +412,8 @@ def main() -> int:
                 faults += len(found)
                 rate = tried / (time.monotonic() - started)
                 print(
-                    f"{target.name}: {tried} cases, {rate:.0f} a second, {len(found)} kinds of faults",
+                    f"{target.name}: {tried} cases, {rate:.0f} a second, {len(found)} kinds of "
+                    f"faults",
                     *found,
                     sep="\n  ",
                     flush=True,
@@ -370,7 +428,12 @@ def _repeat(target: Target, seed: int, number: int, folder: Path) -> None:
     files = load(folder / "valid")
     changes = damage(files, Random(f"{seed}/{target.name}/{number}"))
     for path, data in changes.items():
-        print(path, "removed" if data is None else f"{len(files.get(path, b''))} to {len(data)} bytes: {data[:300]!r}")
+        print(
+            path,
+            "removed"
+            if data is None
+            else f"{len(files.get(path, b''))} to {len(data)} bytes: {data[:300]!r}",
+        )
     signal.signal(signal.SIGALRM, stop)
     print(read_case(target, folder / "valid", files, changes, show=True))
 

@@ -1,4 +1,6 @@
-"""The library of calls.c: built with the machine's C compiler, loaded before the C library, and armed from Python."""
+"""The library of calls.c: built with the machine's C compiler, loaded before the C library, and
+armed from Python.
+"""
 
 from __future__ import annotations
 
@@ -48,13 +50,24 @@ def run_module(module: str, arguments: list[str], folder: Path) -> None:
         RuntimeError: it fails; with what it said.
     """
     library = folder / "calls.so"
-    subprocess.run(["cc", "-O1", "-shared", "-fPIC", "-o", library, SOURCE, "-lpthread"], check=True)
-    environment = os.environ | {"LD_PRELOAD": str(library), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    subprocess.run(
+        ["cc", "-O1", "-shared", "-fPIC", "-o", library, SOURCE, "-lpthread"], check=True
+    )
+    environment = os.environ | {
+        "LD_PRELOAD": str(library),
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
     done = subprocess.run(
-        [sys.executable, "-m", module, *arguments], env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-m", module, *arguments],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
-        raise RuntimeError(f"{module}: exit code {done.returncode}: {done.stdout[-2000:]} {done.stderr[-4000:]}")
+        raise RuntimeError(
+            f"{module}: exit code {done.returncode}: {done.stdout[-2000:]} {done.stderr[-4000:]}"
+        )
 
 
 def count_calls(folder: Path, kinds: Kind = ALL) -> None:
@@ -85,7 +98,9 @@ def counted_calls() -> int:
 
 
 def failed_call() -> tuple[Kind, str] | None:
-    """Return the kind and the path of the first call that failed, in this process or in its forked child; None if none did."""
+    """Return the kind and the path of the first call that failed, in this process or in its forked
+    child; None if none did.
+    """
     library = ctypes.CDLL(None)
     library.faults_failed_path.restype = ctypes.c_char_p
     path = library.faults_failed_path().decode()

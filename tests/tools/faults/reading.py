@@ -1,4 +1,7 @@
-"""All calls that read a kind of input, as users make them. `attempt` calls a reader and takes the errors that carlasc raises on purpose."""
+"""All calls that read a kind of input, as users make them.
+
+`attempt` calls a reader and takes the errors that carlasc raises on purpose.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,16 @@ from carlasc.storage import Sequence
 from faults.writing import REGRID_SPEC
 
 Attempt = Callable[..., Any]
-"""`attempt(function, *arguments)` returns what a reader returns, or None where it refuses with an error of ours."""
+"""`attempt(function, *arguments)` returns what a reader returns, or None where it refuses with an
+error of ours.
+"""
 
 
 def the_only(root: Path) -> Path:
     """Return the store in a folder that holds nothing else; the folder itself where it is gone."""
-    return next((path for path in sorted(root.iterdir()) if path.name.startswith(("data", "store"))), root)
+    return next(
+        (path for path in sorted(root.iterdir()) if path.name.startswith(("data", "store"))), root
+    )
 
 
 def read_stored(root: Path, attempt: Attempt) -> None:
@@ -80,11 +87,26 @@ def check_source(root: Path, attempt: Attempt) -> None:
 
 def train_on(root: Path, attempt: Attempt) -> None:
     """Read every sample of a data set for training: scans and grids, and grids with their evidence."""
-    scans = ("occupancy", "visibility", "labels", "known", "counts", "points", "point_labels", "flow", "poses")
+    scans = (
+        "occupancy",
+        "visibility",
+        "labels",
+        "known",
+        "counts",
+        "points",
+        "point_labels",
+        "flow",
+        "poses",
+    )
     evidence = ("labels", "known", "posterior", "occupied", "flags", "views")
-    for split, coordinates, fields in (("Train", "cartesian", scans), ("Test", "cylindrical", evidence)):
+    for split, coordinates, fields in (
+        ("Train", "cartesian", scans),
+        ("Test", "cylindrical", evidence),
+    ):
         options = {"history": 2, "coordinates": coordinates, "fields": fields, "remap": None}
-        dataset = attempt(lambda split=split, options=options: carlasc.Dataset(root / split, **options))
+        dataset = attempt(
+            lambda split=split, options=options: carlasc.Dataset(root / split, **options)
+        )
         for index in range(0 if dataset is None else len(dataset)):
             attempt(dataset.__getitem__, index)
 
@@ -106,7 +128,11 @@ def pack_again(root: Path, attempt: Attempt) -> None:
     """Pack a data set into a store of each kind."""
     with tempfile.TemporaryDirectory(dir=root.parent) as out:
         for ending in (".zarr", ".h5", ".parquet"):
-            attempt(lambda ending=ending: carlasc.pack(root, Path(out) / f"a{ending}", run=Run(workers=1)))
+            attempt(
+                lambda ending=ending: carlasc.pack(
+                    root, Path(out) / f"a{ending}", run=Run(workers=1)
+                )
+            )
 
 
 def unpack_again(root: Path, attempt: Attempt) -> None:
@@ -148,7 +174,13 @@ def reader_of(converter: str) -> Callable[[Path, Attempt], None]:
     def read(root: Path, attempt: Attempt) -> None:
         found = attempt(lambda: load_converter(converter)(root).sequences())
         for recording in found or ():
-            for call in (recording.poses, recording.times, recording.boxes, recording.problems, recording.notes):
+            for call in (
+                recording.poses,
+                recording.times,
+                recording.boxes,
+                recording.problems,
+                recording.notes,
+            ):
                 attempt(call)
             for name in ("sensors", "voxels", "vehicle_T_scan"):
                 attempt(getattr, recording, name)
@@ -160,7 +192,9 @@ def reader_of(converter: str) -> Callable[[Path, Attempt], None]:
 
 
 def conversion_of(converter: str) -> Callable[[Path, Attempt], None]:
-    """Return a function that converts another data set: its recordings go through all that follows the reading."""
+    """Return a function that converts another data set: its recordings go through all that follows
+    the reading.
+    """
 
     def read(root: Path, attempt: Attempt) -> None:
         with tempfile.TemporaryDirectory(dir=root.parent) as out:
@@ -227,14 +261,22 @@ def regrid_again(root: Path, attempt: Attempt) -> None:
     with tempfile.TemporaryDirectory(dir=root.parent) as folder:
         copy = shutil.copytree(root, Path(folder) / "copy")
         observe = carlasc.FromScans(window=(-1, 1))
-        attempt(lambda: carlasc.regrid(copy, REGRID_SPEC, observe=observe, name="made", run=Run(workers=1)))
         attempt(
-            lambda: carlasc.regrid(copy, REGRID_SPEC, observe=observe, name="made", overwrite=True, run=Run(workers=1))
+            lambda: carlasc.regrid(
+                copy, REGRID_SPEC, observe=observe, name="made", run=Run(workers=1)
+            )
+        )
+        attempt(
+            lambda: carlasc.regrid(
+                copy, REGRID_SPEC, observe=observe, name="made", overwrite=True, run=Run(workers=1)
+            )
         )
 
 
 def tracks_in(root: Path, attempt: Attempt) -> None:
-    """Read the actors and the poses that regrid keeps, which a run that goes on takes for damaged rather than stop."""
+    """Read the actors and the poses that regrid keeps, which a run that goes on takes for damaged
+    rather than stop.
+    """
     from carlasc.motion.refinement import RefinedPoses
     from carlasc.motion.tracks import MovingActors
 

@@ -1,6 +1,8 @@
-"""`python -m faults.sums FOLDER`: run commands in a new folder, and print a SHA-256 sum of each file that they write, as JSON.
+"""`python -m faults.sums FOLDER`: run commands in a new folder, and print a SHA-256 sum of each
+file that they write, as JSON.
 
-With `--keep` the sums are written to `tests/data/sums.json`, with which every version of Python and every processor is compared.
+With `--keep` the sums are written to `tests/data/sums.json`, with which every version of Python and
+every processor is compared.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ STEPS = {
     "coarse": "regrid grids -o coarse --size 8,8,4 --observe grid --name coarse",
     "convert": f"convert kitti kitti converted {GRID} --force",
     "export": "export kitti grids exported",
-    "simulate": "simulate simulated --count 2 --sensors 2 --channels 8 --points 800 --range 20 --no-bev",
+    "simulate": "simulate simulated --count 2 --sensors 2 --channels 8 --points 800 --range 20 "
+    "--no-bev",
 }
 """What is run, by the name of the step; those after the first read what it wrote."""
 
@@ -71,7 +74,9 @@ def sums_in(folder: Path) -> dict[str, str]:
 
 
 def _of_no_version(path: Path) -> bytes:
-    """Return the bytes of a file without what names a version or a time, or depends on the version of zlib."""
+    """Return the bytes of a file without what names a version or a time, or depends on the version
+    of zlib.
+    """
     data = path.read_bytes()
     if path.name == "carlasc-report.json":
         report = json.loads(data)
@@ -82,7 +87,8 @@ def _of_no_version(path: Path) -> bytes:
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files if name != "about"}
     return b"".join(
-        f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes() for name, array in arrays.items()
+        f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes()
+        for name, array in arrays.items()
     )
 
 

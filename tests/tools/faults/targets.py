@@ -45,9 +45,15 @@ TARGETS = (
     Target("page", writing.write_folder, reading.show),
     Target("pictures", writing.write_few, reading.draw, weight=1),
     Target(
-        "packing", writing.write_folder, reading.pack_again, ("numcodecs", "pcodec", "h5py", "hdf5plugin", "pyarrow"), 2
+        "packing",
+        writing.write_folder,
+        reading.pack_again,
+        ("numcodecs", "pcodec", "h5py", "hdf5plugin", "pyarrow"),
+        2,
     ),
-    Target("unpacking", writing.write_packed(".zarr"), reading.unpack_again, ("numcodecs", "pcodec"), 2),
+    Target(
+        "unpacking", writing.write_packed(".zarr"), reading.unpack_again, ("numcodecs", "pcodec"), 2
+    ),
     Target("exporting", writing.write_few, reading.export_again, ("h5py",), 1),
     Target("regrid-captures", writing.write_capture_files, reading.regrid_captures, weight=4),
     Target("reports", writing.write_regridded, reading.read_reports, weight=4),
@@ -65,7 +71,9 @@ TARGETS = (
         for name, write in foreign.DATA_SETS.items()
     ),
     *(
-        Target(f"convert-{name}", write, reading.conversion_of(name), foreign.PACKAGES.get(name, ()), 2)
+        Target(
+            f"convert-{name}", write, reading.conversion_of(name), foreign.PACKAGES.get(name, ()), 2
+        )
         for name, write in foreign.DATA_SETS.items()
     ),
 )

@@ -1,4 +1,6 @@
-"""Cases that are shared among the commands; each command is tried in a child of its own, which becomes warm."""
+"""Cases that are shared among the commands; each command is tried in a child of its own, which
+becomes warm.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from faults import preload
 from faults.commands import COMMANDS, Command, build_inputs, serving
 
 Try = Callable[[Command, int | None, int, Path, Path], tuple[int, list[str]]]
-"""Tries a command, given the number of cases (None: all), the seed, the folder of inputs and a folder to work in; returns the number and what was found."""
+"""Tries a command, given the number of cases (None: all), the seed, the folder of inputs and a
+folder to work in; returns the number and what was found.
+"""
 
 
 def shares(names: Sequence[str], count: int) -> dict[str, int | None]:
@@ -25,8 +29,13 @@ def shares(names: Sequence[str], count: int) -> dict[str, int | None]:
     return {name: number for name, number in numbers.items() if number}
 
 
-def try_commands(attempt: Try, cases: Mapping[str, int | None], seed: int, folder: Path) -> tuple[int, list[str]]:
-    """Try each command with its number of cases. The folders of commands for which something was found stay in `folder`."""
+def try_commands(
+    attempt: Try, cases: Mapping[str, int | None], seed: int, folder: Path
+) -> tuple[int, list[str]]:
+    """Try each command with its number of cases.
+
+    The folders of commands for which something was found stay in `folder`.
+    """
     build_inputs(folder / "inputs", [COMMANDS[name] for name in cases])
     tried, found = 0, []
     with serving():
@@ -37,7 +46,9 @@ def try_commands(attempt: Try, cases: Mapping[str, int | None], seed: int, folde
     return tried, found
 
 
-def _in_a_child(attempt: Try, command: Command, count: int | None, seed: int, folder: Path) -> tuple[int, list[str]]:
+def _in_a_child(
+    attempt: Try, command: Command, count: int | None, seed: int, folder: Path
+) -> tuple[int, list[str]]:
     work = folder / command.name
     work.mkdir()
     result = work / "result.json"
@@ -46,7 +57,9 @@ def _in_a_child(attempt: Try, command: Command, count: int | None, seed: int, fo
         try:
             result.write_text(json.dumps(attempt(command, count, seed, folder / "inputs", work)))
         except BaseException:  # noqa: BLE001 (the parent reports it)
-            result.write_text(json.dumps([0, [f"{command.name}, seed {seed}: {traceback.format_exc()}"]]))
+            result.write_text(
+                json.dumps([0, [f"{command.name}, seed {seed}: {traceback.format_exc()}"]])
+            )
         finally:
             os._exit(0)
     os.waitpid(child, 0)
@@ -58,8 +71,12 @@ def _in_a_child(attempt: Try, command: Command, count: int | None, seed: int, fo
     return tried, found
 
 
-def run_with_library(module: str, count: int, seed: int, folder: Path, names: Sequence[str]) -> tuple[int, list[str]]:
-    """Try commands in another Python, into which the library of calls.c is loaded: it runs `module`, which calls `main`."""
+def run_with_library(
+    module: str, count: int, seed: int, folder: Path, names: Sequence[str]
+) -> tuple[int, list[str]]:
+    """Try commands in another Python, into which the library of calls.c is loaded: it runs
+    `module`, which calls `main`.
+    """
     result = folder / "result.json"
     preload.run_module(module, [str(folder), str(count), str(seed), str(result), *names], folder)
     tried, found = json.loads(result.read_text())
@@ -69,4 +86,6 @@ def run_with_library(module: str, count: int, seed: int, folder: Path, names: Se
 def main(attempt: Try) -> None:
     """Do the work of `run_with_library`, with the arguments that it gives."""
     folder, count, seed, result, *names = sys.argv[1:]
-    Path(result).write_text(json.dumps(try_commands(attempt, shares(names, int(count)), int(seed), Path(folder))))
+    Path(result).write_text(
+        json.dumps(try_commands(attempt, shares(names, int(count)), int(seed), Path(folder)))
+    )

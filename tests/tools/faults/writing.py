@@ -1,4 +1,6 @@
-"""Small valid files of everything that carlasc reads, made by its own writers or by those of the tests of its converters."""
+"""Small valid files of everything that carlasc reads, made by its own writers or by those of the
+tests of its converters.
+"""
 
 from __future__ import annotations
 
@@ -23,16 +25,28 @@ REGRID_SPEC = carlasc.GridSpec("cartesian", (8, 8, 4), (-8.0, -8.0, -2.0), (8.0,
 
 
 def write_folder(root: Path) -> Path:
-    """Write three sequences: one of two frames with every field, one of two scans, one with a grid of evidence."""
+    """Write three sequences: one of two frames with every field, one of two scans, one with a grid
+    of evidence.
+    """
     rng = np.random.default_rng(0)
     sink = FolderSink(root)
     whole = sink.sequence(WHOLE)
     for name, data in zip((layout.POSES, layout.TIMES), lines(2), strict=True):
         whole.write_document(name, data)
-    table = {"name": "own"} | {key: value for key, value in CARLA.to_dict().items() if key != "name"}
-    about = {"format": 2, "axes": "right", "classes": table, "sensor": "a", "min_range_m": 0.5, "max_range_m": 70.0}
+    table = {"name": "own"} | {
+        key: value for key, value in CARLA.to_dict().items() if key != "name"
+    }
+    about = {
+        "format": 2,
+        "axes": "right",
+        "classes": table,
+        "sensor": "a",
+        "min_range_m": 0.5,
+        "max_range_m": 70.0,
+    }
     whole.write_document(
-        layout.METADATA, json.dumps(about | {"source": "b", "rays": True, "sensors": ["x", "y"]}).encode()
+        layout.METADATA,
+        json.dumps(about | {"source": "b", "rays": True, "sensors": ["x", "y"]}).encode(),
     )
     whole.write_document("evaluation/params.json", params(SIZE))
     for frame, count in enumerate((3, 7)):
@@ -63,9 +77,15 @@ def write_folder(root: Path) -> Path:
 
 
 def _boxes(frame: int) -> Boxes:
-    poses = np.stack([translation((5.0 + frame, 1, 0)) @ rotation_z(0.3), translation((2.0, -3, 1))])
+    poses = np.stack(
+        [translation((5.0 + frame, 1, 0)) @ rotation_z(0.3), translation((2.0, -3, 1))]
+    )
     return Boxes.from_poses(
-        np.array([1, 2], np.uint32), np.array([10, 4], np.uint32), poses, np.full((2, 3), 1.5), np.ones(2, bool)
+        np.array([1, 2], np.uint32),
+        np.array([10, 4], np.uint32),
+        poses,
+        np.full((2, 3), 1.5),
+        np.ones(2, bool),
     )
 
 
@@ -78,12 +98,18 @@ def write_zip(root: Path) -> None:
     with zipfile.ZipFile(root / "data.zip", "w") as archive:
         for number, file in enumerate(sorted(files.rglob("*"))):
             if file.is_file():
-                archive.write(file, file.relative_to(files), (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)[number % 2])
+                archive.write(
+                    file,
+                    file.relative_to(files),
+                    (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)[number % 2],
+                )
     shutil.rmtree(files)
 
 
 def write_few(root: Path) -> Path:
-    """Write one sequence of one frame, with a field of each kind: a packed store reads hundreds of them a second."""
+    """Write one sequence of one frame, with a field of each kind: a packed store reads hundreds of
+    them a second.
+    """
     rng = np.random.default_rng(0)
     writer = FolderSink(root).sequence(WHOLE)
     for name, data in zip((layout.POSES, layout.TIMES), lines(1), strict=True):
@@ -144,7 +170,9 @@ def write_openoccupancy(root: Path) -> None:
     for part in ("truth", "predicted"):
         folder = root / part / "scene_x/occupancy"
         folder.mkdir(parents=True)
-        np.save(folder / "aa.npy", np.array([[1, 2, 3, 4], [39, 511, 511, 16], [0, 0, 0, 0]], np.int64))
+        np.save(
+            folder / "aa.npy", np.array([[1, 2, 3, 4], [39, 511, 511, 16], [0, 0, 0, 0]], np.int64)
+        )
 
 
 def write_kitti_predictions(root: Path) -> None:
@@ -182,17 +210,29 @@ def write_runs(root: Path) -> None:
     Config("lmscnet_ss").write(root / "config.yaml")
     write_weights(root / "best.safetensors", network)
     write_weights(root / "best.pt", network)
-    write_checkpoint(root / "last.pt", {"network": network.state_dict(), "epoch": 3, "settings": {"a": [1, "x"]}})
+    write_checkpoint(
+        root / "last.pt", {"network": network.state_dict(), "epoch": 3, "settings": {"a": [1, "x"]}}
+    )
 
 
 def write_regridded(root: Path) -> None:
-    """Write scans with boxes, and a grid that was made from them with its report, held-out scores and tracks of actors."""
+    """Write scans with boxes, and a grid that was made from them with its report, held-out scores
+    and tracks of actors.
+    """
     from helpers.datasets.completion import write_split
 
     write_split(root, "Val", ["Town01_Light"], 3)
     for frame in range(3):
-        FolderSink(root).sequence("Val/Town01_Light/cartesian").write("boxes", frame, _boxes(frame).to_table())
-    carlasc.regrid(root, REGRID_SPEC, observe=carlasc.FromScans(window=(-1, 1)), name="made", run=Run(workers=1))
+        FolderSink(root).sequence("Val/Town01_Light/cartesian").write(
+            "boxes", frame, _boxes(frame).to_table()
+        )
+    carlasc.regrid(
+        root,
+        REGRID_SPEC,
+        observe=carlasc.FromScans(window=(-1, 1)),
+        name="made",
+        run=Run(workers=1),
+    )
     carlasc.report(root, grid="made", holdout=True, save=True, run=Run(workers=1))
 
 

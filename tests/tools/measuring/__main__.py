@@ -1,4 +1,6 @@
-"""`python -m measuring`: measure the figures of the documentation, write docs/figures.json, and fill the pages in."""
+"""`python -m measuring`: measure the figures of the documentation, write docs/figures.json, and
+fill the pages in.
+"""
 
 from __future__ import annotations
 
@@ -48,11 +50,17 @@ def measure_of(group: str) -> Measure:
     """Return the function that measures a group."""
     module, name = GROUPS[group]
     function = getattr(import_module(module), name)
-    return partial(function, {"votes_file": "votes"}.get(group, group)) if name == "measure_file" else function
+    return (
+        partial(function, {"votes_file": "votes"}.get(group, group))
+        if name == "measure_file"
+        else function
+    )
 
 
 def main() -> int:
-    """Measure what is asked for; returns 1 if a group failed, whose figures are then those of before."""
+    """Measure what is asked for; returns 1 if a group failed, whose figures are then those of
+    before.
+    """
     parser = argparse.ArgumentParser(prog="measuring", description=__doc__)
     parser.add_argument(
         "--size",
@@ -61,10 +69,17 @@ def main() -> int:
         help="tiny tries everything once; its figures are not for the pages",
     )
     parser.add_argument(
-        "--only", choices=tuple(GROUPS), action="append", help="only this group; may be given several times"
+        "--only",
+        choices=tuple(GROUPS),
+        action="append",
+        help="only this group; may be given several times",
     )
-    parser.add_argument("--out", type=Path, help="write the figures here, and leave the pages as they are")
-    parser.add_argument("--fill", action="store_true", help="measure nothing; fill the pages in from the figures")
+    parser.add_argument(
+        "--out", type=Path, help="write the figures here, and leave the pages as they are"
+    )
+    parser.add_argument(
+        "--fill", action="store_true", help="measure nothing; fill the pages in from the figures"
+    )
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
@@ -81,17 +96,25 @@ def main() -> int:
 
 
 def measure_all(groups: list[str], size: str, file: Path) -> list[str]:
-    """Measure groups one after another, each in a process of its own; write the file after each. Returns the groups that failed."""
+    """Measure groups one after another, each in a process of its own; write the file after each.
+
+    Returns the groups that failed.
+    """
     failed, run = [], _describe_run(size)
     print(f"{run['cores']} cores of {run['processor']}, load {run['load']:.1f}", flush=True)
     if run["load"] > 0.5:
-        print("other programs are running: processor times suffer little, wall times much", flush=True)
+        print(
+            "other programs are running: processor times suffer little, wall times much", flush=True
+        )
     for group in groups:
         start = time.perf_counter()
         measured, problem = _measure_in_a_process(group, size)
         Figures.read(file).updated(run, measured).write(file)
         seconds = time.perf_counter() - start
-        print(f"{group}: {len(measured)} figures in {seconds:.0f} s{problem and ', then ' + problem}", flush=True)
+        print(
+            f"{group}: {len(measured)} figures in {seconds:.0f} s{problem and ', then ' + problem}",
+            flush=True,
+        )
         failed += [group] if problem else []
     if failed:
         print(f"{', '.join(failed)} failed: these figures are those of before")
@@ -102,25 +125,47 @@ def _measure_in_a_process(group: str, size: str) -> tuple[dict[str, Figure], str
     """Return what a group measured, and what went wrong: nothing, where the text is empty."""
     with tempfile.TemporaryDirectory(prefix="measuring-") as folder:
         lines = Path(folder, "figures.jsonl")
-        command = [sys.executable, "-m", "measuring", "--only", group, "--size", size, "--child", str(lines)]
-        one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+        command = [
+            sys.executable,
+            "-m",
+            "measuring",
+            "--only",
+            group,
+            "--size",
+            size,
+            "--child",
+            str(lines),
+        ]
+        one_thread = dict.fromkeys(
+            ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+        )
         environment = os.environ if group == "networks" else os.environ | one_thread
         problem = ""
         try:
             ran = subprocess.run(
-                command, env=environment, capture_output=True, text=True, timeout=_LONGEST_S[size], check=False
+                command,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=_LONGEST_S[size],
+                check=False,
             )
             if ran.returncode:
                 problem = f"it failed:\n{ran.stderr[-3000:]}"
         except subprocess.TimeoutExpired:
             problem = f"it was stopped after {_LONGEST_S[size]} s"
-        rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
+        rows = (
+            [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
+        )
     return {key: Figure(**figure) for key, figure in rows}, problem
 
 
 def _measure_here(group: str, size: Size, out: Path) -> None:
     """Measure a group in this process; each figure is a line of a file as soon as it is measured."""
-    with tempfile.TemporaryDirectory(prefix="measuring-", dir=out.parent) as folder, out.open("w") as file:
+    with (
+        tempfile.TemporaryDirectory(prefix="measuring-", dir=out.parent) as folder,
+        out.open("w") as file,
+    ):
         for key, figure in measure_of(group)(size, Path(folder)):
             file.write(json.dumps([key, dataclasses.asdict(figure)], default=float) + "\n")
             file.flush()
@@ -140,7 +185,11 @@ def _describe_run(size: str) -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
         "python": found.python.split()[0],
         "versions": {"carlasc": found.version}
-        | {package.name: package.version for package in found.packages if package.name in ("numpy", "numba")},
+        | {
+            package.name: package.version
+            for package in found.packages
+            if package.name in ("numpy", "numba")
+        },
     }
 
 

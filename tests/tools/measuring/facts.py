@@ -1,4 +1,6 @@
-"""Numbers on pages that nothing writes, and why they are right: most are constants of the code, and a test compares them."""
+"""Numbers on pages that nothing writes, and why they are right: most are constants of the code, and
+a test compares them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from typing import Any
 FACTS = ("docs/format.md", "docs/packed-format.md")
 """Pages that define files: their numbers are the format."""
 
-CONSTANTS: dict[str, dict[str, str]] = {  # page -> number as it stands there -> module:NAME, or module:NAME[place]
+# page -> number as it stands there -> module:NAME, or module:NAME[place]
+CONSTANTS: dict[str, dict[str, str]] = {
     "docs/commands/audit.md": {
         "0.06 s": "carlasc.inspection.auditing.matching:_SAME_TIME_S",
         "75%": "carlasc.inspection.auditing.geometry:_BELONGS",
@@ -86,10 +89,14 @@ CONSTANTS: dict[str, dict[str, str]] = {  # page -> number as it stands there ->
     "docs/sets/synthcity.md": {"0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S"},
 }
 
-EXCEPTIONS: dict[tuple[str, str], str] = {  # (page, number or heading of a section) -> why it is right; at most 20
+# (page, number or heading of a section) -> why it is right; at most 20
+EXCEPTIONS: dict[tuple[str, str], str] = {
     ("docs/performance.md", "20 minutes"): "what a run of `make figures` is allowed to take",
     ("docs/index.md", "0.7 GB"): "the size of a download of torch",
-    ("docs/commands/audit.md", "0.25"): "the step of a list of turns, which the code writes as a range",
+    (
+        "docs/commands/audit.md",
+        "0.25",
+    ): "the step of a list of turns, which the code writes as a range",
     ("docs/commands/audit.md", "95%"): "the kind of an interval",
     ("docs/sets/argoverse2.md", "15 s"): "how long a drive of the data set is, by its authors",
     ("docs/sets/argoverse2.md", "200 MB"): "the size of a download",

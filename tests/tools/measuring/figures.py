@@ -71,7 +71,8 @@ class Figures:
     """All figures.
 
     Attributes:
-        runs: the processor, its cores, the load, versions, the size and the date of each run, by its name.
+        runs: the processor, its cores, the load, versions, the size and the date of each run, by
+            its name.
         figures: each figure by its key.
     """
 
@@ -88,7 +89,9 @@ class Figures:
         return cls(held["runs"], figures)
 
     def updated(self, run: Mapping[str, Any], measured: Mapping[str, Figure]) -> Figures:
-        """Return them with what a run measured in place of older figures, without runs of which nothing is left."""
+        """Return them with what a run measured in place of older figures, without runs of which
+        nothing is left.
+        """
         name = f"{run['date']} {run['size']} {run['target']}"  # machines of one day are told apart
         new = {key: dataclasses.replace(figure, run=name) for key, figure in measured.items()}
         figures = dict(sorted((self.figures | new).items()))
@@ -109,7 +112,9 @@ class Figures:
         file.write_text(json.dumps({"runs": self.runs, "figures": rows}, indent=1) + "\n")
 
     def texts(self) -> dict[str, str]:
-        """Return what a page shows for each key: the figures, where they were measured, and what the faults say of theirs."""
+        """Return what a page shows for each key: the figures, where they were measured, and what
+        the faults say of theirs.
+        """
         rows = faults.read()
         other = {
             "faults.table": faults.table(rows),
@@ -121,7 +126,8 @@ class Figures:
     def _machine(self) -> str:
         """Return a sentence for each run: processor, load, versions and date."""
         sentences = [
-            f"{run['date']}: {run['cores']} cores of {run['processor']} (Numba's name for it: {run['target']}), load {run['load']:.1f} at the start,"
+            f"{run['date']}: {run['cores']} cores of {run['processor']} (Numba's name for it: "
+            f"{run['target']}), load {run['load']:.1f} at the start,"
             f" Python {run['python']}, "
             + ", ".join(f"{name} {version}" for name, version in run["versions"].items())
             + f", size {run['size']}"
@@ -131,17 +137,25 @@ class Figures:
 
 
 def unwritten(path: Path) -> list[str]:
-    """Return the numbers of a page that no figure, study, constant or definition of a file gives, apart from the exceptions."""
+    """Return the numbers of a page that no figure, study, constant or definition of a file gives,
+    apart from the exceptions.
+    """
     page = path.relative_to(ROOT).as_posix()
     if page in FACTS:
         return []
-    kept = [text for text in sections(path.read_text()) if (page, text.partition("\n")[0]) not in EXCEPTIONS]
+    kept = [
+        text
+        for text in sections(path.read_text())
+        if (page, text.partition("\n")[0]) not in EXCEPTIONS
+    ]
     known = {*CONSTANTS.get(page, ()), *(number for at, number in EXCEPTIONS if at == page)}
     return [text for text in typed_by_hand("".join(kept)) if text not in known]
 
 
 def _rounded(value: Any) -> Any:
-    """Return a number with four digits: the rest is noise, and would only make differences between runs longer."""
+    """Return a number with four digits: the rest is noise, and would only make differences between
+    runs longer.
+    """
     if not isinstance(value, float) or not math.isfinite(value):
         return value
     return float(f"{value:.4g}")

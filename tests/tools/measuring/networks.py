@@ -21,7 +21,11 @@ def measure_networks(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
             arguments = ["latency.py", network, "--device", "cpu", "--json"]
             arguments += ["--threads", str(threads), "--repetitions", str(2 * size.repeats)]
             ran = subprocess.run(
-                [sys.executable, *arguments], cwd=_EXAMPLES, stdout=subprocess.PIPE, text=True, check=True
+                [sys.executable, *arguments],
+                cwd=_EXAMPLES,
+                stdout=subprocess.PIPE,
+                text=True,
+                check=True,
             )
             for found in json.loads(ran.stdout):
                 key = f"networks.{found['network']}.{found['history']}.{found['mode']}.{threads}"
@@ -31,5 +35,9 @@ def measure_networks(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
                     yield f"{key}.ratio", Figure(found["speedup"], "", f"{text}, eager / this")
                     yield (
                         f"{key}.differing",
-                        Figure(found["differing"], "", f"{text}: voxels per million whose label differs"),
+                        Figure(
+                            found["differing"],
+                            "",
+                            f"{text}: voxels per million whose label differs",
+                        ),
                     )

@@ -1,8 +1,11 @@
-"""Places in pages that are filled in from figures. A place holds its own template, in a comment, and the text that was made of it.
+"""Places in pages that are filled in from figures.
+
+A place holds its own template, in a comment, and the text that was made of it.
 
     <!-- figures {loading.ratio} times -->16 to 27 times<!-- figures end -->
 
-A template of several lines makes a block, such as a table. A page is never edited between the end of the comment and `figures end`.
+A template of several lines makes a block, such as a table. A page is never edited between the end
+of the comment and `figures end`.
 """
 
 from __future__ import annotations
@@ -12,17 +15,22 @@ from collections.abc import Mapping
 
 _PLACE = re.compile(r"<!-- figures(\s.*?)-->(.*?)<!-- figures end -->", re.DOTALL)
 _KEY = re.compile(r"\{([\w.-]+)\}")
-_CODE = re.compile(r"^```.*?^```$|^    .*$|`[^`\n]*`|<!--.*?-->|\]\([^)\s]*\)", re.DOTALL | re.MULTILINE)
+_CODE = re.compile(
+    r"^```.*?^```$|^    .*$|`[^`\n]*`|<!--.*?-->|\]\([^)\s]*\)", re.DOTALL | re.MULTILINE
+)
 _GENERATED = re.compile(r"<!-- generated: .*?<!-- generated end -->", re.DOTALL)
 _COMMAND = re.compile(r"(?:docs/studies|examples|tests/benchmarks)/\w+\.py")
 _NUMBER = r"(?<![\w.,/-])\d[\d,.]*(?: (?:to|and|or|of) \d[\d.,]*)?"
 _MEASURED = re.compile(
-    rf"{_NUMBER}(?: ?(?:ms|us|s|MB|MiB|GB|GiB|kB|KiB|MB/s|GB/s|%)(?![\w/])| (?:seconds?|minutes?|hours?|times|(?:frames|scans)(?:/s| per second))\b"
+    rf"{_NUMBER}(?: ?(?:ms|us|s|MB|MiB|GB|GiB|kB|KiB|MB/s|GB/s|%)(?![\w/])| "
+    rf"(?:seconds?|minutes?|hours?|times|(?:frames|scans)(?:/s| per second))\b"
     r"| ?x(?! ?\d)\b)"  # with the unit of a time, a size, a rate, a share or a ratio
-    r"|(?<![\w.,/-])[01]\.\d\d+(?![\d.,]*\d| (?:to|and|or) |,? ?(?:m|cm|mm|degrees?|rad|m/s|Hz)\b)"  # a score
+    # a score
+    r"|(?<![\w.,/-])[01]\.\d\d+(?![\d.,]*\d| (?:to|and|or) |,? ?(?:m|cm|mm|degrees?|rad|m/s|Hz)\b)"
 )
 _CELL = re.compile(
-    r"[*±~$]*\d[\d,]*(?:\.\d+| ?%| (?:ms|s|MB|GB))(?! ?(?:m|cm|mm|degrees)\b)\**(?: ?(?:±|to |\(|/ ?|/s).*)?"
+    r"[*±~$]*\d[\d,]*(?:\.\d+| ?%| (?:ms|s|MB|GB))(?! ?(?:m|cm|mm|degrees)\b)\**(?: ?(?:±|to "
+    r"|\(|/ ?|/s).*)?"
 )
 
 
@@ -51,7 +59,9 @@ def fill(page: str, figures: Mapping[str, str]) -> str:
 
 
 def sections(page: str) -> list[str]:
-    """Return what stands before the first heading of the second level of a page, and under each of them; code is left out of nothing, tables that the code writes are."""
+    """Return what stands before the first heading of the second level of a page, and under each of
+    them; code is left out of nothing, tables that the code writes are.
+    """
     return re.split(r"^(?=## )", _GENERATED.sub("", page), flags=re.MULTILINE)
 
 
@@ -63,9 +73,11 @@ def commands(section: str) -> set[str]:
 def typed_by_hand(page: str) -> list[str]:
     """Return the numbers of a page that nothing writes.
 
-    These are times, sizes, rates, shares, ratios and scores in its text, and the cells of its tables with a fraction, a share or such a unit. Numbers
-    in places of figures, in code and in links do not count, and neither do those of a section that names the study or the example that makes them.
-    Lengths, angles, speeds and numbers of things are what is measured with, and count in tables only.
+    These are times, sizes, rates, shares, ratios and scores in its text, and the cells of its
+    tables with a fraction, a share or such a unit. Numbers in places of figures, in code and in
+    links do not count, and neither do those of a section that names the study or the example that
+    makes them. Lengths, angles, speeds and numbers of things are what is measured with, and count
+    in tables only.
     """
     found: list[str] = []
     for section in sections(_PLACE.sub("", page)):
@@ -73,5 +85,9 @@ def typed_by_hand(page: str) -> list[str]:
             for line in _CODE.sub("`", section).splitlines():
                 for cell in map(str.strip, line.split("|")):
                     is_number = line.startswith("|") and _CELL.fullmatch(cell)
-                    found += [cell] if is_number else [match[0].strip(" .,") for match in _MEASURED.finditer(cell)]
+                    found += (
+                        [cell]
+                        if is_number
+                        else [match[0].strip(" .,") for match in _MEASURED.finditer(cell)]
+                    )
     return found

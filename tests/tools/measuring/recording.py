@@ -21,7 +21,9 @@ _FRAMES, _PATH = 60, "Train/Town01_Light/cartesian"
 
 
 def measure_recordings(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
-    """Yield the wall time and the size of a recording, and of a page, of 60 frames of the published grid with full scans."""
+    """Yield the wall time and the size of a recording, and of a page, of 60 frames of the published
+    grid with full scans.
+    """
     _write(folder / "data")
     scene = Scene(folder / "data", frames=(0, _FRAMES))
     for ending in ("rrd", "mcap", "html"):
@@ -42,10 +44,18 @@ def _write(folder: Path) -> None:
     scans, labels = street_frame(3, distinct=3), street(spec).labels
     with FolderSink(folder) as sink, sink.sequence(_PATH) as writer:
         writer.write_document("evaluation/params.json", to_json(spec.to_params()))
-        writer.write_document(layout.POSES, layout.encode_poses(np.tile(np.eye(4), (_FRAMES, 1, 1))))
+        writer.write_document(
+            layout.POSES, layout.encode_poses(np.tile(np.eye(4), (_FRAMES, 1, 1)))
+        )
         for frame in range(_FRAMES):
             scan = scans[frame % len(scans)]
-            writer.write("points", frame, np.column_stack([scan.points, np.zeros(len(scan.points), np.float32)]))
+            writer.write(
+                "points",
+                frame,
+                np.column_stack([scan.points, np.zeros(len(scan.points), np.float32)]),
+            )
             writer.write("labels", frame, scan.labels.astype(np.uint32))
-            writer.write("evaluation/labels", frame, np.roll(labels, frame, axis=0).astype(np.uint32))
+            writer.write(
+                "evaluation/labels", frame, np.roll(labels, frame, axis=0).astype(np.uint32)
+            )
             writer.write("evaluation/counts", frame, np.ones(spec.size, np.float32))

@@ -20,13 +20,20 @@ def measure_simulation(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]
     """Yield the times of a town, of a scan, and of a frame with pictures and files."""
     TownDrive(seed=1, traffic="heavy").record(0)
     times = by_turns({"town": lambda: TownDrive(seed=0, traffic="heavy").town}, size.slow_repeats)
-    yield "simulation.town", Figure(times["town"], "s", "building a town with heavy traffic: processor time")
+    yield (
+        "simulation.town",
+        Figure(times["town"], "s", "building a town with heavy traffic: processor time"),
+    )
     drive = TownDrive(seed=0, traffic="heavy")
     drive.record(240)  # collects the triangles of the frame
     times = by_turns({"scan": lambda: drive.record(240, 1)}, size.repeats)
     yield (
         "simulation.scan",
-        Figure(1e3 * times["scan"], "ms", "one full scan of a frame whose triangles are collected: processor time"),
+        Figure(
+            1e3 * times["scan"],
+            "ms",
+            "one full scan of a frame whose triangles are collected: processor time",
+        ),
     )
 
     def frames(count: int) -> None:
@@ -39,6 +46,9 @@ def measure_simulation(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]
     yield (
         "simulation.frame",
         Figure(
-            frame, "s", "a frame of twenty full scans in heavy traffic, with pictures and files, one worker: wall time"
+            frame,
+            "s",
+            "a frame of twenty full scans in heavy traffic, with pictures and files, one worker: "
+            "wall time",
         ),
     )

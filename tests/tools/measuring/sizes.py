@@ -1,4 +1,6 @@
-"""How much is measured, and how two versions are compared: by turns, so that both meet the same machine."""
+"""How much is measured, and how two versions are compared: by turns, so that both meet the same
+machine.
+"""
 
 from __future__ import annotations
 
@@ -28,20 +30,36 @@ class Size:
 
 SIZES = {
     "tiny": Size(1, 1, 1, (1,), ("sscnet_full:1",)),
-    "quick": Size(10, 3, 2, (1, 2), ("motionsc:1", "lmscnet_ss:1", "sscnet_full:1", "motionsc:5", "baseline:5")),
-    "full": Size(40, 10, 5, (1, 2), ("motionsc:1", "lmscnet_ss:1", "sscnet_full:1", "motionsc:5", "baseline:5")),
+    "quick": Size(
+        10,
+        3,
+        2,
+        (1, 2),
+        ("motionsc:1", "lmscnet_ss:1", "sscnet_full:1", "motionsc:5", "baseline:5"),
+    ),
+    "full": Size(
+        40,
+        10,
+        5,
+        (1, 2),
+        ("motionsc:1", "lmscnet_ss:1", "sscnet_full:1", "motionsc:5", "baseline:5"),
+    ),
 }
 
 
 def by_turns(
-    calls: Mapping[str, Callable[[], object]], repeats: int, clock: Callable[[], float] = time.process_time
+    calls: Mapping[str, Callable[[], object]],
+    repeats: int,
+    clock: Callable[[], float] = time.process_time,
 ) -> dict[str, float]:
     """Return the least time of each call, in seconds. The calls take turns.
 
     Args:
-        calls: the calls by name; each was made once before, so that it is compiled and its files are in memory.
+        calls: the calls by name; each was made once before, so that it is compiled and its files
+            are in memory.
         repeats: number of turns.
-        clock: processor time of this process, which hardly depends on what else the machine does; or `time.perf_counter`.
+        clock: processor time of this process, which hardly depends on what else the machine does;
+            or `time.perf_counter`.
     """
     least: dict[str, float] = {}
     for _ in range(repeats):

@@ -1,4 +1,6 @@
-"""Votes of an instant seen by 20 LiDARs, beside plain NumPy; and whole runs of `regrid`, with and without syncing."""
+"""Votes of an instant seen by 20 LiDARs, beside plain NumPy; and whole runs of `regrid`, with and
+without syncing.
+"""
 
 from __future__ import annotations
 
@@ -49,31 +51,49 @@ print(int(kilobytes) / 1e3 or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def measure_voting(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
-    """Yield processor times of the votes of one frame, and the peak memory of a process that makes them."""
+    """Yield processor times of the votes of one frame, and the peak memory of a process that makes
+    them.
+    """
     observations = bench.frame(True)
     ratios = []
     for case, name in _KEYS.items():
         spec, rule = bench.CASES[case]
         text = f"votes of 20 LiDARs, {case}, rule {rule}: least processor time of one thread"
         bench.vote(observations, spec, rule)
-        times = by_turns({"carlasc": lambda s=spec, r=rule: bench.vote(observations, s, r)}, size.repeats)
+        times = by_turns(
+            {"carlasc": lambda s=spec, r=rule: bench.vote(observations, s, r)}, size.repeats
+        )
         if case != "512x512x30":  # in plain NumPy it would need tens of gigabytes
             for _ in range(min(size.slow_repeats, 2)):
                 both = {
-                    "plain": lambda s=spec, r=rule: plain_grid(plain_votes(observations, s, rule=r), s),
+                    "plain": lambda s=spec, r=rule: plain_grid(
+                        plain_votes(observations, s, rule=r), s
+                    ),
                     "carlasc": lambda s=spec, r=rule: bench.vote(observations, s, r),
                 }
                 found = by_turns(both, 1)
-                times = {way: min(time, times.get(way, time)) for way, time in (times | found).items()}
-        figures = {way: Figure(1e3 * seconds, "ms", f"{text}, {way}") for way, seconds in times.items()}
+                times = {
+                    way: min(time, times.get(way, time)) for way, time in (times | found).items()
+                }
+        figures = {
+            way: Figure(1e3 * seconds, "ms", f"{text}, {way}") for way, seconds in times.items()
+        }
         if "plain" in figures:
-            figures["ratio"] = ratio(figures["plain"], figures["carlasc"], f"{text}, plain / carlasc")
+            figures["ratio"] = ratio(
+                figures["plain"], figures["carlasc"], f"{text}, plain / carlasc"
+            )
             ratios.append(figures["ratio"])
         yield from ((f"votes.{name}.{way}", figure) for way, figure in figures.items())
-    yield "votes.ratio", within(ratios, "votes of 20 LiDARs: plain / carlasc, all grids but the finest")
+    yield (
+        "votes.ratio",
+        within(ratios, "votes of 20 LiDARs: plain / carlasc, all grids but the finest"),
+    )
     merged, coarse = (observations * 3)[:60], GridSpec.published()
     times = by_turns({"merged": lambda: bench.vote(merged, coarse, "sensor")}, size.slow_repeats)
-    yield "votes.merged", Figure(1e3 * times["merged"], "ms", "votes of 60 scans on 128 x 128 x 8: processor time")
+    yield (
+        "votes.merged",
+        Figure(1e3 * times["merged"], "ms", "votes of 60 scans on 128 x 128 x 8: processor time"),
+    )
     scans = {}
     for n, one in enumerate(observations):
         scans |= {f"points{n}": one.points, f"labels{n}": one.labels, f"pose{n}": one.grid_T_sensor}
@@ -86,7 +106,9 @@ def measure_voting(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
 
 
 def measure_regrid(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
-    """Yield the wall time of a frame of `regrid` of a capture of 20 sensors: workers, stores, syncing."""
+    """Yield the wall time of a frame of `regrid` of a capture of 20 sensors: workers, stores,
+    syncing.
+    """
     simulate(folder / "capture", count=_FRAMES, bev=False)
     spec, out = GridSpec.published("cartesian"), folder / "out"
 
@@ -94,7 +116,9 @@ def measure_regrid(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         os.environ[DURABLE] = durable
-        assert not regrid(folder / "capture", spec, out / f"a{kind}", run=Run(workers=workers)).failures
+        assert not regrid(
+            folder / "capture", spec, out / f"a{kind}", run=Run(workers=workers)
+        ).failures
 
     cases = {
         "regrid.folder": ("", "yes", 1),
@@ -110,18 +134,22 @@ def measure_regrid(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
         name: Figure(
             1e3 * times[name] / _FRAMES,
             "ms",
-            f"wall time per frame of regrid into {kind or 'a folder'}, durable {durable}, {workers} workers",
+            f"wall time per frame of regrid into {kind or 'a folder'}, durable {durable}, "
+            f"{workers} workers",
         )
         for name, (kind, durable, workers) in cases.items()
     }
     yield from figures.items()
     for kind in ("folder", "zarr"):
-        more = 100 * (figures[f"regrid.{kind}"].value / figures[f"regrid.{kind}.not_synced"].value - 1)
+        more = 100 * (
+            figures[f"regrid.{kind}"].value / figures[f"regrid.{kind}.not_synced"].value - 1
+        )
         yield (
             f"regrid.{kind}.syncing",
             Figure(
                 max(more, 0.0),
                 "%",
-                f"what syncing adds to the time of regrid into a {kind}; 0 where nothing can be seen",
+                f"what syncing adds to the time of regrid into a {kind}; 0 where nothing can be "
+                f"seen",
             ),
         )

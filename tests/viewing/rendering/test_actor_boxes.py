@@ -22,7 +22,11 @@ LENGTHS = np.array([4.4, 1.8, 1.5])
 
 def body(yaw, center, flow=None, actor=3, lengths=LENGTHS):
     """The surface of a body: points of its corners and faces, moved and turned."""
-    share = np.array(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5], [-0.5, 0.5], indexing="ij")).reshape(3, -1).T
+    share = (
+        np.array(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5], [-0.5, 0.5], indexing="ij"))
+        .reshape(3, -1)
+        .T
+    )
     points = share * lengths @ rotation_z(yaw)[:3, :3].T + center
     count = len(points)
     velocity = None if flow is None else np.tile(np.asarray(flow, np.float32), (count, 1))
@@ -39,7 +43,11 @@ def body(yaw, center, flow=None, actor=3, lengths=LENGTHS):
 def test_a_tight_box_has_the_place_and_the_size_of_the_body(yaw, x, moves):
     flow = [5 * np.cos(yaw), 5 * np.sin(yaw), 0] if moves else None
     boxes = tight_boxes(body(yaw, (x, 3.0, -1.0), flow))
-    assert (boxes.tracks.tolist(), boxes.labels.tolist(), boxes.annotated.tolist()) == ([3], [10], [False])
+    assert (boxes.tracks.tolist(), boxes.labels.tolist(), boxes.annotated.tolist()) == (
+        [3],
+        [10],
+        [False],
+    )
     np.testing.assert_allclose(boxes.centers[0], (x, 3.0, -1.0), atol=0.05)
     np.testing.assert_allclose(boxes.sizes[0], LENGTHS, atol=0.1)
     forward = boxes.sensor_T_box[0, :3, 0]
@@ -55,7 +63,12 @@ def test_actors_with_few_points_and_points_without_an_actor_have_no_box():
     assert (
         len(
             box_edges(
-                Boxes.from_poses(np.array([1], np.uint32), np.array([10], np.uint32), np.eye(4)[None], LENGTHS[None])
+                Boxes.from_poses(
+                    np.array([1], np.uint32),
+                    np.array([10], np.uint32),
+                    np.eye(4)[None],
+                    LENGTHS[None],
+                )
             )
         )
         == 6 * 13
@@ -65,7 +78,9 @@ def test_actors_with_few_points_and_points_without_an_actor_have_no_box():
 def test_the_edges_of_a_box_lie_on_its_surface_and_the_bar_leaves_it_at_the_front():
     pose = rotation_z(0.7)
     pose[:3, 3] = (4, -2, 1)
-    boxes = Boxes.from_poses(np.array([1], np.uint32), np.array([10], np.uint32), pose[None], LENGTHS[None])
+    boxes = Boxes.from_poses(
+        np.array([1], np.uint32), np.array([10], np.uint32), pose[None], LENGTHS[None]
+    )
     corners = box_edges(boxes).corners.reshape(-1, 3)
     local = (corners - pose[:3, 3]) @ pose[:3, :3]
     outside = np.abs(local) - LENGTHS / 2
@@ -95,7 +110,10 @@ def test_annotated_boxes_are_drawn_where_they_are_and_only_in_the_picture(blocks
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [(10, -12, 0), (200, 0, 0)]
     boxes = Boxes.from_poses(
-        np.array([1, 2], np.uint32), np.array([10, 10], np.uint32), poses, np.array([[6.0, 3.0, 2.0]] * 2)
+        np.array([1, 2], np.uint32),
+        np.array([10, 10], np.uint32),
+        poses,
+        np.array([[6.0, 3.0, 2.0]] * 2),
     )
     FolderSink(folder.parent).sequence(folder.name).write("boxes", 0, boxes.to_table())
     options = {
@@ -103,7 +121,9 @@ def test_annotated_boxes_are_drawn_where_they_are_and_only_in_the_picture(blocks
         "style": StyleOptions(size=(1536, 1536), ego=False, legend=False),
     }
     plain = pixels(render(Scene(folder, frames=(0, 1)), tmp_path / "b.png", **options).out)
-    boxed = pixels(render(Scene(folder, frames=(0, 1)), tmp_path / "a.png", boxes=True, **options).out)
+    boxed = pixels(
+        render(Scene(folder, frames=(0, 1)), tmp_path / "a.png", boxes=True, **options).out
+    )
     ink = (boxed.max(-1) < 40) & (plain.max(-1) > 100)
     rows, columns = np.flatnonzero(ink.any(1)), np.flatnonzero(ink.any(0))
     scale, middle = 1536 * 0.98 / 51.2, 768  # ahead is up, right is right
@@ -112,16 +132,22 @@ def test_annotated_boxes_are_drawn_where_they_are_and_only_in_the_picture(blocks
 
 
 @pytest.mark.parametrize("what", ["scan", "flow", "grid"])
-def test_boxes_are_drawn_over_any_content_and_named_in_the_legend(blocks, tmp_path, monkeypatch, what):
+def test_boxes_are_drawn_over_any_content_and_named_in_the_legend(
+    blocks, tmp_path, monkeypatch, what
+):
     from carlasc.viewing.rendering import pictures
 
     legends = []
     original = pictures.plan_page
-    monkeypatch.setattr(pictures, "plan_page", lambda *a, **k: legends.append(k["legend"]) or original(*a, **k))
+    monkeypatch.setattr(
+        pictures, "plan_page", lambda *a, **k: legends.append(k["legend"]) or original(*a, **k)
+    )
     options = {"what": what, "overwrite": True, "style": StyleOptions(size=(320, 180))}
     plain = pixels(render(Scene(blocks, frames=(0, 1)), tmp_path / "a.png", **options).out)
     folder = with_instances(blocks, tmp_path)
-    boxed = pixels(render(Scene(folder, frames=(0, 1)), tmp_path / "a.png", boxes=True, **options).out)
+    boxed = pixels(
+        render(Scene(folder, frames=(0, 1)), tmp_path / "a.png", boxes=True, **options).out
+    )
     assert "box, with a bar to its front" not in [entry.name for entry in legends[0]]
     assert legends[1][-1].name == "box, with a bar to its front"
     assert (np.abs(plain - boxed).max(-1) > 60).sum() > 30

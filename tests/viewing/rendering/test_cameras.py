@@ -12,9 +12,13 @@ angles = st.floats(-3.1, 3.1)
 
 
 @given(angles, st.floats(-1.5, 1.5), st.floats(0.2, 2.0), st.floats(0.3, 4.0), st.booleans())
-def test_a_fitted_camera_sees_the_whole_scene_and_fills_the_picture(azimuth, elevation, fov, aspect, left_handed):
+def test_a_fitted_camera_sees_the_whole_scene_and_fills_the_picture(
+    azimuth, elevation, fov, aspect, left_handed
+):
     viewpoint = Viewpoint(azimuth_rad=azimuth, elevation_rad=elevation, fov_rad=fov)
-    camera = perspective_camera(BOX, viewpoint, aspect, axes="left" if left_handed else "right", margin=0.0)
+    camera = perspective_camera(
+        BOX, viewpoint, aspect, axes="left" if left_handed else "right", margin=0.0
+    )
     columns, rows, depths = camera.project(BOX, round(1000 * aspect), 1000)
     assert (depths > 0).all()
     assert columns.min() > -1 and columns.max() < round(1000 * aspect) + 1
@@ -25,7 +29,9 @@ def test_a_fitted_camera_sees_the_whole_scene_and_fills_the_picture(azimuth, ele
 
 @given(angles, st.floats(-1.5, 1.5), st.booleans())
 def test_axes_are_unit_vectors_at_right_angles_and_up_is_up(azimuth, elevation, left_handed):
-    camera = perspective_camera(BOX, Viewpoint(azimuth, elevation), 1.5, axes="left" if left_handed else "right")
+    camera = perspective_camera(
+        BOX, Viewpoint(azimuth, elevation), 1.5, axes="left" if left_handed else "right"
+    )
     np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-9)
     assert camera.axes[1, 2] > 0
     assert abs(camera.axes[0, 2]) < 1e-9
@@ -48,7 +54,9 @@ def test_the_vehicles_right_is_on_the_right(left_handed, right):
 
 def test_azimuth_90_stands_on_the_vehicles_right():
     for left_handed in (True, False):
-        camera = perspective_camera(BOX, Viewpoint(azimuth_rad=np.pi / 2), 1.5, axes="left" if left_handed else "right")
+        camera = perspective_camera(
+            BOX, Viewpoint(azimuth_rad=np.pi / 2), 1.5, axes="left" if left_handed else "right"
+        )
         assert camera.position[1] * (1 if left_handed else -1) > 20
         assert abs(camera.position[0]) < 1e-6
 
@@ -59,7 +67,9 @@ def test_a_ray_through_a_pixel_meets_what_is_projected_there():
         column, row, depth = (float(value[0]) for value in camera.project(point, 160, 100))
         origins, directions = camera.rays(160, 100, slice(int(row), int(row) + 1))
         met = origins[int(column)] + depth * directions[int(column)]
-        assert np.linalg.norm(met - point[0]) < 1.5 * camera.footprint(100) * (1 if camera.orthographic else depth)
+        assert np.linalg.norm(met - point[0]) < 1.5 * camera.footprint(100) * (
+            1 if camera.orthographic else depth
+        )
 
 
 def test_a_moved_camera_sees_the_same_of_a_moved_scene():
@@ -67,7 +77,9 @@ def test_a_moved_camera_sees_the_same_of_a_moved_scene():
     camera = perspective_camera(BOX, Viewpoint(), 1.5)
     moved = camera.moved(there_T_here)
     points = BOX @ there_T_here[:3, :3].T + there_T_here[:3, 3]
-    np.testing.assert_allclose(moved.project(points, 300, 200), camera.project(BOX, 300, 200), atol=1e-9)
+    np.testing.assert_allclose(
+        moved.project(points, 300, 200), camera.project(BOX, 300, 200), atol=1e-9
+    )
 
 
 def test_a_viewpoint_is_read_from_words():
@@ -83,7 +95,17 @@ def test_a_viewpoint_is_read_from_words():
 
 @pytest.mark.parametrize(
     "text",
-    ["azimuth", "azimuth=x", "zoom=3", "target=1,2", "distance=0", "distance=-1", "fov=0", "fov=180", "elevation=91"]
+    [
+        "azimuth",
+        "azimuth=x",
+        "zoom=3",
+        "target=1,2",
+        "distance=0",
+        "distance=-1",
+        "fov=0",
+        "fov=180",
+        "elevation=91",
+    ]
     + ["azimuth=nan", "distance=inf", "position=1,2,nan"],
 )
 def test_an_impossible_viewpoint_is_refused(text):

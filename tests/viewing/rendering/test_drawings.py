@@ -14,23 +14,40 @@ from carlasc.viewing.rendering.drawings import evidence_legend
 pytest.importorskip("embreex")
 
 SPEC = GridSpec.published().with_size((64, 64, 4))
-CENTERS = [(18.0, -15.0, -0.5), (18.0, 0.0, -0.5), (18.0, 15.0, -0.5)]  # from left to right in a picture from above
+# from left to right in a picture from above
+CENTERS = [
+    (18.0, -15.0, -0.5),
+    (18.0, 0.0, -0.5),
+    (18.0, 15.0, -0.5),
+]
 VALUES = {
     "occupied": ([0.55, 0.85, 0.999], np.float16),
     "views": ([1, 5, 900], np.uint16),
     "counts": ([1, 9, 70], np.float32),
     "flags": (
-        [VoxelFlag.SEEN_NOW, VoxelFlag.CONTESTED | VoxelFlag.SEEN_NOW, VoxelFlag.INFERRED | VoxelFlag.IN_ACTOR],
+        [
+            VoxelFlag.SEEN_NOW,
+            VoxelFlag.CONTESTED | VoxelFlag.SEEN_NOW,
+            VoxelFlag.INFERRED | VoxelFlag.IN_ACTOR,
+        ],
         np.uint8,
     ),
     "seen": ([0, 4, 0b101], np.uint8),
 }
-SHOWN = {"confidence": (0, 3, 6), "views": (0, 2, 6), "votes": (0, 3, 6), "inferred": (0, 2, 3), "seen": (0, 1, 2)}
+SHOWN = {
+    "confidence": (0, 3, 6),
+    "views": (0, 2, 6),
+    "votes": (0, 3, 6),
+    "inferred": (0, 2, 3),
+    "seen": (0, 1, 2),
+}
 
 
 @pytest.fixture(scope="module")
 def certain(tmp_path_factory):
-    """Three blocks of one class, each with another value of each kind of evidence; frame 1 has classes only."""
+    """Three blocks of one class, each with another value of each kind of evidence; frame 1 has
+    classes only.
+    """
     root = tmp_path_factory.mktemp("certain")
     writer = FolderSink(root).sequence("Train/Town01_Light/cartesian")
     writer.write_document(layout.params_file(layout.EVALUATION), to_json(SPEC.to_params()))
@@ -47,7 +64,9 @@ def certain(tmp_path_factory):
 
 
 def colors_of(path, legend):
-    """Return the column of the middle of each entry's colour, where it occurs in a picture: a level face in the sun has it."""
+    """Return the column of the middle of each entry's colour, where it occurs in a picture: a level
+    face in the sun has it.
+    """
     shown = np.asarray(Image.open(path).convert("RGB")).astype(float)
     columns = {}
     for number, entry in enumerate(legend):
@@ -74,11 +93,18 @@ def test_each_block_has_the_colour_of_its_value(certain, tmp_path, color):
 @pytest.mark.parametrize("color", sorted(SHOWN))
 def test_the_legend_names_what_the_colours_mean(certain, tmp_path, color):
     legend = evidence_legend(color)
-    assert len({entry.name for entry in legend}) == len({entry.color for entry in legend}) == len(legend)
+    assert (
+        len({entry.name for entry in legend})
+        == len({entry.color for entry in legend})
+        == len(legend)
+    )
     shown = np.asarray(
         Image.open(
             render(
-                Scene(certain, frames=(0, 1)), tmp_path / "a.png", color=color, style=StyleOptions(size=(900, 500))
+                Scene(certain, frames=(0, 1)),
+                tmp_path / "a.png",
+                color=color,
+                style=StyleOptions(size=(900, 500)),
             ).out
         ).convert("RGB")
     )
@@ -87,7 +113,9 @@ def test_the_legend_names_what_the_colours_mean(certain, tmp_path, color):
 
 @pytest.mark.parametrize("color", ["confidence", "views", "votes", "inferred"])
 def test_a_frame_without_the_field_is_an_error_that_says_how_to_make_it(certain, tmp_path, color):
-    with pytest.raises(MissingDataError, match="found none in 1 of 2 frames, such as frame 1") as caught:
+    with pytest.raises(
+        MissingDataError, match="found none in 1 of 2 frames, such as frame 1"
+    ) as caught:
         render(Scene(certain, frames=(0, 2)), tmp_path / "a.gif", color=color)
     assert ("--keep-evidence" in str(caught.value)) is (color != "votes")
     assert list(tmp_path.iterdir()) == []

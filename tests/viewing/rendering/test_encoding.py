@@ -60,7 +60,8 @@ def test_a_png_says_its_resolution_where_one_is_given(tmp_path):
 @pytest.mark.parametrize("name", ["a.png", "a.gif", "a.mp4", "a.webp"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, CarlascError])
 def test_interrupted_pictures_leave_no_file(tmp_path, monkeypatch, name, error):
-    temporary = tmp_path / "temporary"  # of its own: other tests use that of the system at the same time
+    # of its own: other tests use that of the system at the same time
+    temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
 

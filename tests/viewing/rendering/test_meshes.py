@@ -7,7 +7,8 @@ from carlasc.viewing.rendering.meshes import arrows, box, footprint, grid_mesh, 
 SPECS = [
     GridSpec("cartesian", (6, 5, 4), (-3, -2.5, -2), (3, 2.5, 2)),
     GridSpec.published("cylindrical").with_size((5, 40, 4)),
-    GridSpec("cylindrical", (5, 6, 4), (1.0, -1.0, -2.0), (6.0, 2.0, 2.0)),  # wide wedges, part of a turn
+    # wide wedges, part of a turn
+    GridSpec("cylindrical", (5, 6, 4), (1.0, -1.0, -2.0), (6.0, 2.0, 2.0)),
 ]
 
 
@@ -80,7 +81,8 @@ def test_boxes_and_arrows_are_closed_and_face_outwards():
         (arrows(tail, way, (0, 0, 0), 0.3), None),
     ):
         corners = mesh.corners.astype(float)
-        # the divergence theorem: the volume within a closed surface that faces outwards is positive, wherever the origin is
+        # the divergence theorem: the volume within a closed surface that faces outwards is
+        # positive, wherever the origin is
         volumes = []
         for origin in np.random.default_rng(0).normal(0, 5, (3, 3)):
             c = corners - origin
@@ -104,7 +106,9 @@ def test_a_floor_hides_the_lowest_faces_of_the_lowest_cells_alone():
     occupied = np.zeros(spec.size, np.bool_)
     occupied[1, 1, [0, 2]] = True
     colors = np.zeros((*spec.size, 3), np.uint8)
-    bare, standing = (grid_mesh(spec, colors, occupied, on_floor=on_floor) for on_floor in (False, True))
+    bare, standing = (
+        grid_mesh(spec, colors, occupied, on_floor=on_floor) for on_floor in (False, True)
+    )
     lowest = (bare.corners[:, :, 2] == 0).all(1)
     assert lowest.sum() == 1
     for name in ("corners", "normals", "colors", "openness", "edges", "open_sky"):

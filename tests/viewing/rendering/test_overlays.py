@@ -21,7 +21,9 @@ GREY = 100
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Two frames with a camera that looks along x, a vehicle of one voxel, and a building of one voxel behind it and one beside it."""
+    """Two frames with a camera that looks along x, a vehicle of one voxel, and a building of one
+    voxel behind it and one beside it.
+    """
     root = tmp_path_factory.mktemp("scene")
     writer = FolderSink(root).sequence("Train/A/cartesian")
     matrix = np.array([[100.0, 0, 99.5], [0, 100, 59.5], [0, 0, 1]])
@@ -34,7 +36,9 @@ def scene(tmp_path_factory):
     for frame in range(2):
         writer.write("evaluation/labels", frame, labels)
         writer.write("evaluation/counts", frame, np.ones(SPEC.size, np.float32))
-        writer.write("images.front.png", frame, encode_image(np.full((120, 200, 3), GREY, np.uint8), "PNG"))
+        writer.write(
+            "images.front.png", frame, encode_image(np.full((120, 200, 3), GREY, np.uint8), "PNG")
+        )
     return root, camera
 
 
@@ -52,7 +56,8 @@ def test_voxels_are_drawn_where_they_are_and_hidden_ones_are_not(scene, tmp_path
     picture = np.asarray(Image.open(tmp_path / "a.png")).astype(int)
     assert picture.shape == (120, 200, 3) and result.frames == (0,)
     expected = {label: (GREY + CARLA.palette[label].astype(int)) // 2 for label in (1, 10)}
-    assert np.abs(picture[pixel_of(camera, 8, 0.5, 0.5)] - expected[10]).max() <= 1  # the building behind is hidden
+    # the building behind is hidden
+    assert np.abs(picture[pixel_of(camera, 8, 0.5, 0.5)] - expected[10]).max() <= 1
     assert np.abs(picture[pixel_of(camera, 12.2, 3.5, 0.5)] - expected[1]).max() <= 1
     for nothing in ((8, 1.5, 0.5), (8, 0.5, 2.0), (8, -0.5, 0.5)):
         assert (picture[pixel_of(camera, *nothing)] == GREY).all()
@@ -63,10 +68,20 @@ def test_voxels_are_drawn_where_they_are_and_hidden_ones_are_not(scene, tmp_path
 def test_the_command_draws_a_picture_and_a_film(scene, tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     for name, frames in (("a.png", 1), ("b.gif", 2)):
-        arguments = ["render", str(scene[0]), "--camera", "front", "-o", str(tmp_path / name), "--json"]
+        arguments = [
+            "render",
+            str(scene[0]),
+            "--camera",
+            "front",
+            "-o",
+            str(tmp_path / name),
+            "--json",
+        ]
         ran = CliRunner().invoke(app, arguments)
         assert ran.exit_code == 0, ran.output
-        assert json.loads(ran.output)["pictures"] == frames and (tmp_path / name).stat().st_size > 100
+        assert (
+            json.loads(ran.output)["pictures"] == frames and (tmp_path / name).stat().st_size > 100
+        )
 
 
 def test_what_cannot_be_drawn_is_said_in_one_line(scene, tmp_path):

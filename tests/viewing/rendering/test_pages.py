@@ -67,9 +67,15 @@ def test_square_pictures_have_their_legend_beside_them_wide_ones_below():
 def test_swatches_and_titles_are_drawn_at_their_positions():
     legend = [Entry("red", (200, 0, 0)), Entry("blue", (0, 0, 200))]
     page = plan_page((400, 300), 2, titled=True, legend=legend)
-    pictures = [np.full((box.height, box.width, 3), 90 + 60 * i, np.uint8) for i, box in enumerate(page.panels)]
+    pictures = [
+        np.full((box.height, box.width, 3), 90 + 60 * i, np.uint8)
+        for i, box in enumerate(page.panels)
+    ]
     drawn = draw_page(
-        page, pictures, ["left", "a title that is much too long for the place that it has got"], [None, "empty"]
+        page,
+        pictures,
+        ["left", "a title that is much too long for the place that it has got"],
+        [None, "empty"],
     )
     for entry, box in zip(page.entries, page.entry_boxes, strict=True):
         middle = drawn[box.y + box.height // 2, box.x + page.font_size // 2]
@@ -78,7 +84,10 @@ def test_swatches_and_titles_are_drawn_at_their_positions():
         assert (drawn[box.y : box.y + box.height, box.x : box.x + box.width] < 128).any()
     first, second = page.panels
     assert (drawn[first.y : first.y + first.height, first.x : first.x + first.width] == 90).all()
-    assert (drawn[second.y : second.y + second.height, second.x : second.x + second.width] != 150).any()  # the note
+    # the note
+    assert (
+        drawn[second.y : second.y + second.height, second.x : second.x + second.width] != 150
+    ).any()
 
 
 @pytest.mark.parametrize("size", [(10, 10), (0, 500), (-5, 500), (100_000, 500)])

@@ -24,7 +24,9 @@ def bare(**options):
 @pytest.fixture(scope="module")
 def moved(tmp_path_factory):
     """The same scene with the red block 4 m farther ahead."""
-    return write_blocks(tmp_path_factory.mktemp("moved") / "Train" / "Town02_Light" / "cartesian", shift=4.0)
+    return write_blocks(
+        tmp_path_factory.mktemp("moved") / "Train" / "Town02_Light" / "cartesian", shift=4.0
+    )
 
 
 @pytest.fixture
@@ -32,7 +34,9 @@ def captions(monkeypatch):
     """The texts of the panels that are drawn."""
     drawn = []
     original = pictures.draw_page
-    monkeypatch.setattr(pictures, "draw_page", lambda *a, **k: drawn.append(a[2]) or original(*a, **k))
+    monkeypatch.setattr(
+        pictures, "draw_page", lambda *a, **k: drawn.append(a[2]) or original(*a, **k)
+    )
     return drawn
 
 
@@ -53,7 +57,9 @@ def test_two_sources_are_drawn_from_the_same_camera(blocks, moved, tmp_path, cap
     ahead = [middle_of(red_pixels(part)) for part in (left, right)]
     scale = (ahead[0][1] - ahead[1][1]) / 4  # pixels per metre; ahead is up
     assert ahead[0][0] == pytest.approx(ahead[1][0], abs=1)
-    assert scale == pytest.approx(np.hypot(*np.subtract(ahead[0], still[0])) / np.hypot(18, 11), rel=0.05)
+    assert scale == pytest.approx(
+        np.hypot(*np.subtract(ahead[0], still[0])) / np.hypot(18, 11), rel=0.05
+    )
     assert captions == [["(a) Train / Town01_Light", "(b) Train / Town02_Light"]]
 
 
@@ -65,20 +71,29 @@ def test_grids_of_another_size_are_drawn_at_the_same_scale(blocks, tmp_path):
     small = write_blocks(tmp_path / "Train" / "Small" / "cartesian", spec=half)
     result = render([blocks, small], tmp_path / "a.png", camera=ABOVE, style=bare(size=(600, 330)))
     left, right = halves(picture(result.out))
-    np.testing.assert_allclose(middle_of(blue_pixels(left)), middle_of(blue_pixels(right)), atol=1.5)
+    np.testing.assert_allclose(
+        middle_of(blue_pixels(left)), middle_of(blue_pixels(right)), atol=1.5
+    )
 
 
 def test_frames_of_one_source_become_panels_in_reading_order(blocks, tmp_path, captions):
     result = render(
-        [Scene(blocks, frames=(0, 3))], tmp_path / "a.png", camera=ABOVE, style=bare(size=(900, 330), columns=3)
+        [Scene(blocks, frames=(0, 3))],
+        tmp_path / "a.png",
+        camera=ABOVE,
+        style=bare(size=(900, 330), columns=3),
     )
     assert result.frames == (0, 1, 2) and result.pictures == 1
-    rows = [middle_of(red_pixels(part))[1] for part in np.array_split(picture(result.out), 3, axis=1)]
+    rows = [
+        middle_of(red_pixels(part))[1] for part in np.array_split(picture(result.out), 3, axis=1)
+    ]
     assert rows[0] > rows[1] > rows[2]  # the block moves ahead
     assert captions == [["(a) frame 0", "(b) frame 1", "(c) frame 2"]]
 
 
-def test_several_frames_of_several_sources_have_a_row_for_each_source(blocks, moved, tmp_path, captions):
+def test_several_frames_of_several_sources_have_a_row_for_each_source(
+    blocks, moved, tmp_path, captions
+):
     scenes = [Scene(source, frames=(0, 3), every=2) for source in (blocks, moved)]
     result = render(scenes, tmp_path / "a.png", camera=ABOVE, style=bare(size=(600, 660)))
     parts = [half for row in np.array_split(picture(result.out), 2, axis=0) for half in halves(row)]
@@ -89,7 +104,13 @@ def test_several_frames_of_several_sources_have_a_row_for_each_source(blocks, mo
 
 
 def test_a_film_shows_the_sources_beside_each_other(blocks, moved, tmp_path, captions):
-    result = render([blocks, moved], tmp_path / "a.mp4", camera=ABOVE, style=bare(size=(600, 330)), run=Run(workers=1))
+    result = render(
+        [blocks, moved],
+        tmp_path / "a.mp4",
+        camera=ABOVE,
+        style=bare(size=(600, 330)),
+        run=Run(workers=1),
+    )
     _, frames = read_mp4(result.out)
     assert (result.frames, len(frames)) == ((0, 1, 2), 3)
     for frame in frames:
@@ -99,7 +120,12 @@ def test_a_film_shows_the_sources_beside_each_other(blocks, moved, tmp_path, cap
 
 
 def test_own_captions_follow_the_letters(blocks, moved, tmp_path, captions):
-    render([blocks, moved], tmp_path / "a.png", camera=ABOVE, style=bare(size=(400, 230), captions=["before", ""]))
+    render(
+        [blocks, moved],
+        tmp_path / "a.png",
+        camera=ABOVE,
+        style=bare(size=(400, 230), captions=["before", ""]),
+    )
     assert captions == [["(a) before", "(b)"]]
 
 
@@ -112,7 +138,12 @@ def test_contents_and_views_are_panels_too(blocks, tmp_path, captions):
         camera=camera,
         style=bare(size=(400, 330)),
     )
-    names = ["(a) grid, from behind", "(b) grid, from above", "(c) scan, from behind", "(d) scan, from above"]
+    names = [
+        "(a) grid, from behind",
+        "(b) grid, from above",
+        "(c) scan, from behind",
+        "(d) scan, from above",
+    ]
     assert captions == [names]
 
 
@@ -123,10 +154,20 @@ def test_impossible_panels_are_refused(blocks, moved, tmp_path):
         StyleOptions(columns=0)
     cases = [
         ([], {}, ArgumentError, "source: expected at least one"),
-        ([blocks, moved], {"captions": ["one"]}, ArgumentError, "captions: expected one for each of the 2 panels"),
+        (
+            [blocks, moved],
+            {"captions": ["one"]},
+            ArgumentError,
+            "captions: expected one for each of the 2 panels",
+        ),
         ([blocks, right], {}, ArgumentError, "the same axes"),
         (blocks, {"captions": ["one"]}, ArgumentError, "captions: expected several"),
-        ([Scene(blocks, frames=(0, 2)), late], {"out": "a.mp4"}, MissingDataError, "frames that all sources have"),
+        (
+            [Scene(blocks, frames=(0, 2)), late],
+            {"out": "a.mp4"},
+            MissingDataError,
+            "frames that all sources have",
+        ),
     ]
     for source, options, error, message in cases:
         out = tmp_path / options.pop("out", "a.png")

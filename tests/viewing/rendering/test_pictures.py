@@ -1,6 +1,14 @@
 import numpy as np
 import pytest
-from helpers.readers.pixels import BLUE, RED, blue_pixels, grid_with, has_color, middle_of, red_pixels
+from helpers.readers.pixels import (
+    BLUE,
+    RED,
+    blue_pixels,
+    grid_with,
+    has_color,
+    middle_of,
+    red_pixels,
+)
 
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
@@ -73,9 +81,13 @@ def test_up_is_up_and_near_voxels_hide_far_ones():
     assert middle_of(red_pixels(picture))[1] < middle_of(blue_pixels(picture))[1]
     wall = grid_with({(0, 0, -0.5): RED, (-3, 0, -0.5): BLUE}, size_m=2.4)
     level = Viewpoint(elevation_rad=0.0)
-    assert not red_pixels(render_grid(wall, viewpoint=level, size=SIZE, legend=False, ego=False)).any()
+    assert not red_pixels(
+        render_grid(wall, viewpoint=level, size=SIZE, legend=False, ego=False)
+    ).any()
     behind = Viewpoint(azimuth_rad=np.pi, elevation_rad=0.0)
-    assert not blue_pixels(render_grid(wall, viewpoint=behind, size=SIZE, legend=False, ego=False)).any()
+    assert not blue_pixels(
+        render_grid(wall, viewpoint=behind, size=SIZE, legend=False, ego=False)
+    ).any()
 
 
 def test_free_and_unknown_voxels_are_not_drawn():
@@ -92,7 +104,8 @@ def test_the_picture_of_an_empty_grid_says_so():
     assert scene.note == "no voxel is occupied"
     picture = render_grid(empty, size=SIZE, ego=False)
     silent = draw_panels(
-        [Panel(type(scene)(scene.extent, grid_drawing(empty, ClassColors(), ego=False).mesh))], size=SIZE
+        [Panel(type(scene)(scene.extent, grid_drawing(empty, ClassColors(), ego=False).mesh))],
+        size=SIZE,
     )
     assert (silent < 250).any()  # the ground
     assert (silent != picture).any() and picture.min() < 130 < silent.min()  # the words
@@ -107,7 +120,9 @@ def test_a_sunlit_top_has_exactly_the_legends_colour():
 @views
 def test_the_legend_names_the_classes_present_and_no_other(view):
     grid = grid_with({(0, 0, -0.5): BLUE, (5, 5, -0.5): RED})
-    with_legend, without = (render_grid(grid, view=view, size=(640, 360), legend=shown) for shown in (True, False))
+    with_legend, without = (
+        render_grid(grid, view=view, size=(640, 360), legend=shown) for shown in (True, False)
+    )
     assert with_legend.shape == without.shape == (360, 640, 3)
     strip = with_legend[-40:] if view == "perspective" else with_legend[:, 400:]
     assert has_color(strip, CARLA.colors[BLUE], 0)
@@ -166,7 +181,13 @@ def test_faces_hide_points_behind_them_and_not_those_in_front():
     """The ego vehicle is made of faces: points behind it are hidden, points before it are not."""
     level = Viewpoint(elevation_rad=0.0)
     behind, before = (
-        render_scan(scan_of(((x, 0, -1.3), RED, (0, 0, 0), 0)), viewpoint=level, size=SIZE, legend=False, extent=EXTENT)
+        render_scan(
+            scan_of(((x, 0, -1.3), RED, (0, 0, 0), 0)),
+            viewpoint=level,
+            size=SIZE,
+            legend=False,
+            extent=EXTENT,
+        )
         for x in (6.0, -6.0)
     )
     assert red_pixels(before).sum() > 3 * red_pixels(behind).sum()
@@ -174,7 +195,9 @@ def test_faces_hide_points_behind_them_and_not_those_in_front():
 
 def test_points_without_labels_are_drawn_by_height():
     scan = scan_of(((5, 0, -1.8), 0, (0, 0, 0), 0), ((-5, 0, 1.8), 0, (0, 0, 0), 0))
-    picture = render_scan(Scan(scan.points), view="bev", size=SIZE, legend=False, ego=False, extent=EXTENT)
+    picture = render_scan(
+        Scan(scan.points), view="bev", size=SIZE, legend=False, ego=False, extent=EXTENT
+    )
     rows, columns = np.nonzero((picture < 200).any(-1))
     ahead = picture[rows[rows < 90], columns[rows < 90]].mean(0)
     astern = picture[rows[rows > 90], columns[rows > 90]].mean(0)
@@ -191,26 +214,33 @@ def test_points_that_are_not_finite_are_left_out():
     scan = scan_of(((10, 5, 0), RED, (0, 0, 0), 0))
     broken = scan.points.copy()
     broken[:5] = np.nan
-    picture = render_scan(Scan(broken, scan.labels), view="bev", size=SIZE, legend=False, extent=EXTENT)
+    picture = render_scan(
+        Scan(broken, scan.labels), view="bev", size=SIZE, legend=False, extent=EXTENT
+    )
     assert red_pixels(picture).any()
 
 
 def test_each_moving_actor_has_an_arrow_as_long_as_its_movement_in_one_second():
     scan = scan_of(
-        ((10, 5, 0), RED, (0, 2, 0), 7), ((11, 5, 0), RED, (0, 2, 0), 7), ((-10, -15, 0), BLUE, (0, 0, 0), 9)
+        ((10, 5, 0), RED, (0, 2, 0), 7),
+        ((11, 5, 0), RED, (0, 2, 0), 7),
+        ((-10, -15, 0), BLUE, (0, 0, 0), 9),
     )
     tails, vectors = motion_arrows(scan.select(np.linalg.norm(scan.flow, axis=1) > 0.2))
     assert len(tails) == 1
     np.testing.assert_allclose(tails[0, :2], (10.5, 5), atol=0.1)
     assert tails[0, 2] > scan.points[:, 2].max()
     np.testing.assert_allclose(vectors, [[0, 2, 0]], atol=1e-6)
-    by_place = motion_arrows(Scan(scan.points, scan.labels, scan.flow))  # instances unknown: by cells of 3 m
+    # instances unknown: by cells of 3 m
+    by_place = motion_arrows(Scan(scan.points, scan.labels, scan.flow))
     assert 1 <= len(by_place[0]) <= 4
 
 
 def test_flow_points_the_right_way_in_the_picture():
     scan = scan_of(((0, 0, 0), BLUE, (8, 8, 0), 1), ((-10, -15, 0), RED, (0, 0, 0), 2))
-    picture = render_scan(scan, view="bev", size=(400, 400), legend=False, ego=False, flow=True, extent=EXTENT)
+    picture = render_scan(
+        scan, view="bev", size=(400, 400), legend=False, ego=False, flow=True, extent=EXTENT
+    )
     dark = (picture < 60).all(-1)
     rows, columns = np.nonzero(dark)
     assert rows.min() < 200 and columns.max() > 200  # ahead and to the right
@@ -225,7 +255,9 @@ def test_flow_of_a_scan_without_it_is_refused():
 
 def test_each_kind_of_error_has_its_colour_where_the_truth_is_known():
     truth = grid_with({(10, 10, -0.5): 10, (10, -10, -0.5): 10, (-10, 10, -0.5): 10}, size_m=4.0)
-    prediction = grid_with({(10, 10, -0.5): 10, (10, -10, -0.5): 4, (-10, -10, -0.5): 10, (0, 0, -0.5): 4}, size_m=4.0)
+    prediction = grid_with(
+        {(10, 10, -0.5): 10, (10, -10, -0.5): 4, (-10, -10, -0.5): 10, (0, 0, -0.5): 4}, size_m=4.0
+    )
     truth.counts[54:74, 54:74] = 0  # the last one of the prediction's is where nobody knows
     right, wrong, missed, invented = (palette.ERRORS.colors[outcome] for outcome in (1, 2, 3, 4))
     quarters = {(1, 1): right, (1, -1): wrong, (-1, 1): missed, (-1, -1): invented}
@@ -238,8 +270,13 @@ def test_each_kind_of_error_has_its_colour_where_the_truth_is_known():
 
 
 def test_a_comparison_is_drawn_side_by_side():
-    truth, prediction = grid_with({(0, 0, -0.5): BLUE}, size_m=5.0), grid_with({(0, 0, -0.5): RED}, size_m=5.0)
-    picture = render_comparison(prediction, truth, size=(800, 300), errors=False, ego=False, legend=False)
+    truth, prediction = (
+        grid_with({(0, 0, -0.5): BLUE}, size_m=5.0),
+        grid_with({(0, 0, -0.5): RED}, size_m=5.0),
+    )
+    picture = render_comparison(
+        prediction, truth, size=(800, 300), errors=False, ego=False, legend=False
+    )
     assert middle_of(red_pixels(picture))[0] < 400 < middle_of(blue_pixels(picture))[0]
     with pytest.raises(ArgumentError, match="predicted grid"):
         render_comparison(prediction, grid_with({(0, 0, -0.5): RED}, PUBLISHED[1]), size=SIZE)
@@ -257,8 +294,12 @@ def test_edges_of_voxels_are_drawn_only_if_the_voxels_are_large():
     light = CARLA.colors[CARLA.id_of("Terrain")]
 
     def shades(size):
-        picture = render_grid(Grid(spec, labels), view="bev", size=size, legend=False, ego=False).astype(int)
-        middle = picture[int(size[1] * 0.35) : int(size[1] * 0.65), int(size[0] * 0.35) : int(size[0] * 0.65)]
+        picture = render_grid(
+            Grid(spec, labels), view="bev", size=size, legend=False, ego=False
+        ).astype(int)
+        middle = picture[
+            int(size[1] * 0.35) : int(size[1] * 0.65), int(size[0] * 0.35) : int(size[0] * 0.65)
+        ]
         return np.abs(middle - light).max()
 
     assert shades((400, 400)) > 20
@@ -284,8 +325,12 @@ def test_unknown_axes_are_refused():
 def test_points_have_the_colours_of_their_classes_and_a_legend():
     scan = scan_of(((5, 0, 0), RED, (0, 0, 0), 0), ((0, 5, 0), 0, (0, 0, 0), 0))
     drawing = scan_drawing(scan, ClassColors())
-    np.testing.assert_array_equal(drawing.point_colors[:200], np.broadcast_to(CARLA.colors[RED], (200, 3)))
-    np.testing.assert_array_equal(drawing.point_colors[200:], np.broadcast_to(palette.UNLABELLED, (200, 3)))
+    np.testing.assert_array_equal(
+        drawing.point_colors[:200], np.broadcast_to(CARLA.colors[RED], (200, 3))
+    )
+    np.testing.assert_array_equal(
+        drawing.point_colors[200:], np.broadcast_to(palette.UNLABELLED, (200, 3))
+    )
     assert [(entry.name, entry.color) for entry in drawing.legend] == [
         ("unlabelled", palette.UNLABELLED),
         ("Pedestrian", CARLA.colors[RED]),
@@ -297,8 +342,12 @@ def test_points_have_the_colours_of_their_classes_and_a_legend():
 def test_flow_shows_what_moves_faster_than_20_centimetres_a_second():
     scan = scan_of(((5, 0, 0), RED, (0.3, 0, 0), 1), ((0, 5, 0), BLUE, (0, 0.15, 0), 2))
     drawing = flow_drawing(scan, ClassColors())
-    np.testing.assert_array_equal(drawing.point_colors[:200], np.broadcast_to(CARLA.colors[RED], (200, 3)))
-    np.testing.assert_array_equal(drawing.point_colors[200:], np.broadcast_to(palette.STATIC, (200, 3)))
+    np.testing.assert_array_equal(
+        drawing.point_colors[:200], np.broadcast_to(CARLA.colors[RED], (200, 3))
+    )
+    np.testing.assert_array_equal(
+        drawing.point_colors[200:], np.broadcast_to(palette.STATIC, (200, 3))
+    )
     assert [(entry.color, entry.order) for entry in drawing.legend] == [
         (palette.STATIC, -1),
         (CARLA.colors[RED], RED),
@@ -312,7 +361,9 @@ def test_points_without_instances_share_an_arrow_within_three_metres():
     points = np.array([[0.5, 0.5, 0], [2.5, 2.5, 1], [3.5, 0.5, 0], [-0.5, 0.5, 0]], np.float32)
     flow = np.tile(np.array([1, 0, 0], np.float32), (4, 1))
     tails, _ = motion_arrows(Scan(points, flow=flow))
-    np.testing.assert_allclose(sorted(tails.tolist()), [[-0.5, 0.5, 0.4], [1.5, 1.5, 1.4], [3.5, 0.5, 0.4]], atol=1e-6)
+    np.testing.assert_allclose(
+        sorted(tails.tolist()), [[-0.5, 0.5, 0.4], [1.5, 1.5, 1.4], [3.5, 0.5, 0.4]], atol=1e-6
+    )
 
 
 def test_the_ego_vehicle_is_under_the_sensor_which_is_half_a_metre_behind_its_middle():
@@ -331,13 +382,18 @@ def test_a_scan_is_shown_to_at_most_40_metres_and_with_the_surroundings_of_the_s
 def test_the_errors_have_a_legend_after_the_classes_and_say_when_there_is_nothing_to_compare():
     truth, nothing = grid_with({(0, 0, -0.5): BLUE}), grid_with({})
     drawing = error_drawing(truth, truth)
-    assert [entry.name for entry in drawing.legend][:2] == ["right class", "wrong class"] and len(drawing.legend) == 4
+    assert [entry.name for entry in drawing.legend][:2] == ["right class", "wrong class"] and len(
+        drawing.legend
+    ) == 4
     assert min(entry.order for entry in drawing.legend) > 1000 and drawing.note is None
     assert error_drawing(nothing, nothing).note == "no known voxel is occupied in either"
 
 
 def test_the_legend_names_the_classes_of_all_panels():
-    panels = [Panel(grid_drawing(grid_with({(0, 0, -0.5): label}), ClassColors()), "bev") for label in (RED, BLUE)]
+    panels = [
+        Panel(grid_drawing(grid_with({(0, 0, -0.5): label}), ClassColors()), "bev")
+        for label in (RED, BLUE)
+    ]
     legend = draw_panels(panels, size=(640, 360))[-40:]
     assert has_color(legend, CARLA.colors[RED], 0) and has_color(legend, CARLA.colors[BLUE], 0)
 
@@ -348,7 +404,11 @@ def test_shadows_fall_ahead_to_the_right(axes):
     picture = render_grid(tower, view="bev", size=(400, 400), legend=False, ego=False, axes=axes)
     right, ahead = (int(400 * 0.98 / 51.2 * metres) for metres in (1.3, 1.0))
     assert picture[200 - ahead, 200 + right].max() < 200  # in the shadow
-    for row, column in ((200 + ahead, 200 - right), (200 + ahead, 200 + right), (200 - ahead, 200 - right)):
+    for row, column in (
+        (200 + ahead, 200 - right),
+        (200 + ahead, 200 + right),
+        (200 - ahead, 200 - right),
+    ):
         assert picture[row, column].min() > 225, (row, column)
 
 
@@ -357,7 +417,9 @@ def test_walls_hide_a_part_of_the_sky():
     ground = {(0, 0, -1.8): CARLA.id_of("Terrain")}
     wall = {(2.4, y, z): BLUE for y in (-2, -1, 0, 1, 2) for z in (-1.5, -0.5, 0.5)}
     lone, beside = (
-        render_grid(grid_with(blocks, size_m=1.6), view="bev", size=(400, 400), legend=False, ego=False)
+        render_grid(
+            grid_with(blocks, size_m=1.6), view="bev", size=(400, 400), legend=False, ego=False
+        )
         for blocks in (ground, ground | wall)
     )
     assert has_color(lone[197:204, 197:204], CARLA.colors[CARLA.id_of("Terrain")])
@@ -365,8 +427,15 @@ def test_walls_hide_a_part_of_the_sky():
 
 
 def test_points_behind_others_are_darker():
-    x, y = (axis.reshape(-1) for axis in np.meshgrid(np.arange(-10, 10, 0.05), np.arange(-10, 10, 0.05)))
-    scan = Scan(np.column_stack([x, y, np.where(y > 0, 1.0, -1.0)]).astype(np.float32), np.full(x.size, RED, np.uint8))
-    picture = render_scan(scan, view="bev", size=(400, 400), legend=False, ego=False, extent=EXTENT).astype(float)
+    x, y = (
+        axis.reshape(-1) for axis in np.meshgrid(np.arange(-10, 10, 0.05), np.arange(-10, 10, 0.05))
+    )
+    scan = Scan(
+        np.column_stack([x, y, np.where(y > 0, 1.0, -1.0)]).astype(np.float32),
+        np.full(x.size, RED, np.uint8),
+    )
+    picture = render_scan(
+        scan, view="bev", size=(400, 400), legend=False, ego=False, extent=EXTENT
+    ).astype(float)
     below = picture[150:250, 150:200].mean((0, 2))  # columns from the left towards the edge
     assert below[-2] < 0.9 * below[:40].mean()

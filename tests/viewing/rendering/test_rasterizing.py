@@ -33,7 +33,9 @@ def cast_rays(mesh, camera):
 
 
 def check(mesh, camera, share=2e-4):
-    """Compare with rays; only samples on an edge, at most a share of all, may show another face, which is equally near."""
+    """Compare with rays; only samples on an edge, at most a share of all, may show another face,
+    which is equally near.
+    """
     origins, directions = camera.rays(WIDTH, HEIGHT, slice(0, HEIGHT))
     triangle = visible_triangles(mesh, camera, WIDTH, HEIGHT).reshape(-1)
     expected = cast_rays(mesh, camera)
@@ -41,7 +43,8 @@ def check(mesh, camera, share=2e-4):
     same = triangle == expected["primID"]
     assert (~same).mean() <= share
     cosine = (mesh.normals[triangle >> 1] * directions).sum(1) / np.linalg.norm(directions, axis=1)
-    hit = same & (triangle >= 0) & (abs(cosine) > 0.05)  # along a face, single precision is only as exact as that
+    # along a face, single precision is only as exact as that
+    hit = same & (triangle >= 0) & (abs(cosine) > 0.05)
     np.testing.assert_allclose(u[hit], expected["u"][hit], atol=1e-4)
     np.testing.assert_allclose(v[hit], expected["v"][hit], atol=1e-4)
     np.testing.assert_allclose(depth[hit], expected["tfar"][hit], rtol=1e-5, atol=1e-4)
@@ -51,7 +54,9 @@ def check(mesh, camera, share=2e-4):
 
 def town(coordinates):
     lower = (0.2, -np.pi, -2.0) if coordinates == "cylindrical" else (-8.0, -8.0, -2.0)
-    spec = GridSpec(coordinates, (24, 32, 6), lower, (8.0, np.pi if coordinates == "cylindrical" else 8.0, 1.0))
+    spec = GridSpec(
+        coordinates, (24, 32, 6), lower, (8.0, np.pi if coordinates == "cylindrical" else 8.0, 1.0)
+    )
     occupied = np.random.default_rng(3).random(spec.size) < 0.15
     mesh = grid_mesh(spec, np.zeros((*spec.size, 3), np.uint8), occupied)
     floor = quads(footprint(spec, spec.lower[2] - 2e-3), (9, 9, 9))
@@ -62,13 +67,20 @@ def town(coordinates):
 @pytest.mark.parametrize("coordinates", ["cartesian", "cylindrical"])
 def test_samples_show_what_rays_hit(coordinates, view):
     mesh = town(coordinates)
-    camera = perspective_camera(mesh.corners.reshape(-1, 3).astype(float), VIEWS[view], WIDTH / HEIGHT)
+    camera = perspective_camera(
+        mesh.corners.reshape(-1, 3).astype(float), VIEWS[view], WIDTH / HEIGHT
+    )
     assert check(mesh, camera) > 0.3
 
 
 def test_a_camera_above_shows_what_parallel_rays_hit():
     mesh = town("cartesian")
-    extent = mesh.corners.reshape(-1, 3).astype(float) + (0.013, 0.007, 0.0)  # no row of samples is on edges
+    # no row of samples is on edges
+    extent = mesh.corners.reshape(-1, 3).astype(float) + (
+        0.013,
+        0.007,
+        0.0,
+    )
     assert check(mesh, birdseye_camera(extent, WIDTH / HEIGHT)) > 0.3
 
 
@@ -77,15 +89,25 @@ def test_a_camera_above_shows_what_parallel_rays_hit():
 def test_triangles_anywhere_also_around_and_behind_the_camera(seed, orthographic):
     rng = np.random.default_rng(seed)
     middle, one, two = rng.normal(scale=(4, 4, 4), size=(3, 12, 1, 3))
-    corners = (middle + np.concatenate([-one - two, one - two, one + two, two - one], axis=1)).astype(np.float32)
-    camera = Camera(rng.normal(size=3), np.linalg.qr(rng.normal(size=(3, 3)))[0], 0.7, orthographic=orthographic)
+    corners = (
+        middle + np.concatenate([-one - two, one - two, one + two, two - one], axis=1)
+    ).astype(np.float32)
+    camera = Camera(
+        rng.normal(size=3), np.linalg.qr(rng.normal(size=(3, 3)))[0], 0.7, orthographic=orthographic
+    )
     check(quads(corners, (1, 2, 3)), camera, share=2e-3)
 
 
 def test_faces_with_a_common_edge_leave_no_gap():
     x = np.linspace(-3, 3, 40)
-    corners = [[(a, c, 0), (b, c, 0), (b, d, 0), (a, d, 0)] for a, b in pairwise(x) for c, d in pairwise(x)]
-    camera = Camera(np.array([0.1, 0.2, 1.0]), np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]) * [[1], [-1], [1]], 1.0)
+    corners = [
+        [(a, c, 0), (b, c, 0), (b, d, 0), (a, d, 0)] for a, b in pairwise(x) for c, d in pairwise(x)
+    ]
+    camera = Camera(
+        np.array([0.1, 0.2, 1.0]),
+        np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]) * [[1], [-1], [1]],
+        1.0,
+    )
     assert (visible_triangles(quads(corners, (1, 2, 3)), camera, WIDTH, HEIGHT) >= 0).all()
 
 

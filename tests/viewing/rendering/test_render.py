@@ -10,10 +10,24 @@ from carlasc import Run
 from carlasc.core.geometry import translation
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLASC11
-from carlasc.errors import ArgumentError, CarlascError, ConflictError, DependencyError, FormatError, MissingDataError
+from carlasc.errors import (
+    ArgumentError,
+    CarlascError,
+    ConflictError,
+    DependencyError,
+    FormatError,
+    MissingDataError,
+)
 from carlasc.storage import FolderSink, FolderSource, layout
 from carlasc.storage.files import to_json
-from carlasc.viewing import CameraOptions, Scene, StyleOptions, Viewpoint, colorblind_palette, render
+from carlasc.viewing import (
+    CameraOptions,
+    Scene,
+    StyleOptions,
+    Viewpoint,
+    colorblind_palette,
+    render,
+)
 
 pytest.importorskip("embreex")
 
@@ -26,8 +40,12 @@ def picture(path):
     return np.asarray(Image.open(path).convert("RGB"))
 
 
-def write_sequence(root, path="Train/Town01_Light/cartesian", frames=4, spec=COARSE, metadata=None, block=RED):
-    """A vehicle that drives 2 m a frame towards a block, another standing beside; points, flow, poses, grid."""
+def write_sequence(
+    root, path="Train/Town01_Light/cartesian", frames=4, spec=COARSE, metadata=None, block=RED
+):
+    """A vehicle that drives 2 m a frame towards a block, another standing beside; points, flow,
+    poses, grid.
+    """
     writer = FolderSink(root).sequence(path)
     writer.write_document(f"evaluation/{layout.PARAMS}", to_json(spec.to_params()))
     for frame in range(frames):
@@ -52,7 +70,12 @@ def drive(tmp_path_factory):
 
 def test_a_frame_becomes_a_png(drive, tmp_path):
     result = render(Scene(drive, frames=(2, 3)), tmp_path / "a.png", style=StyleOptions(size=SIZE))
-    assert (result.out, result.frames, result.what, result.pictures) == (tmp_path / "a.png", (2,), ("grid",), 1)
+    assert (result.out, result.frames, result.what, result.pictures) == (
+        tmp_path / "a.png",
+        (2,),
+        ("grid",),
+        1,
+    )
     shown = picture(result.out)
     assert shown.shape == (180, 320, 3)
     assert red_pixels(shown).any()
@@ -73,7 +96,8 @@ def test_a_range_of_frames_becomes_a_film_that_follows_the_vehicle(drive, tmp_pa
     assert done == [(1, 3), (2, 3), (3, 3)]
     rows = [middle_of(red_pixels(frame))[1] for frame in frames]
     scale = 180 * 0.98 / 51.2
-    np.testing.assert_allclose(np.diff(rows), 2 * scale, atol=1.0)  # the block comes 2 m nearer a frame
+    # the block comes 2 m nearer a frame
+    np.testing.assert_allclose(np.diff(rows), 2 * scale, atol=1.0)
 
 
 def test_without_frames_a_film_has_all_of_them_and_a_picture_the_first(drive, tmp_path):
@@ -99,7 +123,8 @@ def test_with_a_still_camera_a_static_block_stays_in_place(drive, tmp_path, view
 
 def test_two_processes_draw_what_one_draws(drive, tmp_path):
     one, two = (
-        render(drive, tmp_path / f"{n}.gif", style=StyleOptions(size=(160, 90)), run=Run(n)).out for n in (1, 2)
+        render(drive, tmp_path / f"{n}.gif", style=StyleOptions(size=(160, 90)), run=Run(n)).out
+        for n in (1, 2)
     )
     assert one.read_bytes() == two.read_bytes()
 
@@ -138,7 +163,9 @@ def test_an_orbit_keeps_its_distance(tmp_path, monkeypatch):
     np.testing.assert_allclose(places, np.broadcast_to(places[0], (8, 2)), atol=1.5)
 
 
-def test_an_orbit_of_one_frame_has_its_own_number_of_pictures_and_rate(drive, tmp_path, monkeypatch):
+def test_an_orbit_of_one_frame_has_its_own_number_of_pictures_and_rate(
+    drive, tmp_path, monkeypatch
+):
     monkeypatch.setattr("carlasc.viewing.rendering.render.ORBIT_PICTURES", 5)
     result = render(
         Scene(drive, frames=(1, 2)),
@@ -182,7 +209,9 @@ def test_a_prediction_is_drawn_beside_its_truth_and_its_errors(drive, tmp_path):
 
 
 def test_a_prediction_in_eleven_classes_is_compared_with_a_truth_in_twenty_three(drive, tmp_path):
-    prediction = write_sequence(tmp_path / "p", metadata={"classes": "carlasc11"}, block=CARLASC11.id_of("Pedestrian"))
+    prediction = write_sequence(
+        tmp_path / "p", metadata={"classes": "carlasc11"}, block=CARLASC11.id_of("Pedestrian")
+    )
     options = {
         "what": "errors",
         "camera": CameraOptions(view="bev"),
@@ -200,13 +229,22 @@ def test_a_prediction_in_eleven_classes_is_compared_with_a_truth_in_twenty_three
 
 
 def test_a_prediction_beside_the_data_is_shown_in_its_own_classes(tmp_path):
-    """Scans are CARLA's 4, a pedestrian; the prediction's params.json says eleven classes, of which 6 is road."""
+    """Scans are CARLA's 4, a pedestrian; the prediction's params.json says eleven classes, of which
+    6 is road.
+    """
     folder = write_sequence(tmp_path)
     params = COARSE.to_params() | {"carlasc": {"classes": "carlasc11"}}
     writer = FolderSink(tmp_path).sequence("Train/Town01_Light/cartesian")
     writer.write_document(f"completion/{layout.PARAMS}", to_json(params))
-    writer.write("completion/labels", 0, grid_with({(10, 5, -0.5): CARLASC11.id_of("Road")}, COARSE, size_m=2.4).labels)
-    options = {"camera": CameraOptions(view="bev"), "style": StyleOptions(size=SIZE, ego=False, legend=False)}
+    writer.write(
+        "completion/labels",
+        0,
+        grid_with({(10, 5, -0.5): CARLASC11.id_of("Road")}, COARSE, size_m=2.4).labels,
+    )
+    options = {
+        "camera": CameraOptions(view="bev"),
+        "style": StyleOptions(size=SIZE, ego=False, legend=False),
+    }
     scene = Scene(folder, grid="completion")
     result = render(scene, tmp_path / "a.png", **options)
     assert result.classes == "carlasc11"
@@ -224,7 +262,9 @@ def test_a_prediction_beside_the_data_is_shown_in_its_own_classes(tmp_path):
 
 def test_the_papers_eleven_classes_can_be_shown(drive, tmp_path):
     result = render(
-        Scene(drive, classes="carlasc11", palette="colorblind"), tmp_path / "a.png", style=StyleOptions(size=(640, 360))
+        Scene(drive, classes="carlasc11", palette="colorblind"),
+        tmp_path / "a.png",
+        style=StyleOptions(size=(640, 360)),
     )
     assert result.classes == "carlasc11"
     legend = picture(result.out)[-40:]
@@ -258,7 +298,13 @@ def test_the_legend_of_a_film_is_that_of_all_its_frames(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "ending", ["evaluation/000002.label", "evaluation/000002.bin", "labels/000002.label", "velodyne/000002.bin"]
+    "ending",
+    [
+        "evaluation/000002.label",
+        "evaluation/000002.bin",
+        "labels/000002.label",
+        "velodyne/000002.bin",
+    ],
 )
 def test_a_frames_file_is_that_frame(drive, tmp_path, ending):
     result = render(drive / ending, tmp_path / "a.png", style=StyleOptions(size=SIZE))
@@ -280,11 +326,20 @@ def test_every_kind_of_source_gives_the_same_picture(drive, tmp_path):
 
 def test_the_first_of_several_sequences_is_shown_and_noted(tmp_path):
     for name in ("Town01_Light", "Town02_Heavy"):
-        write_sequence(tmp_path / "set", f"Train/{name}/cartesian", frames=1, block=RED if "1" in name else BLUE)
+        write_sequence(
+            tmp_path / "set",
+            f"Train/{name}/cartesian",
+            frames=1,
+            block=RED if "1" in name else BLUE,
+        )
     result = render(tmp_path / "set", tmp_path / "a.png", style=StyleOptions(size=SIZE))
     assert result.sequence == "Train/Town01_Light/cartesian"
     assert "2 sequences" in result.notes[0] and "Town01_Light" in result.notes[0]
-    other = render(Scene(tmp_path / "set", sequence="Town02_Heavy"), tmp_path / "b.png", style=StyleOptions(size=SIZE))
+    other = render(
+        Scene(tmp_path / "set", sequence="Town02_Heavy"),
+        tmp_path / "b.png",
+        style=StyleOptions(size=SIZE),
+    )
     assert blue_pixels(picture(other.out)).any()
     with pytest.raises(MissingDataError, match="Town03"):
         render(Scene(tmp_path / "set", sequence="Town03"), tmp_path / "c.png")
@@ -298,7 +353,8 @@ def test_without_a_name_the_file_is_named_after_the_sequence(drive, tmp_path, mo
         == "Town01_Light_scan_000003.png"
     )
     assert (
-        str(render(Scene(drive, frames=(0, 2)), style=StyleOptions(size=SIZE)).out) == "Town01_Light_000000-000001.mp4"
+        str(render(Scene(drive, frames=(0, 2)), style=StyleOptions(size=SIZE)).out)
+        == "Town01_Light_000000-000001.mp4"
     )
 
 
@@ -324,7 +380,12 @@ def test_an_empty_grid_is_noted(tmp_path):
         ({"palette": "rainbow"}, {}, ArgumentError, "palette: .* found 'rainbow'"),
         ({"truth": "nowhere"}, {}, MissingDataError, "nowhere"),
         ({}, {"what": "votes"}, ArgumentError, "what: .* found 'votes'"),
-        ({}, {"what": "errors"}, ArgumentError, "what: errors needs a ground truth: give it with `truth`"),
+        (
+            {},
+            {"what": "errors"},
+            ArgumentError,
+            "what: errors needs a ground truth: give it with `truth`",
+        ),
         ({}, {"camera": FIXED_ORBIT, "out": "a.gif"}, ArgumentError, "orbit"),
         ({}, {"out": "a.jpg"}, ArgumentError, "a.jpg"),
         ({"frames": (0, 3)}, {"out": "a.png"}, ArgumentError, "a single frame for a PNG"),
@@ -375,7 +436,12 @@ def test_still_needs_poses(tmp_path):
     sequence = write_sequence(tmp_path, frames=2)
     (sequence / layout.POSES).unlink()
     with pytest.raises(CarlascError, match=r"poses.txt"):
-        render(sequence, tmp_path / "a.gif", camera=CameraOptions(still=True), style=StyleOptions(size=SIZE))
+        render(
+            sequence,
+            tmp_path / "a.gif",
+            camera=CameraOptions(still=True),
+            style=StyleOptions(size=SIZE),
+        )
 
 
 def test_an_existing_file_is_replaced_only_with_overwrite(drive, tmp_path):
@@ -399,7 +465,8 @@ def test_ctrl_c_leaves_no_file(drive, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("module", "package"), [("embreex", "embreex"), ("PIL", "PIL"), ("imageio_ffmpeg", "imageio_ffmpeg")]
+    ("module", "package"),
+    [("embreex", "embreex"), ("PIL", "PIL"), ("imageio_ffmpeg", "imageio_ffmpeg")],
 )
 def test_a_missing_package_is_named_with_its_extra(drive, tmp_path, monkeypatch, module, package):
     for name in [name for name in sys.modules if name.partition(".")[0] == module]:
@@ -416,17 +483,23 @@ def test_panels_are_titled_by_what_they_show(drive, tmp_path, monkeypatch):
 
     titles = []
     original = pictures.draw_page
-    monkeypatch.setattr(pictures, "draw_page", lambda *a, **k: titles.append(a[2]) or original(*a, **k))
+    monkeypatch.setattr(
+        pictures, "draw_page", lambda *a, **k: titles.append(a[2]) or original(*a, **k)
+    )
     for scene, options in (
         (Scene(drive, truth=drive), {}),
         (drive, {"what": "grid,scan,flow"}),
         (drive, {"camera": CameraOptions(view="both")}),
         (drive, {}),
     ):
-        render(scene, tmp_path / "a.png", style=StyleOptions(size=(160, 90)), overwrite=True, **options)
+        render(
+            scene, tmp_path / "a.png", style=StyleOptions(size=(160, 90)), overwrite=True, **options
+        )
     cells = "cartesian 128 x 128 x 8"
     assert titles[0] == ["prediction", "truth", "errors"]
-    assert titles[1][1:] == ["scan", "scene flow"] and titles[1][0].endswith(cells.split(maxsplit=1)[1])
+    assert titles[1][1:] == ["scan", "scene flow"] and titles[1][0].endswith(
+        cells.split(maxsplit=1)[1]
+    )
     assert titles[2] == ["", ""] and titles[3] == [""]
 
 
@@ -449,13 +522,19 @@ def test_both_views_are_the_perspective_one_and_beside_it_the_one_from_above(dri
 def test_a_picture_shows_the_first_frame_and_every_chooses_others(drive, tmp_path):
     first, same, other = (
         render(scene, tmp_path / f"{number}.png", style=StyleOptions(size=SIZE)).out.read_bytes()
-        for number, scene in enumerate((drive, Scene(drive, frames=(0, 1)), Scene(drive, frames=(3, 4))))
+        for number, scene in enumerate(
+            (drive, Scene(drive, frames=(0, 1)), Scene(drive, frames=(3, 4)))
+        )
     )
     assert first == same != other
-    assert render(Scene(drive, every=3), tmp_path / "d.gif", style=StyleOptions(size=(160, 90))).frames == (0, 3)
+    assert render(
+        Scene(drive, every=3), tmp_path / "d.gif", style=StyleOptions(size=(160, 90))
+    ).frames == (0, 3)
 
 
-def test_missed_voxels_are_those_of_the_truth_and_invented_ones_those_of_the_prediction(drive, tmp_path):
+def test_missed_voxels_are_those_of_the_truth_and_invented_ones_those_of_the_prediction(
+    drive, tmp_path
+):
     writer = FolderSink(tmp_path).sequence("p/Town01_Light/cartesian")
     writer.write_document(f"evaluation/{layout.PARAMS}", to_json(COARSE.to_params()))
     writer.write("evaluation/labels", 0, grid_with({(-10, -5, -0.5): RED}, size_m=2.4).labels)
@@ -464,7 +543,9 @@ def test_missed_voxels_are_those_of_the_truth_and_invented_ones_those_of_the_pre
         "camera": CameraOptions(view="bev"),
         "style": StyleOptions(size=SIZE, ego=False, legend=False),
     }
-    shown = picture(render(Scene(tmp_path / "p", truth=drive), tmp_path / "a.png", **options).out).astype(int)
+    shown = picture(
+        render(Scene(tmp_path / "p", truth=drive), tmp_path / "a.png", **options).out
+    ).astype(int)
     for color, ahead, right in (((16, 90, 190), 10, 5), ((240, 200, 40), -10, -5)):
         column, row = middle_of(np.abs(shown - color).max(-1) < 10)
         assert column - 160 == pytest.approx(right * 180 * 0.98 / 51.2, abs=4)

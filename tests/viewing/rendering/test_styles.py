@@ -24,7 +24,9 @@ pytest.importorskip("embreex")
         ("paper", (900, 500), 150, (900, 500), 150),
     ],
 )
-def test_sizes_are_pixels_or_lengths_at_a_number_of_pixels_per_inch(name, size, dpi, pixels, written):
+def test_sizes_are_pixels_or_lengths_at_a_number_of_pixels_per_inch(
+    name, size, dpi, pixels, written
+):
     sheet = StyleOptions(name, size, dpi).sheet
     assert (sheet.size, sheet.dpi) == (pixels, written)
 
@@ -38,7 +40,8 @@ def test_a_size_that_is_none_is_refused(size):
 
 
 @pytest.mark.parametrize(
-    ("name", "dpi", "where"), [("poster", None, "style"), ("paper", 3, "dpi"), ("paper", np.nan, "dpi")]
+    ("name", "dpi", "where"),
+    [("poster", None, "style"), ("paper", 3, "dpi"), ("paper", np.nan, "dpi")],
 )
 def test_an_unknown_style_and_impossible_resolutions_are_refused(name, dpi, where):
     with pytest.raises(ArgumentError, match=f"^{where}: "):
@@ -50,9 +53,13 @@ def test_type_on_paper_is_eight_points_high_at_any_resolution():
     assert StyleOptions().sheet.font_size is None
 
 
-def test_a_picture_on_paper_says_its_resolution_and_has_its_legend_in_a_file_of_its_own(blocks, tmp_path):
+def test_a_picture_on_paper_says_its_resolution_and_has_its_legend_in_a_file_of_its_own(
+    blocks, tmp_path
+):
     result = render(
-        Scene(blocks, frames=(0, 1)), tmp_path / "scene.png", style=StyleOptions(name="paper", size="5cmx3cm")
+        Scene(blocks, frames=(0, 1)),
+        tmp_path / "scene.png",
+        style=StyleOptions(name="paper", size="5cmx3cm"),
     )
     assert result.legend == tmp_path / "scene.legend.png"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.legend.png", "scene.png"]
@@ -61,7 +68,9 @@ def test_a_picture_on_paper_says_its_resolution_and_has_its_legend_in_a_file_of_
             assert image.info["dpi"] == pytest.approx((300, 300), abs=0.01)
         assert picture.size == (591, 354)
         without = render(
-            Scene(blocks, frames=(0, 1)), tmp_path / "b.png", style=StyleOptions(size=(591, 354), legend=False)
+            Scene(blocks, frames=(0, 1)),
+            tmp_path / "b.png",
+            style=StyleOptions(size=(591, 354), legend=False),
         ).out
         assert np.array_equal(np.asarray(picture), np.asarray(Image.open(without)))
         shown = np.asarray(legend)
@@ -80,7 +89,9 @@ def test_without_a_legend_no_file_of_one_is_written(blocks, tmp_path):
 
 def test_a_picture_for_a_screen_says_no_resolution(blocks, tmp_path):
     with Image.open(
-        render(Scene(blocks, frames=(0, 1)), tmp_path / "a.png", style=StyleOptions(size=(160, 90))).out
+        render(
+            Scene(blocks, frames=(0, 1)), tmp_path / "a.png", style=StyleOptions(size=(160, 90))
+        ).out
     ) as picture:
         assert "dpi" not in picture.info
 
