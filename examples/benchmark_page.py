@@ -68,8 +68,8 @@ def tables(kept: Mapping[str, Groups]) -> dict[str, str]:
             made[name] = f"{make(groups)}\n\n{_runs(groups)}{_missing(study, groups)}"
         else:
             made[name] = (
-                f"Not run: `python examples/benchmark.py WORK --size medium --study {study}` "
-                f"makes this table."
+                f"Not run: `python examples/benchmark.py WORK --size medium --study {study}` makes "
+                f"this table."
             )
     return made
 

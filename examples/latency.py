@@ -47,9 +47,8 @@ def main(
         for r in measured if not as_json else ():
             print(
                 f"{r.network} T={r.history} {r.mode:8s} median {r.median_ms:8.2f} ms  fastest "
-                f"{r.fastest_ms:8.2f} ms"
-                f"  {r.memory_mb:6.0f} MB  x{r.speedup:.2f}  {r.differing:.1f} voxels per million "
-                f"differ",
+                f"{r.fastest_ms:8.2f} ms  {r.memory_mb:6.0f} MB  x{r.speedup:.2f}  "
+                f"{r.differing:.1f} voxels per million differ",
                 flush=True,
             )
     if as_json:

@@ -142,8 +142,7 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install():
 
 ORIGINS = {
     '{"url": "file:///home/a%20b/carlasc", "dir_info": {"editable": true}}': "pip install -e "
-    "'/home/a "
-    "b/carlasc[zarr]'",
+    "'/home/a b/carlasc[zarr]'",
     '{"url": "file:///tmp/carlasc", "dir_info": {}}': "pip install '/tmp/carlasc[zarr]'",
     '{"url": "file:///tmp/carlasc-1.whl", "archive_info": {}}': "pip install "
     "'/tmp/carlasc-1.whl[zarr]'",

@@ -170,8 +170,7 @@ def test_the_search_finds_pages_from_the_disk_and_over_http(site, browser):
             browser.find_element("css selector", "input.md-search__input").send_keys("slurm")
             found = browser.execute_async_script(
                 "const done = arguments[0], look = () => { const links = "
-                "document.querySelectorAll('.md-search-result__link');"
-                " links.length ? done([...links].map((link) => link.href)) : setTimeout(look, "
-                "50); }; look();"
+                "document.querySelectorAll('.md-search-result__link'); links.length ? "
+                "done([...links].map((link) => link.href)) : setTimeout(look, 50); }; look();"
             )
             assert any("many-machines.html" in link for link in found), start

@@ -138,8 +138,7 @@ app = typer.Typer(
     cls=_Group,
     **_SETTINGS,
     help="A toolkit for semantic scene completion: read CarlaSC, convert other data sets to its "
-    "layout, make ground truth at any voxel size,"
-    " and score predictions.",
+    "layout, make ground truth at any voxel size, and score predictions.",
 )
 
 
@@ -165,8 +164,8 @@ def _root(
             "--durable/--no-durable",
             show_default=False,
             help="Sync each file to the disk before it is renamed to its final name, so that a "
-            "power failure leaves no empty file. Default: on,"
-            " unless the environment variable CARLASC_DURABLE is no.",
+            "power failure leaves no empty file. Default: on, unless the environment variable "
+            "CARLASC_DURABLE is no.",
         ),
     ] = None,
 ) -> None:

@@ -57,8 +57,8 @@ def audit(
     keep: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for intermediate counts: an interrupted audit continues there, and "
-            "--part needs it to join the parts."
+            help="Folder for intermediate counts: an interrupted audit continues there, and --part "
+            "needs it to join the parts."
         ),
     ] = None,
     html: Annotated[

@@ -24,8 +24,7 @@ CamerasOption = Annotated[
     str,
     typer.Option(
         help="Cameras of the vehicle, separated by commas: front, front_left, front_right, left, "
-        "right, back_left, back_right, back."
-        " Default: none.",
+        "right, back_left, back_right, back. Default: none.",
         metavar="NAMES",
     ),
 ]
@@ -132,10 +131,8 @@ def capture(
         return
     echo(
         f"{result.out}: {counted(result.written, 'frame')} of {counted(result.sensors, 'LiDAR')} "
-        f"written,"
-        f" {result.count - result.written} existed already"
-        f" (CARLA {result.server_version}, {counted(result.vehicles, 'vehicle')}, "
-        f"{counted(result.walkers, 'pedestrian')})"
+        f"written, {result.count - result.written} existed already (CARLA {result.server_version}, "
+        f"{counted(result.vehicles, 'vehicle')}, {counted(result.walkers, 'pedestrian')})"
     )
     echo(f"next: carlasc regrid {result.out} --res 0.2")
 

@@ -85,8 +85,7 @@ def card(
             "--out",
             metavar="FOLDER",
             text="Folder of the card: the root folder of the publication. Default: SOURCE, if it "
-            "is a folder or a Parquet store; otherwise the"
-            " folder that contains SOURCE.",
+            "is a folder or a Parquet store; otherwise the folder that contains SOURCE.",
         ),
     ] = None,
     pictures: Annotated[

@@ -33,8 +33,8 @@ class LayoutFlags(Flags):
         str,
         typer.Option(
             help="Classes of the labels. carla: CarlaSC's classes. The name of the data set's own "
-            "class table, such as semantickitti: its ids are"
-            " kept. auto: the ids of SemanticKITTI are kept, all others become carla."
+            "class table, such as semantickitti: its ids are kept. auto: the ids of SemanticKITTI "
+            "are kept, all others become carla."
         ),
     ] = "auto"
     axes: Annotated[
@@ -58,8 +58,7 @@ class LayoutFlags(Flags):
         Images,
         typer.Option(
             help="Images of cameras. copy: copied into the output. link: only their paths are "
-            "written. none: left out. Calibrations are always"
-            " written."
+            "written. none: left out. Calibrations are always written."
         ),
     ] = "none"
 
@@ -150,8 +149,7 @@ def convert(
         Literal["scans", "voxels", "none"],
         typer.Option(
             help="Grids to write. scans: made from scans merged over time (by default coarse "
-            "ones). voxels: the grids of the data set. none: no"
-            " grids."
+            "ones). voxels: the grids of the data set. none: no grids."
         ),
     ] = "scans",
     dry_run: Annotated[

@@ -64,8 +64,8 @@ def _lines(found: Installation) -> Iterator[str]:
         state = (
             "writable"
             if code.writable
-            else "NOT WRITABLE: every process compiles again; set NUMBA_CACHE_DIR to a folder "
-            "that is writable"
+            else "NOT WRITABLE: every process compiles again; set NUMBA_CACHE_DIR to a folder that "
+            "is writable"
         )
         yield "\ncompiled code"
         yield f"  {code.folder} ({state}): {code.files} files, {code.bytes / 1e6:.1f} MB"

@@ -89,8 +89,8 @@ class ScoringFlags(Flags):
         list[str] | None,
         typer.Option(
             metavar="PART",
-            help="Also score by distance, height, visibility, motion or seen (by a camera). "
-            "Repeat it for several.",
+            help="Also score by distance, height, visibility, motion or seen (by a camera). Repeat "
+            "it for several.",
         ),
     ] = None
     rays: Annotated[
@@ -147,8 +147,7 @@ def evaluate(
         str,
         place_argument(
             "Predictions: a data set, a sequence, the folder of a grid, a folder of .label files, "
-            "or files of SemanticKITTI,"
-            " SSCBench, Occ3D, OpenOccupancy or CarlaOcc."
+            "or files of SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc."
         ),
     ],
     truth: Annotated[str, place_argument("Ground truth, in one of the same forms.", "TRUTH")],
@@ -156,10 +155,9 @@ def evaluate(
         str | None,
         typer.Option(
             help="Benchmark whose rules are followed: carlasc, semantickitti, sscbench, "
-            "occ3d-lidar, occ3d-lidar-sparseocc,"
-            " occ3d-camera, openoccupancy; or own, which scores the classes of the data. Default: "
-            "the benchmark whose files TRUTH holds, otherwise"
-            " carlasc, or own for classes that carlasc has no map for.",
+            "occ3d-lidar, occ3d-lidar-sparseocc, occ3d-camera, openoccupancy; or own, which "
+            "scores the classes of the data. Default: the benchmark whose files TRUTH holds, "
+            "otherwise carlasc, or own for classes that carlasc has no map for.",
             autocompletion=lambda incomplete: starting_with(
                 incomplete, (*carlasc.metrics.CONVENTIONS, "own")
             ),
@@ -175,8 +173,8 @@ def evaluate(
         Around | None,
         typer.Option(
             help="Score forecasts: grids with names such as forecast_1s. present: they are around "
-            "the sensor of the frame in which they are made."
-            " future: around the sensor of the frame that they predict."
+            "the sensor of the frame in which they are made. future: around the sensor of the "
+            "frame that they predict."
         ),
     ] = None,
     compare: Annotated[
@@ -312,8 +310,8 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
         out.print(
             line(
                 f"mIoU minus that of {other.name}: {100 * found.value:+.2f}, 95 % interval "
-                f"{100 * found.low:+.2f} to {100 * found.high:+.2f},"
-                f" p = {comparison.p_value:.3g} ({count(len(comparison.sequences), 'sequence')})"
+                f"{100 * found.low:+.2f} to {100 * found.high:+.2f}, p = {comparison.p_value:.3g} "
+                f"({count(len(comparison.sequences), 'sequence')})"
             )
         )
     if result.actors is not None and not math.isnan(result.actors.velocity_m_s):

@@ -193,8 +193,8 @@ class WorkFlags(Flags):
         typer.Option(
             metavar="WHERE",
             help="Run on a Dask cluster: local or local:N (N processes on this machine), "
-            "tcp://HOST:PORT (a running scheduler), slurm"
-            " (starts --workers jobs), or the dotted path of a cluster class. Default: no cluster.",
+            "tcp://HOST:PORT (a running scheduler), slurm (starts --workers jobs), or the dotted "
+            "path of a cluster class. Default: no cluster.",
         ),
     ] = None
 

@@ -20,9 +20,8 @@ _MOVED_M = 1e-3  # bounds that differ by less are equal up to rounding
 _VOXEL_BYTES, _LARGE_BYTES = 8, 2e9  # size of a label and a count; a larger frame is unusual
 MOTION_HELP = (
     "How moving points are found. boxes, instances, flow: by the field of that name. evidence: a "
-    "point moves if rays of other scans passed"
-    " through its position. none: only classes that always move. auto: the best field that "
-    "exists, and evidence for what it misses"
+    "point moves if rays of other scans passed through its position. none: only classes that "
+    "always move. auto: the best field that exists, and evidence for what it misses"
 )
 
 
@@ -37,8 +36,8 @@ class GridFlags(Flags):
         str | None,
         typer.Option(
             help="Voxel size in metres: one value, or one per axis, x,y,z (cylindrical: "
-            "radius,azimuth,z with the azimuth in degrees). Use only"
-            " one of --res, --size and --preset."
+            "radius,azimuth,z with the azimuth in degrees). Use only one of --res, --size and "
+            "--preset."
         ),
     ] = None
     size: Annotated[
@@ -52,8 +51,7 @@ class GridFlags(Flags):
         str | None,
         typer.Option(
             help="Lower and upper bound of each axis, x0,x1,y0,y1,z0,z1, in metres (cylindrical: "
-            "radius, azimuth in degrees, z). Default: those of"
-            " the published data set."
+            "radius, azimuth in degrees, z). Default: those of the published data set."
         ),
     ] = None
     yes: Annotated[
@@ -167,10 +165,9 @@ class VoteFlags(Flags):
         typer.Option(
             "--voting",
             help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the "
-            "published files (default for captures)."
-            " sample: one vote per sample, as in the paper. ray: a voxel is occupied if enough of "
-            "the rays that enter it end in it (default for"
-            " scans).",
+            "published files (default for captures). sample: one vote per sample, as in the "
+            "paper. ray: a voxel is occupied if enough of the rays that enter it end in it "
+            "(default for scans).",
         ),
     ] = None
     free_step_m: Annotated[
@@ -198,8 +195,7 @@ class VoteFlags(Flags):
         float,
         typer.Option(
             help="Set a voxel to unknown if it is neither free nor occupied with at least this "
-            "probability, 0 to below 1 (only for grids from"
-            " scans)."
+            "probability, 0 to below 1 (only for grids from scans)."
         ),
     ] = 0.0
     keep_seen: Annotated[
@@ -232,9 +228,8 @@ class PoseFlags(Flags):
     poses: Annotated[
         carlasc.motion.PoseSource,
         typer.Option(
-            help="Where poses come from. file: the poses of the data. kiss-icp: estimated from "
-            "the scans. auto: the file if it exists, otherwise"
-            " estimated."
+            help="Where poses come from. file: the poses of the data. kiss-icp: estimated from the "
+            "scans. auto: the file if it exists, otherwise estimated."
         ),
     ] = "auto"
     refine: Annotated[
@@ -276,9 +271,9 @@ class WindowFlags(Flags):
         Dynamic | None,
         typer.Option(
             help="What happens to moving points. align: each actor is completed from all scans "
-            "(default). current: only points of the frame"
-            " itself are used. drop: they are left out. tube: they stay where they were seen, "
-            "which leaves ghost trails, as in SemanticKITTI."
+            "(default). current: only points of the frame itself are used. drop: they are left "
+            "out. tube: they stay where they were seen, which leaves ghost trails, as in "
+            "SemanticKITTI."
         ),
     ] = None
     motion: Annotated[
@@ -314,8 +309,8 @@ class ScanFlags(WindowFlags):
         Complete | None,
         typer.Option(
             help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay "
-            "unknown. mirror: one side is copied from the"
-            " other. body: like mirror, and the rest is copied from similar vehicles (default)."
+            "unknown. mirror: one side is copied from the other. body: like mirror, and the rest "
+            "is copied from similar vehicles (default)."
         ),
     ] = None
     no_own_path: Annotated[
@@ -323,8 +318,7 @@ class ScanFlags(WindowFlags):
         typer.Option(
             "--no-own-path",
             help="Do not count the space that the recording vehicle drove through as free. By "
-            "default it counts as free, which removes ghost trails"
-            " there.",
+            "default it counts as free, which removes ghost trails there.",
         ),
     ] = False
     rays: Annotated[

@@ -25,9 +25,8 @@ def label(
             "--from",
             metavar="FILES",
             help="Folder of predictions, with a folder per sequence and a file per frame. motion: "
-            "instances and flow of the actors that carlasc"
-            " finds to move. images: the class of each point is that of the camera pixel that "
-            "shows it.",
+            "instances and flow of the actors that carlasc finds to move. images: the class of "
+            "each point is that of the camera pixel that shows it.",
         ),
     ],
     pixels: Annotated[

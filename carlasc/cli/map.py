@@ -31,8 +31,8 @@ def map(
     out: Annotated[
         Path | None,
         file_argument(
-            "File of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). Not needed "
-            "with --mesh or --distance."
+            "File of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). Not needed with "
+            "--mesh or --distance."
         ),
     ] = None,
     cell_m: Annotated[

@@ -48,8 +48,7 @@ def regrid(
         Observed | None,
         typer.Option(
             help="What grids are made from: a raw capture, scans of one sensor merged over time, "
-            "or a finer grid. Default: the capture if it exists,"
-            " otherwise the scans.",
+            "or a finer grid. Default: the capture if it exists, otherwise the scans.",
             show_default=False,
         ),
     ] = None,

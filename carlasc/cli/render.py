@@ -32,8 +32,7 @@ class CameraFlags(Flags):
         str | None,
         typer.Option(
             help="Position of the camera: any of azimuth=DEG elevation=DEG distance=M fov=DEG "
-            "target=X,Y,Z position=X,Y,Z (degrees and metres),"
-            " together in quotes."
+            "target=X,Y,Z position=X,Y,Z (degrees and metres), together in quotes."
         ),
     ] = None
     orbit: Annotated[
@@ -74,8 +73,8 @@ class StyleFlags(Flags):
     size: Annotated[
         str | None,
         typer.Option(
-            help="WIDTHxHEIGHT in pixels, or with a unit, such as 8.8cmx5cm or 3.5inx2in. "
-            "Default: 1280x720; with --style paper: 8.8cmx5cm."
+            help="WIDTHxHEIGHT in pixels, or with a unit, such as 8.8cmx5cm or 3.5inx2in. Default: "
+            "1280x720; with --style paper: 8.8cmx5cm."
         ),
     ] = None
     dpi: Annotated[
@@ -161,9 +160,8 @@ def render(
     sources: Annotated[
         list[str],
         places_argument(
-            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or "
-            "the file of one frame."
-            " With --grid-of: one or more.",
+            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the "
+            "file of one frame. With --grid-of: one or more.",
         ),
     ],
     out: Annotated[

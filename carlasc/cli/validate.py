@@ -41,8 +41,7 @@ class HoldoutFlags(Flags):
         typer.Option(
             "--holdout",
             help="Also leave scans out, make grids from the other scans, and compare the rays of "
-            "the left-out scans with these grids (by default"
-            " in one process per core).",
+            "the left-out scans with these grids (by default in one process per core).",
         ),
     ] = False
     holdout_every: Annotated[

@@ -73,8 +73,8 @@ def view(
     source: Annotated[
         str,
         place_argument(
-            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or "
-            "the file of one frame."
+            "A sequence or data set (folder, zip, packed store, URL), the folder of a grid, or the "
+            "file of one frame."
         ),
     ],
     out: Annotated[
@@ -84,8 +84,8 @@ def view(
             "--out",
             "--to",
             text="File to write instead of opening a window: an .html page for any browser, an "
-            ".rrd recording for Rerun, or an .mcap recording for"
-            " Foxglove. A name without an ending is the folder of a page for a web server.",
+            ".rrd recording for Rerun, or an .mcap recording for Foxglove. A name without an "
+            "ending is the folder of a page for a web server.",
         ),
     ] = None,
     palette: Annotated[

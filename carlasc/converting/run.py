@@ -222,8 +222,8 @@ def _fit(spec: GridSpec, grounds: Series[Ground], where: str) -> tuple[GridSpec,
     heights = f"the sensor is {low} m" if low == high else f"the sensors are {low} to {high} m"
     return fitted, [
         f"{where}: {heights} above the ground, so grids reach from {fitted.lower[2]:g} to "
-        f"{fitted.upper[2]:g} m in z"
-        f" instead of {spec.lower[2]:g} to {spec.upper[2]:g} m; give --bounds to keep them"
+        f"{fitted.upper[2]:g} m in z instead of {spec.lower[2]:g} to {spec.upper[2]:g} m; give "
+        f"--bounds to keep them"
     ]
 
 

@@ -289,8 +289,8 @@ def check_poses(
             recording.location,
             expected=expected,
             found=f"{diagnosis.share_there:.0%} of a scan's structure overlaps that of an earlier "
-            f"scan; the likely cause is"
-            f" {diagnosis.correction.name} (with that corrected: {diagnosis.corrected_share:.0%})",
+            f"scan; the likely cause is {diagnosis.correction.name} (with that corrected: "
+            f"{diagnosis.corrected_share:.0%})",
             advice=f"{diagnosis.correction.advice}, or {_ACCEPT}",
         )
     if diagnosis.offset_m is not None:

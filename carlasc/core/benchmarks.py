@@ -25,14 +25,12 @@ def _table(name: str, names: str, free: int) -> ClassTable:
 SSCBENCH = _table(
     "sscbench",
     "empty car bicycle motorcycle truck other-vehicle person road parking sidewalk other-ground "
-    "building fence vegetation terrain pole"
-    " traffic-sign other-structure other-object",
+    "building fence vegetation terrain pole traffic-sign other-structure other-object",
     0,
 )
 _NUSCENES = (
-    "barrier bicycle bus car construction-vehicle motorcycle pedestrian traffic-cone trailer "
-    "truck driveable-surface other-flat sidewalk"
-    " terrain manmade vegetation"
+    "barrier bicycle bus car construction-vehicle motorcycle pedestrian traffic-cone trailer truck "
+    "driveable-surface other-flat sidewalk terrain manmade vegetation"
 )
 OCC3D = _table("occ3d", f"others {_NUSCENES} free", 17)
 OPENOCCUPANCY = _table("openoccupancy", f"empty {_NUSCENES}", 0)

@@ -335,8 +335,8 @@ CONVENTIONS: Mapping[str, Convention] = MappingProxyType(
                 name="occ3d-lidar-sparseocc",
                 title="Occ3D-nuScenes as SparseOcc's script takes the mean",
                 absent="skip-truth",
-                notes="A class that is not in the ground truth is left out of the mean, even if "
-                "it was predicted.",
+                notes="A class that is not in the ground truth is left out of the mean, even if it "
+                "was predicted.",
             ),
             replace(
                 _OCC3D_LIDAR,

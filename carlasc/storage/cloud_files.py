@@ -208,8 +208,8 @@ def write_octomap(
     if farthest >= _MIDDLE:
         raise ArgumentError(
             "cell_m",
-            expected=f"cells within {_MIDDLE * cell_m:g} m of the origin, the extent of an "
-            f"OctoMap tree",
+            expected=f"cells within {_MIDDLE * cell_m:g} m of the origin, the extent of an OctoMap "
+            f"tree",
             found=f"{farthest * cell_m:.0f} m",
             advice="use larger cells, or fewer frames",
         )

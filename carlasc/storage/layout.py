@@ -133,8 +133,8 @@ _GRID_FIELDS: dict[str, Field] = {
         Field(
             name="flags", folder="", suffix=".flags.bin", per="voxel", kind="flags",
             dtype="u1", names=("flags",), unit="bits",
-            meaning="what else is known of the voxel: 1 inferred, 2 contested, 4 seen now, 8 in "
-                    "an actor", published=False,
+            meaning="what else is known of the voxel: 1 inferred, 2 contested, 4 seen now, 8 in an "
+                    "actor", published=False,
         ),
         Field(
             name="views", folder="", suffix=".views.bin", per="voxel", kind="count",

@@ -39,8 +39,8 @@ class LidarTopic:
             raise FormatError(
                 f"{topic.parts[0][0]}: {self.name}",
                 expected="a message for each turn of the LiDAR",
-                found=f"{len(topic)} messages, {1 / max(period, 1e-9):.0f} per second, of a "
-                f"packet each",
+                found=f"{len(topic)} messages, {1 / max(period, 1e-9):.0f} per second, of a packet "
+                f"each",
                 advice="set the driver to publish full turns, and replay its packets",
             )
 

@@ -165,8 +165,8 @@ class BagFiles:
                 "topics",
                 expected=f"one or several of {_listed(found)} in {self.location}",
                 found="none",
-                advice="name the LiDARs, separated by commas; the messages of the first become "
-                "the frames",
+                advice="name the LiDARs, separated by commas; the messages of the first become the "
+                "frames",
             )
         return found
 
@@ -190,8 +190,8 @@ class BagFiles:
         lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
         if len(self.paths) > 1:
             lost.append(
-                f"{len(self.paths)} files are parts of one recording: {self.paths[0].name} and "
-                f"the next"
+                f"{len(self.paths)} files are parts of one recording: {self.paths[0].name} and the "
+                f"next"
             )
         return lost
 

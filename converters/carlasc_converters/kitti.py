@@ -48,8 +48,7 @@ class SemanticKitti(KittiConverter):
     title: ClassVar[str] = "SemanticKITTI, or KITTI odometry data without labels"
     citation = (
         "J. Behley et al., SemanticKITTI, ICCV 2019; A. Geiger, P. Lenz, R. Urtasun, Are we ready "
-        "for "
-        "Autonomous Driving?, CVPR 2012"
+        "for Autonomous Driving?, CVPR 2012"
     )
     classes = SEMANTICKITTI
     keeps_classes = True

@@ -16,10 +16,9 @@ _CLASSES: tuple[tuple[str, Color, str, str], ...] = (
     (
         "Vehicle", (0, 0, 142), "Vehicle",
         "automobile car vehicle van truck bus trailer heavy_truck other_vehicle train_or_tram_car "
-        "construction_vehicle emergency_vehicle"
-        " articulated_bus box_truck large_vehicle message_board_trailer railed_vehicle "
-        "regular_vehicle school_bus traffic_light_trailer"
-        " truck_cab vehicular_trailer",
+        "construction_vehicle emergency_vehicle articulated_bus box_truck large_vehicle "
+        "message_board_trailer railed_vehicle regular_vehicle school_bus traffic_light_trailer "
+        "truck_cab vehicular_trailer",
     ),
     ("Two-wheeler", (255, 61, 99), "Vehicle", "bicycle motorcycle wheeled_device"),
     ("Rider", (240, 70, 190), "Pedestrian", "rider cyclist bicyclist motorcyclist wheeled_rider"),

@@ -167,8 +167,7 @@ class ParisCarlaTown(Recording):
         return [
             "Paris-CARLA-3D has the licence CC BY-NC-ND 3.0: converted data must not be shared",
             "poses are the positions of the LiDAR at the middle of each scan, upright, with the "
-            "direction of motion as heading,"
-            " because the data have no rotations",
+            "direction of motion as heading, because the data have no rotations",
         ]
 
 

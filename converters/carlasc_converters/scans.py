@@ -381,8 +381,8 @@ class ScanFolder(Recording):
             )
         if "label" in self._first and not options.has_classes:
             notes.append(
-                "points have a field of classes, which was not read: give `source_classes` to "
-                "read it"
+                "points have a field of classes, which was not read: give `source_classes` to read "
+                "it"
             )
         return notes
 

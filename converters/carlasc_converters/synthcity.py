@@ -205,8 +205,8 @@ class SynthCityArea(Recording):
         """Return notes on what is missing in the data."""
         return [
             f"SynthCity is a static cloud without trajectory: each frame is a tile of "
-            f"{self._step:.1f} m, in the frame of a place"
-            f" {_HEIGHT_M} m above its ground, where no sensor was",
+            f"{self._step:.1f} m, in the frame of a place {_HEIGHT_M} m above its ground, where "
+            f"no sensor was",
             "only voxels with points are known, because there are no rays that show free space",
         ]
 

@@ -73,8 +73,8 @@ def main() -> None:
     for seed in given.seeds:
         folder = _drive(given.work / f"{given.size}{seed}", seed, FRAMES[given.size])
         print(
-            f"| {seed} | "
-            f"{' | '.join(f'{100 * share:.1f} %' for share in labels_of(folder, seed))} |",
+            f"| {seed} | {' | '.join(f'{100 * share:.1f} %' for share in labels_of(folder, seed))} "
+            f"|",
             flush=True,
         )
     print(

@@ -120,8 +120,8 @@ def run(task: Task) -> None:
         apart_cm = 100 * float(np.nanmean(apart_m))
         write_atomic(task.path(mode, MOTIONS), json.dumps([*errors, apart_cm]).encode())
         print(
-            f"{setting}, every {task.every}, {task.row}, {mode}: {show(errors)}, {apart_cm:.1f} "
-            f"cm apart",
+            f"{setting}, every {task.every}, {task.row}, {mode}: {show(errors)}, {apart_cm:.1f} cm "
+            f"apart",
             flush=True,
         )
         actors = (
@@ -205,8 +205,8 @@ def table(tasks: Sequence[Task], grid: str) -> str:
                 back, lost = values[:, 0] - made["never"][:, 0], exact - made["never"][:, 0]
                 won = f"{back.mean() / lost.mean():.0%} (at least {(back / lost).min():.0%})"
             lines.append(
-                f"| {row} | {mode} | "
-                f"{' | '.join(f'{value:.3f}' for value in values.mean(axis=0))} | {won} |"
+                f"| {row} | {mode} | {' | '.join(f'{value:.3f}' for value in values.mean(axis=0))} "
+                f"| {won} |"
             )
     return "\n".join(lines)
 

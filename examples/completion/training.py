@@ -333,7 +333,7 @@ def _print_epoch(progress: Progress, config: Config, matrix: ConfusionMatrix) ->
     start = "\r" if sys.stderr.isatty() else ""
     print(
         f"{start}epoch {progress.epoch}/{config.epochs}  loss {progress.losses[-1]:.4f}  mIoU "
-        f"{100 * matrix.miou:.2f}"
-        f"  IoU {100 * geometry.iou:.2f}  {progress.samples_per_s[-1]:.1f} samples/s{mark}",
+        f"{100 * matrix.miou:.2f}  IoU {100 * geometry.iou:.2f}  {progress.samples_per_s[-1]:.1f} "
+        f"samples/s{mark}",
         file=sys.stderr,
     )

@@ -115,8 +115,8 @@ def test_a_note_says_what_share_of_the_points_is_above_the_grid(up, said, tmp_pa
         heights = points[(np.abs(points[:, :2]) < 25.6).all(axis=1), 2]
         share = f"{100 * np.mean(heights >= up):.0f}%"
         assert notes[0].startswith(
-            f"{tmp_path / 'out'}: {share} of the points between the sides of the grid are above "
-            f"it (z > 1 m)"
+            f"{tmp_path / 'out'}: {share} of the points between the sides of the grid are above it "
+            f"(z > 1 m)"
         )
 
 

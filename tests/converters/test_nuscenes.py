@@ -432,8 +432,8 @@ def test_a_box_of_an_unknown_object_and_one_without_a_rotation_are_named(tables)
     change_table(path, size=[1.0, 2.0])
     with pytest.raises(
         FormatError,
-        match=r"sample_annotation.json: expected a list of 3 numbers under .size., found .* in "
-        r"row 0",
+        match=r"sample_annotation.json: expected a list of 3 numbers under .size., found .* in row "
+        r"0",
     ):
         recording(tables).boxes()
     path.write_text(text)

@@ -199,8 +199,8 @@ def no_times(path: Path) -> None:
         (scattered, "the rows of each scan (index_frame) one after the other"),
         (
             no_times,
-            f"expected times that increase from scan to scan, found none from scan {FIRST_SCAN} "
-            f"to {FIRST_SCAN + 1}",
+            f"expected times that increase from scan to scan, found none from scan {FIRST_SCAN} to "
+            f"{FIRST_SCAN + 1}",
         ),
     ],
 )

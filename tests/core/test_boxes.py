@@ -118,8 +118,8 @@ def test_select_takes_boxes_by_mask_and_by_index():
                                                                     "rotation.*in box 1"),
         ({"tracks": np.array([0, 3], np.uint32)}, "tracks: expected numbers above 0, found 0 in "
                                                   "box 0"),
-        ({"tracks": np.array([3, 3], np.uint32)}, r"one box per track in a frame, found 3 in box "
-                                                  r"1 \(track 3\)"),
+        ({"tracks": np.array([3, 3], np.uint32)}, r"one box per track in a frame, found 3 in box 1 "
+                                                  r"\(track 3\)"),
     ],
 )  # fmt: skip
 def test_boxes_that_make_no_sense_are_refused(change, message):

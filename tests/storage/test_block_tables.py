@@ -330,8 +330,8 @@ def test_a_scan_much_larger_than_announced_is_one_clear_error(tmp_path: Path) ->
     writer.expect({}, {"points": 10})
     with pytest.raises(
         FormatError,
-        match=r"field labels, frame 3: its array: expected at most 262144 elements .*found "
-        r"262145: leave",
+        match=r"field labels, frame 3: its array: expected at most 262144 elements .*found 262145: "
+        r"leave",
     ):
         writer.write("labels", 3, np.zeros(262_145, np.uint32))
     writer.write("labels", 4, np.ones(262_144, np.uint32))

@@ -68,8 +68,8 @@ def test_the_slider_moves_the_frame(page):
     before = middle_of(red_pixels(page.canvas()))
     page.run(
         "const s = document.getElementById('slider'); s.value = 2; s.dispatchEvent(new "
-        "Event('input'));"
-        " while (carlasc.position !== 2) await new Promise((done) => setTimeout(done, 10))"
+        "Event('input')); while (carlasc.position !== 2) await new Promise((done) => "
+        "setTimeout(done, 10))"
     )
     after = middle_of(red_pixels(page.canvas("page_last_frame")))
     assert after[1] < before[1] - 3  # farther ahead is higher up in the picture
@@ -83,10 +83,9 @@ def test_the_slider_moves_the_frame(page):
 def test_play_goes_through_the_frames_until_it_is_stopped(page):
     page.click("#play")
     seen = page.run(
-        "const seen = new Set(); const until = performance.now() + 20000;"
-        " while (seen.size < 3 && performance.now() < until) { seen.add(carlasc.position); await "
-        "new Promise((done) => setTimeout(done, 10)); }"
-        " return [...seen].sort()"
+        "const seen = new Set(); const until = performance.now() + 20000; while (seen.size < 3 && "
+        "performance.now() < until) { seen.add(carlasc.position); await new Promise((done) => "
+        "setTimeout(done, 10)); } return [...seen].sort()"
     )
     assert seen == [0, 1, 2]
     assert page.text("#play") == "Stop"

@@ -13,11 +13,10 @@ from carlasc.viewing import Scene, view
 pytestmark = pytest.mark.slow
 READY = (
     "while (!document.documentElement.dataset.ready && "
-    "!document.getElementById('message').textContent.startsWith('This page'))"
-    " await new Promise((done) => setTimeout(done, 20));"
-    " carlasc.setTheme('light'); await new Promise((done) => requestAnimationFrame(() => "
-    "requestAnimationFrame(done)));"
-    " return document.getElementById('message').textContent"
+    "!document.getElementById('message').textContent.startsWith('This page')) await new "
+    "Promise((done) => setTimeout(done, 20)); carlasc.setTheme('light'); await new Promise((done) "
+    "=> requestAnimationFrame(() => requestAnimationFrame(done))); return "
+    "document.getElementById('message').textContent"
 )
 
 

@@ -308,8 +308,8 @@ class ScanSequence(StoredSequence):
             )
         if self.actors.own:
             notes.append(
-                f"{where}: points near the sensor move with it: they are on the recording "
-                f"vehicle, and were left out"
+                f"{where}: points near the sensor move with it: they are on the recording vehicle, "
+                f"and were left out"
             )
         wrong = sum(max(actor["size_m"]) >= LONGEST_M for actor in self.actors.summary)
         if wrong:

@@ -409,8 +409,8 @@ def _frames(spans: Any) -> tuple[int, ...]:
         or sum(map(len, ranges)) > _MOST_FRAMES
     ):
         raise ValueError(
-            f"{len(ranges)} ranges of frames with negative numbers, or of more than "
-            f"{_MOST_FRAMES} frames"
+            f"{len(ranges)} ranges of frames with negative numbers, or of more than {_MOST_FRAMES} "
+            f"frames"
         )
     return tuple(frame for span in ranges for frame in span)
 

@@ -283,8 +283,8 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
         )
     if without := sorted(set(numbers) - {number for number, _ in pairs}):
         names = first_names([grids.name_of(number) for number in without], 4)
-        notes.append(f"{len(without)} of {count(len(numbers), 'grid')} left out, without a scan "
-                     f"of the same number or time: {names}")  # fmt: skip
+        notes.append(f"{len(without)} of {count(len(numbers), 'grid')} left out, without a scan of "
+                     f"the same number or time: {names}")  # fmt: skip
     pairs = [pair for pair in pairs if pair[0] in chosen]
     if not pairs:
         where = f"frames {own[0]} to {own[-1]}" if len(own) else "frames with scans"

@@ -101,8 +101,8 @@ class StoreRoot:
             return not (self._overwrite and root.get("complete") is True)
         if root.get("type") not in (STORE, "carlasc.unfinished"):
             raise ConflictError(
-                self._target.location, expected="a packed store to overwrite", found="another "
-                                                                                     "zarr store",
+                self._target.location, expected="a packed store to overwrite", found="another zarr "
+                                                                                     "store",
                 advice="choose another name",
             )  # fmt: skip
         if not self._overwrite:

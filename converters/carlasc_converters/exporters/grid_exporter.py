@@ -100,8 +100,8 @@ class GridExporter(FrameExporter):
         what = "unknown voxels" if becomes == IGNORED else f"class {becomes}"
         return [
             f"{sequence.location}/{name}: {share:.0%} of the occupied voxels are "
-            f"{table.names[table.geometry_id]}, structure without a class of its own:"
-            f" they become {what} of {self.slug}"
+            f"{table.names[table.geometry_id]}, structure without a class of its own: they become "
+            f"{what} of {self.slug}"
         ]
 
     def frames(self, sequence: storage.Sequence) -> list[int]:

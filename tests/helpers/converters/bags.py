@@ -19,8 +19,8 @@ _TYPES = {
     np.dtype(kind): number for number, kind in enumerate("i1 u1 i2 u2 i4 u4 f4 f8".split(), 1)
 }
 _LIVOX = {
-    "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 "
-    "reflectivity\nuint8 tag\nuint8 line\n",
+    "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 "
+    "tag\nuint8 line\n",
     "CustomMsg": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 "
     "lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n",
 }

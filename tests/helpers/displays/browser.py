@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 OUTPUT = Path(__file__).parents[3] / "test-output"
 _FLAGS = (
     "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader --disable-quic --no-first-run"
-    " --disable-background-networking --disable-component-update --disable-sync "
-    "--disable-dev-shm-usage --hide-scrollbars"
+    "--enable-unsafe-swiftshader --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --disable-dev-shm-usage --hide-scrollbars"
 ).split()
 
 
@@ -121,8 +120,8 @@ class Page:
     def canvas(self, name: str | None = None) -> NDArray[np.uint8]:
         """Return the part of a screenshot that three.js draws."""
         box = self.run(
-            "const r = document.getElementById('stage').getBoundingClientRect(); return [r.x, "
-            "r.y, r.right, r.bottom]"
+            "const r = document.getElementById('stage').getBoundingClientRect(); return [r.x, r.y, "
+            "r.right, r.bottom]"
         )
         x0, y0, x1, y1 = (round(value) for value in box)
         return self.picture(name)[y0:y1, x0:x1]

@@ -41,8 +41,8 @@ KINDS = {
         "faults.kills",
         "kills",
         "A command is ended by a signal (SIGKILL, SIGTERM, SIGINT) at a random moment and run "
-        "again, up to three times: "
-        "the bytes are those of an undisturbed run, and nothing is left over",
+        "again, up to three times: the bytes are those of an undisturbed run, and nothing is left "
+        "over",
         100,
         1000,
     ),
@@ -50,8 +50,7 @@ KINDS = {
         "faults.calls",
         "failed system calls",
         "The k-th open, write, rename, sync or read of a command fails (EIO, ENOSPC, EDQUOT), or "
-        "the process ends there: "
-        "one line, and the next run completes",
+        "the process ends there: one line, and the next run completes",
         500,
         100_000,
     ),
@@ -59,8 +58,7 @@ KINDS = {
         "faults.crashes",
         "power losses",
         "The writes of a command are replayed up to a random point, and what was not synced is "
-        "dropped, reordered or zeroed: "
-        "every reader finds a file whole or not at all",
+        "dropped, reordered or zeroed: every reader finds a file whole or not at all",
         500,
         100_000,
     ),
@@ -118,8 +116,8 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     for name, row in rows.items():
         minutes = max(1, round(row["seconds"] / 60))
         lines.append(
-            f"| {name} | {KINDS[name].what} | {row['tried']:,} | {len(row['found'])} | {minutes} "
-            f"| {row['date']} |"
+            f"| {name} | {KINDS[name].what} | {row['tried']:,} | {len(row['found'])} | {minutes} | "
+            f"{row['date']} |"
         )
     return "\n".join(lines)
 

@@ -127,8 +127,7 @@ class Figures:
         """Return a sentence for each run: processor, load, versions and date."""
         sentences = [
             f"{run['date']}: {run['cores']} cores of {run['processor']} (Numba's name for it: "
-            f"{run['target']}), load {run['load']:.1f} at the start,"
-            f" Python {run['python']}, "
+            f"{run['target']}), load {run['load']:.1f} at the start, Python {run['python']}, "
             + ", ".join(f"{name} {version}" for name, version in run["versions"].items())
             + f", size {run['size']}"
             for run in self.runs.values()
