@@ -13,13 +13,13 @@ from typing import Any, get_args
 
 import matplotlib as mpl
 import numpy as np
+from carlasc_recorders import TownDrive
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
-from carlasc.captures import TownDrive
 from carlasc.core.choices import Preset
 from carlasc.core.geometry import relative_to
 from carlasc.core.grids import Grid, GridSpec

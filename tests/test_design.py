@@ -165,6 +165,23 @@ def test_nothing_outside_of_transport_sends_a_request():
             assert not found, f"{path.relative_to(ROOT)} imports {', '.join(sorted(found))}"
 
 
+def test_converters_and_recorders_are_found_by_entry_points_only():
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text())
+        for_types = [
+            node
+            for block in ast.walk(tree)
+            if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
+            for node in ast.walk(block)
+        ]
+        for node in ast.walk(tree):
+            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            named = {module.partition(".")[0] for module in modules}
+            found = named & {"carlasc_converters", "carlasc_recorders"}
+            assert not found or node in for_types, f"{path.relative_to(ROOT)}, line {node.lineno}"
+
+
 def test_the_protocols_of_stores_rest_on_no_store_and_on_no_transport():
     allowed = {"files", "layout", "metadata", "protocol"}
     for name in ("protocol", "sinks"):

@@ -68,7 +68,11 @@ def test_the_wheel_holds_the_packages_and_nothing_that_only_builds_them(tmp_path
     with ZipFile(wheel) as archive:
         held = {name for name in archive.namelist() if ".dist-info/" not in name}
         metadata = {Path(name).name for name in archive.namelist() if ".dist-info/" in name}
-    folders = {"carlasc": ROOT, "carlasc_converters": ROOT / "converters"}
+    folders = {
+        "carlasc": ROOT,
+        "carlasc_converters": ROOT / "converters",
+        "carlasc_recorders": ROOT / "converters",
+    }
     there = {
         path.relative_to(parent).as_posix()
         for folder, parent in folders.items()

@@ -1,6 +1,4 @@
-"""Raw captures of many sensors: reading them, and recording them in a simulated town or on a CARLA
-server.
-"""
+"""Raw captures of many sensors: reading, writing, simulating and recording them."""
 
 import lazy_loader
 

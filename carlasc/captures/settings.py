@@ -1,5 +1,5 @@
-"""Settings of both the simulated town and a CARLA server: model and positions of LiDARs, traffic,
-bird's-eye pictures.
+"""Settings of simulators and of a CARLA server: model and positions of LiDARs, traffic, bird's-eye
+pictures, and the address of the server.
 """
 
 from __future__ import annotations
@@ -130,3 +130,20 @@ def sensor_offsets(sensors: int, rng: np.random.Generator) -> NDArray[np.float64
         (MAX_OFFSET_M, MAX_OFFSET_M, HEIGHTS_M[1]),
     )
     return np.vstack([EGO_SENSOR_M, rng.uniform(low, high, (sensors - 1, 3))])
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """Address and timeout of a CARLA server.
+
+    Attributes:
+        host: host of the server.
+        port: RPC port of the server.
+        traffic_port: port of the traffic manager.
+        timeout_s: timeout of answers, seconds.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 2000
+    traffic_port: int = 8000
+    timeout_s: float = 60.0

@@ -23,6 +23,12 @@ def simulate(
         int, typer.Option(help="Number of the first frame. The drive starts at 0.", min=0)
     ] = 0,
     cameras: CamerasOption = "",
+    simulator: Annotated[
+        str,
+        typer.Option(
+            help="What is simulated: town, or a simulator of another package.", metavar="NAME"
+        ),
+    ] = "town",
     grid: GridFlags,
     json: Json = False,
     sensors: SensorFlags,
@@ -39,10 +45,11 @@ def simulate(
     drive["cameras"] = camera_names(cameras)
     if not grid.is_given and PurePosixPath(out).suffix != ".zarr":
         with run.spread("simulate") as spread:
-            written = carlasc.simulate(out, **drive, run=spread)
+            written = carlasc.simulate(out, simulator=simulator, **drive, run=spread)
         print_json(written) if json else _print_capture(written)
         return
-    spec, simulated = grid.spec_or_published(), carlasc.captures.SimulatedCapture(**drive)
+    spec = grid.spec_or_published()
+    simulated = carlasc.captures.load_recorder(simulator, carlasc.captures.Simulator)(**drive)
     with run.spread("simulate") as spread:
         made = carlasc.regrid(simulated, spec, out, run=spread)
     print_frames(made, made.grids, f"{made.spec}: made", json=json)

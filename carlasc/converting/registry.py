@@ -13,7 +13,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -21,6 +20,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from carlasc.converting.exporter import Exporter
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.core.classes import ClassTable, Remap
+from carlasc.core.plugins import load_plugin, plugin_names
 from carlasc.core.tables import CARLA, remaps_between
 from carlasc.errors import (
     ArgumentError,
@@ -38,12 +38,12 @@ _TRUTH = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0"
 
 def converter_names() -> tuple[str, ...]:
     """Return the sorted names of the installed converters, without loading any."""
-    return tuple(sorted(_entries(GROUP)))
+    return plugin_names(GROUP)
 
 
 def exporter_names() -> tuple[str, ...]:
     """Return the sorted names of the installed exporters, without loading any."""
-    return tuple(sorted(_entries(EXPORTERS)))
+    return plugin_names(EXPORTERS)
 
 
 def load_converter(name: str) -> type[Converter]:
@@ -53,7 +53,7 @@ def load_converter(name: str) -> type[Converter]:
         ArgumentError: no converter has that name.
         DependencyError: it cannot be loaded, or is not a converter.
     """
-    found: type[Converter] = _load(GROUP, Converter, name)
+    found: type[Converter] = load_plugin(GROUP, name, Converter)
     return found
 
 
@@ -64,7 +64,7 @@ def load_exporter(name: str) -> type[Exporter]:
         ArgumentError: no exporter has that name.
         DependencyError: it cannot be loaded, or is not an exporter.
     """
-    found: type[Exporter] = _load(EXPORTERS, Exporter, name)
+    found: type[Exporter] = load_plugin(EXPORTERS, name, Exporter)
     return found
 
 
@@ -266,27 +266,3 @@ def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDecl
             f"{kind.__name__}: {parameter.name}", expected="a default", found="none"
         )
     return OptionDeclaration(parameter.name, found, parameter.default, text, choices)
-
-
-def _load(group: str, base: type, name: str) -> Any:
-    """Return the class of an entry point, which inherits `base`."""
-    entries = _entries(group)
-    if name not in entries:
-        raise ArgumentError(
-            "name",
-            expected=f"one of {', '.join(sorted(entries)) or 'no names: none is installed'}",
-            found=repr(name),
-        )
-    where = f"{base.__name__.lower()} {name} ({entries[name].value})"
-    try:
-        found = entries[name].load()
-    except Exception as error:  # code of another distribution may fail in any way
-        raise DependencyError(where, problem=f"cannot be loaded: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, base)):
-        expected = f"a class that inherits carlasc.converting.{base.__name__}"
-        raise DependencyError(where, expected=expected, found=repr(found))
-    return found
-
-
-def _entries(group: str) -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=group)}

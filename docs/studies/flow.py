@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import study
+from carlasc_recorders import TownDrive
 from numpy.typing import NDArray
 
 import carlasc
-from carlasc.captures import Lidar, TownDrive
+from carlasc.captures import Lidar
 from carlasc.converting import LayoutOptions, convert
 from carlasc.core.tables import CARLA
 from carlasc.running import Run

@@ -16,10 +16,11 @@ from importlib.util import find_spec
 
 import numpy as np
 import study
+from carlasc_recorders import TownDrive
+from carlasc_recorders.town.drive import scan_snapshot
 from numpy.typing import NDArray
 
-from carlasc.captures import Lidar, TownDrive
-from carlasc.captures.town.drive import scan_snapshot
+from carlasc.captures import Lidar
 from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.core.tables import CARLA
 from carlasc.motion.ground import ground_height, ground_points

@@ -16,11 +16,12 @@ from operator import add
 from pathlib import Path
 
 import study
+from carlasc_recorders import TownDrive
 from PIL import Image
 
 import carlasc
 from carlasc import Grid, GridSpec, Run
-from carlasc.captures import Lidar, TownDrive
+from carlasc.captures import Lidar
 from carlasc.converting import FlowSource, LayoutOptions, convert
 from carlasc.core.choices import Dynamic
 from carlasc.core.geometry import invert

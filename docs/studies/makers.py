@@ -25,10 +25,11 @@ from itertools import combinations
 
 import numpy as np
 import study
+from carlasc_recorders import SimulatedCapture, TownDrive
 
 import carlasc
 from carlasc import FromScans, Grid, GridSpec, Run, Voting
-from carlasc.captures import Lidar, SimulatedCapture, TownDrive
+from carlasc.captures import Lidar
 from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, transform_points
 from carlasc.core.grids import most_frequent

@@ -12,6 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from carlasc_recorders import TownActor, TownDrive
+from carlasc_recorders.town.actors import EGO_ID
+from carlasc_recorders.town.drive import REFERENCE_OFFSET_M, scan_snapshot
 from numpy.typing import NDArray
 from railed import RailedDrive
 from street import StreetDrive
@@ -19,9 +22,7 @@ from study import is_tiny, labels_of
 
 import carlasc
 from carlasc import Boxes, GridSpec
-from carlasc.captures import Lidar, TownActor, TownDrive
-from carlasc.captures.town.actors import EGO_ID
-from carlasc.captures.town.drive import REFERENCE_OFFSET_M, scan_snapshot
+from carlasc.captures import Lidar
 from carlasc.core.geometry import Transform, invert, relative_to, transform_points, translation
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes

@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from carlasc_recorders.town import furniture
+from carlasc_recorders.town.meshes import Mesh, MeshBuilder
+from carlasc_recorders.town.plan import KERB_M, hedge
 from street import END_M, HALF_ROAD_M, START_M, WALK_M, StreetDrive, Traffic, build_street
 
 from carlasc.captures import Lidar
-from carlasc.captures.town import furniture
-from carlasc.captures.town.meshes import Mesh, MeshBuilder
-from carlasc.captures.town.plan import KERB_M, hedge
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import CARLA
 

@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import study
+from carlasc_recorders import TownDrive
 from matplotlib.figure import Figure
 
 from carlasc import Grid, GridSpec
-from carlasc.captures import Lidar, SensorRecording, TownDrive
+from carlasc.captures import Lidar, SensorRecording
 from carlasc.core.geometry import invert
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth import Observation, count_votes

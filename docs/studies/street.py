@@ -13,14 +13,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-
-from carlasc.captures import Lidar, TownActor, TownDrive
-from carlasc.captures.town import furniture
-from carlasc.captures.town.actors import EGO_ID, STRIDE_M, Population
-from carlasc.captures.town.furniture import add_building
-from carlasc.captures.town.meshes import Mesh
-from carlasc.captures.town.plan import KERB_M, PAINT_M, PlantCatalogue, Rectangle, TownPlan
-from carlasc.captures.town.shapes import (
+from carlasc_recorders import TownActor, TownDrive
+from carlasc_recorders.town import furniture
+from carlasc_recorders.town.actors import EGO_ID, STRIDE_M, Population
+from carlasc_recorders.town.furniture import add_building
+from carlasc_recorders.town.meshes import Mesh
+from carlasc_recorders.town.plan import KERB_M, PAINT_M, PlantCatalogue, Rectangle, TownPlan
+from carlasc_recorders.town.shapes import (
     EGO_KIND,
     GAIT_PHASES,
     VEHICLE_KINDS,
@@ -29,8 +28,10 @@ from carlasc.captures.town.shapes import (
     pedestrian_mesh,
     vehicle_mesh,
 )
-from carlasc.captures.town.streets import Streets
-from carlasc.captures.town.town import GROUND, ROAD, ROAD_LINE, SIDEWALK, TERRAIN, Town
+from carlasc_recorders.town.streets import Streets
+from carlasc_recorders.town.town import GROUND, ROAD, ROAD_LINE, SIDEWALK, TERRAIN, Town
+
+from carlasc.captures import Lidar
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
 

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import study
+from carlasc_recorders import SimulatedCapture
 
 import carlasc
-from carlasc.captures import Lidar, SimulatedCapture
+from carlasc.captures import Lidar
 from carlasc.core.geometry import transform_points
 from carlasc.testing import wrong_labels
 

@@ -21,12 +21,13 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from carlasc_recorders import TownDrive
 from numpy.typing import NDArray
 
 from benchmarking.sizes import SPLITS, Scenes, settings_of
 from carlasc import FromScans, Grid, GridSpec, Run, Voting, label, regrid
 from carlasc import open as open_source
-from carlasc.captures import TownDrive, TrafficLevel
+from carlasc.captures import TrafficLevel
 from carlasc.core import CARLA, invert, relative_to, transform_points
 from carlasc.errors import ConflictError
 from carlasc.groundtruth import Observation, count_votes

@@ -7,10 +7,11 @@ import shutil
 
 import numpy as np
 import pytest
+from carlasc_recorders import TownDrive
 from helpers.datasets.kitti import write_kitti
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
-from carlasc.captures import Lidar, TownDrive
+from carlasc.captures import Lidar
 from carlasc.converting import LayoutOptions, convert
 from carlasc.motion import PoseOptions
 from carlasc.motion.paths import estimate_path

@@ -1,11 +1,12 @@
 import json
 
 import pytest
+from carlasc_recorders import SimulatedCapture
 from typer.testing import CliRunner
 
 import carlasc
 from carlasc import GridSpec, Run
-from carlasc.captures import Lidar, SimulatedCapture
+from carlasc.captures import Lidar
 from carlasc.cli import app
 from carlasc.storage import layout
 from carlasc.storage import open as open_store

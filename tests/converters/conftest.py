@@ -1,9 +1,8 @@
 from pathlib import Path
 
 import pytest
+from carlasc_recorders import TownDrive
 from helpers.datasets.kitti import SMALL_LIDAR, KittiTruth, write_kitti
-
-from carlasc.captures import TownDrive
 
 
 @pytest.fixture(scope="session")

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from carlasc_recorders import TownDrive
 from helpers.datasets.kitti import write_kitti
 
 import carlasc
-from carlasc.captures import TownDrive
 from carlasc.converting import LayoutOptions, convert
 from carlasc.motion import PoseOptions
 from carlasc.running import Run

@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from carlasc_recorders import TownDrive
 from helpers.datasets.kitti import write_kitti
 from helpers.datasets.tiny_kitti import write_tiny_kitti
 
 import carlasc
-from carlasc.captures import Lidar, TownDrive
+from carlasc.captures import Lidar
 from carlasc.converting import LayoutOptions, convert
 from carlasc.running import Run
 from carlasc.storage import layout

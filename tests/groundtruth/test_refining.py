@@ -10,12 +10,13 @@ import sys
 
 import numpy as np
 import pytest
+from carlasc_recorders import SimulatedCapture
 from helpers.scenes.winding import record
 from numpy.testing import assert_array_equal
 
 import carlasc
 from carlasc import GridSpec, Run
-from carlasc.captures import Lidar, SimulatedCapture
+from carlasc.captures import Lidar
 from carlasc.core.geometry import invert, multiply, slerp, translation
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
 from carlasc.groundtruth import refining

@@ -3,6 +3,7 @@ import time
 
 import numpy as np
 import pytest
+from carlasc_recorders import SimulatedCapture
 
 import carlasc
 from carlasc import GridSpec
@@ -132,7 +133,7 @@ def town(tmp_path_factory):
     pytest.importorskip("embreex")
     out = tmp_path_factory.mktemp("town")
     with pytest.MonkeyPatch.context() as patch:  # a quarter of the pixels says the same
-        patch.setattr("carlasc.captures.town.photographs.IMAGE_SIZE", (400, 225))
+        patch.setattr("carlasc_recorders.town.photographs.IMAGE_SIZE", (400, 225))
         carlasc.simulate(
             out, count=1, sensors=2, bev=False, cameras=("front", "back"), run=carlasc.Run(workers=1),
             lidar=carlasc.captures.Lidar(16, 16_000),
@@ -196,7 +197,7 @@ def test_seen_needs_cameras_and_a_cartesian_grid(town, tmp_path):
     keep, run = carlasc.Voting(keep_seen=True), carlasc.Run(workers=1)
     with pytest.raises(ArgumentError, match="a Cartesian grid"):
         carlasc.regrid(town, GridSpec.published("cylindrical"), tmp_path, voting=keep, run=run)
-    bare = carlasc.captures.SimulatedCapture(count=1, sensors=1)
+    bare = SimulatedCapture(count=1, sensors=1)
     with pytest.raises(ArgumentError, match="1 to 8 cameras, found 0"):
         carlasc.regrid(bare, GridSpec.published(), tmp_path, voting=keep, run=run)
     with pytest.raises(ArgumentError, match="expected any of front"):

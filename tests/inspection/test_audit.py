@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from carlasc_recorders import SimulatedCapture, TownDrive
 from helpers.datasets import planted
 from typer.testing import CliRunner
 
 import carlasc
 from carlasc import GridSpec, Run
-from carlasc.captures import Lidar, TownDrive
+from carlasc.captures import Lidar
 from carlasc.cli import app
 from carlasc.core.geometry import invert, rotation_z
 from carlasc.errors import ArgumentError, MissingDataError
@@ -32,7 +33,7 @@ X, Y, Z = SPEC.voxel_size
 def town(tmp_path_factory):
     """A sound drive, with grids of all of its sensors."""
     folder = tmp_path_factory.mktemp("audited") / "town"
-    capture = carlasc.captures.SimulatedCapture(
+    capture = SimulatedCapture(
         count=FRAMES, first_frame=20, sensors=5, seed=1, traffic="light", lidar=LIDAR, bev=False
     )
     carlasc.regrid(capture, SPEC, folder, run=Run(workers=1))
@@ -262,7 +263,7 @@ def test_the_command_prints_writes_a_page_and_tells_by_its_exit_code(town, tmp_p
 @pytest.mark.slow
 def test_one_sensor_loses_thin_things_and_the_finding_says_so(tmp_path):
     dense = Lidar(channels=48, points=40_000)
-    capture = carlasc.captures.SimulatedCapture(
+    capture = SimulatedCapture(
         count=8, first_frame=20, sensors=1, seed=1, traffic="light", lidar=dense, bev=False
     )
     carlasc.regrid(capture, SPEC, tmp_path, run=Run(workers=1))
@@ -391,7 +392,7 @@ def test_scans_without_poses_tell_less_and_say_so(town, tmp_path):
 @pytest.mark.slow
 def test_a_drift_of_five_centimetres_a_second_is_named(tmp_path):
     scans, drifting, spec = tmp_path / "town", tmp_path / "drifting", GridSpec.published("fine")
-    capture = carlasc.captures.SimulatedCapture(
+    capture = SimulatedCapture(
         count=51, first_frame=20, sensors=1, seed=6, traffic="light", lidar=LIDAR, bev=False
     )
     carlasc.regrid(capture, SPEC, scans, run=Run(workers=1))

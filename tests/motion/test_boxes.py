@@ -4,10 +4,10 @@ nobody swallows the road.
 
 import numpy as np
 import pytest
+from carlasc_recorders import TownDrive
 from helpers.scenes.box_actors import PERIOD_S, MovingBox, scan_of
 
 from carlasc import Boxes, Scan
-from carlasc.captures import TownDrive
 from carlasc.core.geometry import invert, rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
 from carlasc.motion import segment_by_boxes, tracks_from_boxes

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from carlasc_recorders import TownDrive
 from numpy.typing import NDArray
 
-from carlasc.captures import Lidar, TownDrive
+from carlasc.captures import Lidar
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.tables import REMAPS
 

@@ -17,8 +17,7 @@ from types import SimpleNamespace
 
 import carla
 import numpy as np
-
-from carlasc.captures.carla.server import DETECTION
+from carlasc_recorders.carla.server import DETECTION
 
 SPEED_M_S = 5.0
 ROAD, VEHICLE, PEDESTRIAN = "road", "vehicle", "pedestrian"

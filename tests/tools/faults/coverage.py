@@ -36,7 +36,7 @@ NAMES = (
 )
 """The targets that read thousands of inputs a minute."""
 CORPUS = Path(__file__).parent / "corpus"
-_PACKAGES = ("carlasc", "carlasc_converters")
+_PACKAGES = ("carlasc", "carlasc_converters", "carlasc_recorders")
 _RUNS = re.compile(r"stat::number_of_executed_units: *([0-9]+)")
 _MOST_S = 1800  # seconds of one target
 

@@ -323,7 +323,7 @@ def _place_of(error: BaseException) -> str:
     own, last = "", ""
     for step in traceback.extract_tb(error.__traceback__):
         last = f"[{Path(step.filename).name}:{step.lineno}]"
-        for package in ("carlasc", "carlasc_converters", "completion"):
+        for package in ("carlasc", "carlasc_converters", "carlasc_recorders", "completion"):
             parts = Path(step.filename).parts
             # a checkout may be named after it
             if package in parts[:-1] and not {"site-packages", "tests"} & {*parts}:

@@ -7,9 +7,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from carlasc_recorders.town.drive import TownDrive
+from carlasc_recorders.town.simulation import simulate
+
 from carlasc import Run
-from carlasc.captures.town.drive import TownDrive
-from carlasc.captures.town.simulation import simulate
 from measuring.figures import Figure
 from measuring.sizes import Size, by_turns
 

@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.town.meshes import Mesh, MeshBuilder
-from carlasc.captures.town.streets import HALF_ROAD_M, SIDEWALK_M
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
+from carlasc_recorders.town.meshes import Mesh, MeshBuilder
+from carlasc_recorders.town.streets import HALF_ROAD_M, SIDEWALK_M
 
 VEGETATION = CARLA.id_of("Vegetation")
 

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from carlasc.captures.carla.sensors import ActorNumbers, SensorRig, photo_fields
-from carlasc.captures.carla.server import Server, ServerOptions
 from carlasc.captures.raw import Capture, SensorRecording
 from carlasc.captures.settings import TRAFFIC, Lidar, TrafficLevel, check_at_least, sensor_offsets
-from carlasc.captures.town.photographs import town_cameras
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.errors import ConflictError, MissingDataError, check_choice, import_extra
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.layout import CAMERAS
+from carlasc_recorders.carla.sensors import ActorNumbers, SensorRig, photo_fields
+from carlasc_recorders.carla.server import Server, ServerOptions
+from carlasc_recorders.town.photographs import roof_cameras
 
 SETTINGS_FILE = "recording.json"
 # maximum distance between the ego sensor positions of the replay and of the recorded drive
@@ -115,7 +115,7 @@ def record(
     check_at_least(1, count=count, sensors=sensors)
     check_at_least(0, seed=seed)
     check_choice("traffic", traffic, TrafficLevel)
-    models = town_cameras(cameras)
+    models = roof_cameras(cameras)
     images = photo_fields(models)
     if bev or cameras:
         import_extra("PIL.Image", "carla")

@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from carlasc_recorders import TownActor, TownDrive
+from carlasc_recorders.town.actors import EGO_ID
+from carlasc_recorders.town.plan import Rectangle
+from carlasc_recorders.town.shapes import VEHICLE
 
-from carlasc.captures import TownActor, TownDrive
 from carlasc.captures.settings import TRAFFIC
-from carlasc.captures.town.actors import EGO_ID
-from carlasc.captures.town.plan import Rectangle
-from carlasc.captures.town.shapes import VEHICLE
 from carlasc.core.geometry import invert, transform_points
 
 pytest.importorskip("embreex", reason="the simulator needs carlasc[simulate]")

@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.captures.settings import TRAFFIC, TrafficLevel
-from carlasc.captures.town.meshes import Mesh, close_loop
-from carlasc.captures.town.plan import KERB_M
-from carlasc.captures.town.shapes import (
+from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.errors import check_choice
+from carlasc.storage.layout import FRAME_PERIOD_S
+from carlasc_recorders.town.meshes import Mesh, close_loop
+from carlasc_recorders.town.plan import KERB_M
+from carlasc_recorders.town.shapes import (
     EGO_KIND,
     GAIT_PHASES,
     VEHICLE_KINDS,
@@ -23,12 +26,9 @@ from carlasc.captures.town.shapes import (
     pedestrian_mesh,
     vehicle_mesh,
 )
-from carlasc.captures.town.streets import HALF_ROAD_M, CityBlock
-from carlasc.captures.town.town import Town
-from carlasc.captures.town.traffic import Traffic, place_vehicles
-from carlasc.core.geometry import Transform, rotation_z, translation
-from carlasc.errors import check_choice
-from carlasc.storage.layout import FRAME_PERIOD_S
+from carlasc_recorders.town.streets import HALF_ROAD_M, CityBlock
+from carlasc_recorders.town.town import Town
+from carlasc_recorders.town.traffic import Traffic, place_vehicles
 
 _OFFSETS_M = (1.1, 1.75, 2.3)
 """Distance from the kerb of pedestrians who walk along the loop, against it, and who stand."""

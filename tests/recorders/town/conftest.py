@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import pytest
+from carlasc_recorders import TownDrive
 
-from carlasc.captures import Lidar, TownDrive
+from carlasc.captures import Lidar
 
 
 @pytest.fixture(scope="session")

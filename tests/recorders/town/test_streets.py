@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from carlasc.captures.town.streets import (
+from carlasc_recorders.town.streets import (
     HALF_ROAD_M,
     LANE_WIDTH_M,
     SIDEWALK_M,

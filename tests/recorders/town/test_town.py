@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from carlasc_recorders import TownDrive
+from carlasc_recorders.town.plan import Land, Rectangle
+from carlasc_recorders.town.town import build_town
 
-from carlasc.captures import TownDrive
-from carlasc.captures.town.plan import Land, Rectangle
-from carlasc.captures.town.town import build_town
 from carlasc.core.tables import CARLA
 
 pytest.importorskip("embreex", reason="the simulator needs carlasc[simulate]")

@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from carlasc.captures.town.meshes import Mesh, MeshBuilder
-from carlasc.captures.town.plan import INNER_M, KERB_M, Rectangle, TownPlan
-from carlasc.captures.town.streets import BAY_M, HALF_ROAD_M, Side, Streets
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
+from carlasc_recorders.town.meshes import Mesh, MeshBuilder
+from carlasc_recorders.town.plan import INNER_M, KERB_M, Rectangle, TownPlan
+from carlasc_recorders.town.streets import BAY_M, HALF_ROAD_M, Side, Streets
 
 FENCE, OTHER, POLE, WALL = (CARLA.id_of(name) for name in ("Fence", "Other", "Pole", "Wall"))
 TRAFFIC_SIGN, TRAFFIC_LIGHT = CARLA.id_of("TrafficSign"), CARLA.id_of("TrafficLight")

@@ -17,11 +17,12 @@ pytest.importorskip(
 )
 
 import carla
+from carlasc_recorders import ServerError
+from carlasc_recorders.carla.sensors import ActorNumbers
+from carlasc_recorders.carla.server import DETECTION, Server, ServerOptions, decode_sweep
 from helpers.servers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
 
-from carlasc.captures import Capture, Lidar, ServerError, record
-from carlasc.captures.carla.sensors import ActorNumbers
-from carlasc.captures.carla.server import DETECTION, Server, ServerOptions, decode_sweep
+from carlasc.captures import Capture, Lidar, record
 from carlasc.captures.settings import sensor_offsets
 from carlasc.cli import app
 from carlasc.core.geometry import transform_points

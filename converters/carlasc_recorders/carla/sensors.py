@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.carla.server import SemanticSweep, Server, decode_sweep
 from carlasc.captures.raw import SensorRecording
 from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE, Lidar
 from carlasc.core.cameras import CameraModel
@@ -20,6 +19,7 @@ from carlasc.core.tables import CARLA, REMAPS
 from carlasc.errors import MissingDataError
 from carlasc.storage.camera_files import encode_image
 from carlasc.storage.layout import FRAME_PERIOD_S
+from carlasc_recorders.carla.server import SemanticSweep, Server, decode_sweep
 
 # by folder of images: camera of CARLA and file suffix
 _KINDS = {

@@ -11,14 +11,14 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.town.actors import EGO_ID
-from carlasc.captures.town.drive import Snapshot
-from carlasc.captures.town.meshes import RayScene, rotate_exactly
 from carlasc.core.cameras import CameraModel, optical_axes
 from carlasc.core.geometry import Transform
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
 from carlasc.storage.camera_files import encode_image
+from carlasc_recorders.town.actors import EGO_ID
+from carlasc_recorders.town.drive import Snapshot
+from carlasc_recorders.town.meshes import RayScene, rotate_exactly
 
 CAMERA_YAWS_DEG = MappingProxyType(
     {
@@ -54,7 +54,7 @@ PHOTO_SUFFIXES = MappingProxyType(
 )
 
 
-def town_cameras(names: Sequence[str]) -> tuple[CameraModel, ...]:
+def roof_cameras(names: Sequence[str]) -> tuple[CameraModel, ...]:
     """Return the cameras with some names.
 
     Raises:

@@ -18,6 +18,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.captures.settings import ServerOptions
 from carlasc.core.geometry import Transform
 from carlasc.errors import ArgumentError, CarlascError, FormatError, import_extra
 from carlasc.storage.layout import FRAME_PERIOD_S
@@ -47,23 +48,6 @@ class SemanticSweep:
     detections: NDArray[np.void]
     world_T_sensor: Transform
     elapsed_s: float
-
-
-@dataclass(frozen=True)
-class ServerOptions:
-    """Address and timeout of a CARLA server.
-
-    Attributes:
-        host: host of the server.
-        port: RPC port of the server.
-        traffic_port: port of the traffic manager.
-        timeout_s: timeout of answers, seconds.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 2000
-    traffic_port: int = 8000
-    timeout_s: float = 60.0
 
 
 class Server:

@@ -13,16 +13,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.town import furniture
-from carlasc.captures.town.furniture import (
+from carlasc.core.geometry import Transform, rotation_z, translation
+from carlasc.core.tables import CARLA
+from carlasc_recorders.town import furniture
+from carlasc_recorders.town.furniture import (
     add_building,
     add_footbridge,
     add_street_furniture,
     add_traffic_signals,
     mark_parking_bay,
 )
-from carlasc.captures.town.meshes import Mesh, at_height, close_loop
-from carlasc.captures.town.plan import (
+from carlasc_recorders.town.meshes import Mesh, at_height, close_loop
+from carlasc_recorders.town.plan import (
     INNER_M,
     KERB_M,
     PAINT_M,
@@ -32,9 +34,14 @@ from carlasc.captures.town.plan import (
     TownPlan,
     hedge,
 )
-from carlasc.captures.town.streets import BAY_M, HALF_ROAD_M, CityBlock, Side, Streets, draw_streets
-from carlasc.core.geometry import Transform, rotation_z, translation
-from carlasc.core.tables import CARLA
+from carlasc_recorders.town.streets import (
+    BAY_M,
+    HALF_ROAD_M,
+    CityBlock,
+    Side,
+    Streets,
+    draw_streets,
+)
 
 ROAD, ROAD_LINE, SIDEWALK = (CARLA.id_of(name) for name in ("Road", "RoadLine", "Sidewalk"))
 GROUND, TERRAIN, WATER = (CARLA.id_of(name) for name in ("Ground", "Terrain", "Water"))

@@ -21,11 +21,11 @@ from carlasc.captures.settings import (
     check_at_least,
     sensor_offsets,
 )
-from carlasc.captures.town.actors import EGO_ID, Population, TownActor
-from carlasc.captures.town.meshes import Mesh, RayScene, concatenate, rotate_exactly
-from carlasc.captures.town.town import Town, build_town
 from carlasc.core.geometry import Transform, invert, rotate_vectors, transform_points, translation
 from carlasc.core.scans import Scan
+from carlasc_recorders.town.actors import EGO_ID, Population, TownActor
+from carlasc_recorders.town.meshes import Mesh, RayScene, concatenate, rotate_exactly
+from carlasc_recorders.town.town import Town, build_town
 
 REFERENCE_OFFSET_M = (
     25.6  # maximum offset of a reference sensor in x and y: half the width of the published grid

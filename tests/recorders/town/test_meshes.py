@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from carlasc_recorders.town.meshes import MeshBuilder, RayScene, rotate_exactly
 
-from carlasc.captures.town.meshes import MeshBuilder, RayScene, rotate_exactly
 from carlasc.core.geometry import rotate_vectors, rotation_z, translation
 
 pytest.importorskip("embreex", reason="the simulator needs carlasc[simulate]")

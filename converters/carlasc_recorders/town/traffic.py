@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.captures.town.streets import Lane, Streets
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.storage.layout import FRAME_PERIOD_S
+from carlasc_recorders.town.streets import Lane, Streets
 
 ACCELERATION = 1.8  # m/s^2
 BRAKING = 2.5  # m/s^2, comfortable

@@ -10,8 +10,8 @@ from functools import cache
 
 import numpy as np
 
-from carlasc.captures.town.meshes import Mesh, MeshBuilder, unit_sphere
 from carlasc.core.tables import CARLA
+from carlasc_recorders.town.meshes import Mesh, MeshBuilder, unit_sphere
 
 VEHICLE = CARLA.id_of("Vehicle")
 PEDESTRIAN = CARLA.id_of("Pedestrian")

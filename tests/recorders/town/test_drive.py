@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from carlasc_recorders import SimulatedCapture
+from carlasc_recorders.town.actors import EGO_ID
+from carlasc_recorders.town.drive import Snapshot, TownDrive, scan_snapshot
+from carlasc_recorders.town.meshes import MeshBuilder, RayScene
 
-from carlasc.captures.town.actors import EGO_ID
-from carlasc.captures.town.drive import Snapshot, TownDrive, scan_snapshot
-from carlasc.captures.town.meshes import MeshBuilder, RayScene
-from carlasc.captures.town.simulation import TOWN_VERSION
 from carlasc.core.geometry import invert, rotate_vectors, rotation_z, transform_points, translation
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError
@@ -338,10 +338,10 @@ def test_reference_sensors_are_at_all_heights(drive: TownDrive) -> None:
 
 
 def test_a_seed_keeps_its_town_and_its_traffic(drive: TownDrive) -> None:
-    """Where this fails, the same seed makes another town: raise TOWN_VERSION, so that old and new
+    """Where this fails, the same seed makes another town: raise `recipe`, so that old and new
     frames are not mixed.
     """
-    assert TOWN_VERSION == 1
+    assert SimulatedCapture.recipe == 1
     mesh = drive.town.mesh
     assert (len(mesh.vertices), len(mesh.faces)) == SEED_3["mesh"]
     assert len(drive.town.buildings) == SEED_3["buildings"]

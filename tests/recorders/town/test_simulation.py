@@ -15,16 +15,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from carlasc_recorders import SimulatedCapture, TownDrive
+from carlasc_recorders.town.actors import EGO_ID
+from carlasc_recorders.town.drive import Snapshot
+from carlasc_recorders.town.meshes import MeshBuilder, RayScene
+from carlasc_recorders.town.simulation import render_birdseye
 from helpers.datasets.captures import read_tree
 from typer.testing import CliRunner
 
 import carlasc
 from carlasc import Run
-from carlasc.captures import Capture, Lidar, SimulatedCapture, TownDrive, simulate
-from carlasc.captures.town.actors import EGO_ID
-from carlasc.captures.town.drive import Snapshot
-from carlasc.captures.town.meshes import MeshBuilder, RayScene
-from carlasc.captures.town.simulation import render_birdseye
+from carlasc.captures import Capture, Lidar, simulate
 from carlasc.cli import app
 from carlasc.core.geometry import rotation_z, translation
 from carlasc.core.grids import GridSpec

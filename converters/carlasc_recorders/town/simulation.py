@@ -1,0 +1,157 @@
+"""A drive through the simulated town, as a capture that is computed when it is read."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.captures.raw import SensorRecording
+from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE, Lidar, TrafficLevel
+from carlasc.captures.simulation import Simulator
+from carlasc.core.cameras import CameraModel
+from carlasc.core.geometry import Transform, rotate_vectors
+from carlasc.core.tables import CARLA
+from carlasc.errors import import_extra
+from carlasc_recorders.town.drive import Snapshot, TownDrive
+from carlasc_recorders.town.photographs import photo_fields, photograph, roof_cameras
+
+_SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
+_BACKGROUND = (255, 255, 255)
+_REDUCTION = (
+    2  # rays are cast for every second row and column of pixels; the picture is enlarged afterwards
+)
+
+
+def render_birdseye(snapshot: Snapshot) -> bytes:
+    """Return the bird's-eye picture as JPEG bytes: 1920 x 1080 pixels, 90 degrees wide, with its
+    upper edge ahead of the vehicle.
+
+    Raises:
+        DependencyError: a package of the extra `simulate` is missing.
+    """
+    pixels = _render(snapshot, snapshot.world_T_ego, (0.0, 0.0, BEV_HEIGHT_M), _downward_rays())
+    image = import_extra("PIL.Image", "simulate")
+    picture = image.fromarray(pixels).resize(BEV_SIZE, image.Resampling.BICUBIC)
+    buffer = io.BytesIO()
+    picture.save(buffer, "JPEG", quality=BEV_QUALITY)
+    return buffer.getvalue()
+
+
+def _render(
+    snapshot: Snapshot,
+    world_T_view: Transform,
+    origin: tuple[float, float, float],
+    directions: NDArray[np.float64],
+) -> NDArray[np.uint8]:
+    """Return a picture of the surfaces that rays hit.
+
+    Args:
+        snapshot: the town.
+        world_T_view: (4, 4) from the frame of `origin` and `directions` to the world frame.
+        origin: (3,) start of the rays, metres.
+        directions: (H, W, 3) unit vectors, one per pixel.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    height, width, _ = directions.shape
+    rays = rotate_vectors(world_T_view, directions.reshape(-1, 3))
+    eye = world_T_view[:3, :3] @ np.array(origin) + world_T_view[:3, 3]
+    hit, triangles, _ = snapshot.scene.cast(eye, rays, 1000.0)
+    normals = snapshot.scene.normals(triangles)
+    normals *= -np.sign(np.einsum("ri,ri->r", normals, rays[hit]))[:, None]  # towards the camera
+    light = 0.55 + 0.45 * np.clip(normals @ (_SUN / np.linalg.norm(_SUN)), 0, 1)
+    pixels = np.full((height * width, 3), _BACKGROUND, np.uint8)
+    pixels[hit] = CARLA.palette[snapshot.mesh.labels[triangles]] * light[:, None]
+    return pixels.reshape(height, width, 3)
+
+
+def _downward_rays() -> NDArray[np.float64]:
+    """Return (H, W, 3) rays of a camera that looks down.
+
+    Its upper edge is ahead, its right edge on the right.
+    """
+    width, height = BEV_SIZE[0] // _REDUCTION, BEV_SIZE[1] // _REDUCTION
+    right = (np.arange(width) + 0.5 - width / 2) / (width / 2)
+    ahead = -(np.arange(height) + 0.5 - height / 2) / (width / 2)
+    rays = np.stack(np.broadcast_arrays(ahead[:, None], right[None, :], -1.0), axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+class SimulatedCapture(Simulator):
+    """A drive through the simulated town, to make ground truth with `carlasc.regrid` without a
+    capture on disk.
+
+    Its data are equal to the output of `carlasc.simulate` with the same settings. It can be
+    pickled.
+    """
+
+    def read(self, sensor: int, frame: int) -> SensorRecording:
+        """Simulate the recording of a sensor in a frame."""
+        self.check_frame(frame)
+        return self._drive.record(frame, sensor)
+
+    def read_velocities(self, frame: int) -> dict[int, NDArray[np.float64]]:
+        """Return the (3,) velocity over ground, m/s, world frame, of each actor of the town in a
+        frame.
+        """
+        self.check_frame(frame)
+        return {actor.id: actor.velocity for actor in self._drive.actors(frame)}
+
+    def read_pose(self, sensor: int, frame: int) -> Transform:
+        """Return the (4, 4) float64 world_T_sensor of a frame."""
+        self.check_frame(frame)
+        return self._drive.sensor_poses(frame, sensor + 1)[sensor]
+
+    def read_bev(self, frame: int) -> bytes | None:
+        """Return the bird's-eye picture of a frame as JPEG bytes; None without `bev`."""
+        self.check_frame(frame)
+        return render_birdseye(self._drive.snapshot(frame)) if self.bev else None
+
+    def has_bev(self, frame: int) -> bool:
+        """Whether a frame has a bird's-eye picture."""
+        return self.bev
+
+    def make_cameras(self, names: Sequence[str]) -> tuple[CameraModel, ...]:
+        """Return the cameras with some names, on the roof of the vehicle.
+
+        Raises:
+            ArgumentError: a name is unknown, or occurs twice.
+        """
+        return roof_cameras(names)
+
+    def image_fields(self, frame: int) -> tuple[str, ...]:
+        """Return the layout names of the images of a frame."""
+        return photo_fields(self.cameras.values())
+
+    def read_images(self, frame: int) -> dict[str, NDArray[np.uint8]]:
+        """Return the image files of a frame as bytes, by their layout names."""
+        if not self.cameras:
+            return {}
+        return photograph(
+            self._drive.snapshot(frame), tuple(self.cameras.values()), self.read_pose(0, frame)
+        )
+
+    def check_packages(self) -> None:
+        """Check that the packages for the simulation are installed.
+
+        Raises:
+            DependencyError: a package of the extra `simulate` is missing.
+        """
+        modules = ["trimesh.creation", "embreex.rtcore_scene", "embreex.mesh_construction"]
+        for module in [*modules, "PIL.Image"] if self.bev or self.cameras else modules:
+            import_extra(module, "simulate")
+
+    @property
+    def _drive(self) -> TownDrive:
+        return _cached_drive(self.seed, self.traffic, self.lidar)
+
+
+@lru_cache(maxsize=1)
+def _cached_drive(seed: int, traffic: TrafficLevel, lidar: Lidar) -> TownDrive:
+    """Return the drive of this process. The town is built once."""
+    return TownDrive(seed, traffic, lidar)
