@@ -82,20 +82,20 @@ def parse_times(data: bytes | memoryview, where: str) -> dict[int, tuple[float, 
         FormatError: a line does not have the format of CARLA. `where` is the file named in the
             message.
     """
-    found: dict[int, tuple[float, str]] = {}
+    times: dict[int, tuple[float, str]] = {}
     for number, line in enumerate(bytes(data).decode(errors="replace").splitlines(), 1):
         match = re.match(r"\s*([0-9]{1,18})\s*,.*\belapsed_seconds=([-+0-9.eE]+)", line)
         try:
             if match is None:
                 raise ValueError("another format")
-            found[int(match[1])] = float(match[2]), line
+            times[int(match[1])] = float(match[2]), line
         except ValueError as error:
             raise FormatError(
                 where,
                 expected="'<frame>, Timestamp(...,elapsed_seconds=...)'",
                 found=f"{line[:60]!r} in line {number}",
             ) from error
-    return found
+    return times
 
 
 _SEARCH_DEPTH = 3  # levels of folders: <root>/<split>/<sequence>, and one folder around them
@@ -165,19 +165,19 @@ class Capture:
         Raises:
             MissingDataError: no sensor, or not sensor 0, has such a folder.
         """
-        found = set()
+        numbers = set()
         for name, is_folder in self._entries("").items():
             match = re.fullmatch(r"([a-z]+)([0-9]{1,18})", name)
             if match and match[1] in FOLDERS.values() and is_folder:
-                found.add(int(match[2]))
-        if 0 not in found:
+                numbers.add(int(match[2]))
+        if 0 not in numbers:
             raise MissingDataError(
                 self.location,
                 expected="the folder velodyne0 of the ego sensor",
-                found=f"only the sensors {sorted(found)}" if found else "no sensor",
+                found=f"only the sensors {sorted(numbers)}" if numbers else "no sensor",
                 advice="give a folder with raw/ in it, or raw/ itself",
             )
-        return tuple(sorted(found))
+        return tuple(sorted(numbers))
 
     @cached_property
     def frames(self) -> NDArray[np.int64]:
@@ -190,19 +190,19 @@ class Capture:
             MissingDataError: the capture has no frames.
         """
         ego = self.sensors[0]
-        found: set[int] = set()
+        numbers: set[int] = set()
         for kind in FOLDERS.values():
             names = self._entries(f"{kind}{ego}")
-            found |= {
+            numbers |= {
                 int(name.removesuffix(".npy"))
                 for name in names
                 if re.fullmatch(r"[0-9]{1,18}\.npy", name)
             }
-        if not found:
+        if not numbers:
             raise MissingDataError(
                 self.location, expected="frames such as velodyne0/100.npy", found="none"
             )
-        return np.array(sorted(found), np.int64)
+        return np.array(sorted(numbers), np.int64)
 
     def read(self, sensor: int, frame: int) -> SensorRecording:
         """Read the recording of a sensor in a frame.
@@ -246,7 +246,7 @@ class Capture:
             for kind in ("velocities", "pose")
             for sensor in self.sensors
         ]
-        files, found = self.tree.read_many(paths), dict[int, NDArray[np.float64]]()
+        files, by_actor = self.tree.read_many(paths), dict[int, NDArray[np.float64]]()
         half = len(self.sensors)
         for row, (path, data) in enumerate(zip(paths[:half], files[:half], strict=True)):
             rows = parse_npy(data, FORMATS["velocities"], where := self.tree.where(path))
@@ -254,8 +254,8 @@ class Capture:
             velocities = rotate_vectors(
                 self._pose_of(paths[half + row], files[half + row]), rows[:, 1:]
             )
-            found |= dict(zip(rows[:, 0].astype(np.int64).tolist(), velocities, strict=True))
-        return found
+            by_actor |= dict(zip(rows[:, 0].astype(np.int64).tolist(), velocities, strict=True))
+        return by_actor
 
     def read_pose(self, sensor: int, frame: int) -> Transform:
         """Return the (4, 4) float64 world_T_sensor of a frame.
@@ -272,15 +272,15 @@ class Capture:
         poses that cannot be read.
         """
         paths = [self._folder + array_path("pose", sensor, frame) for frame in frames]
-        found = np.full((len(paths), 4, 4), np.nan)
+        poses = np.full((len(paths), 4, 4), np.nan)
         try:
             files = dict(enumerate(self.tree.read_many(paths)))
         except CarlascError:
             files = {}
         for place, path in enumerate(paths):
             with suppress(FormatError, MissingDataError):
-                found[place] = self._pose_of(path, files[place] if files else self.tree.read(path))
-        return found
+                poses[place] = self._pose_of(path, files[place] if files else self.tree.read(path))
+        return poses
 
     def _pose_of(self, path: str, data: bytes | memoryview) -> Transform:
         where = self.tree.where(path)
@@ -311,8 +311,8 @@ class Capture:
             FormatError: a line does not have this format.
         """
         path = self._folder + times_path(sensor)
-        found = parse_times(self.tree.read(path), self.tree.where(path))
-        return {frame: elapsed_s for frame, (elapsed_s, _) in found.items()}
+        lines = parse_times(self.tree.read(path), self.tree.where(path))
+        return {frame: elapsed_s for frame, (elapsed_s, _) in lines.items()}
 
     def read_bev(self, frame: int) -> bytes | None:
         """Return the bird's-eye picture of a frame as JPEG bytes; None if it does not exist."""

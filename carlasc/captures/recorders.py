@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from carlasc.core.plugins import load_plugin, plugin_names
 
 if TYPE_CHECKING:
-    from carlasc_recorders.carla.recording import record as record  # noqa: PLC0414 (part of this module)
+    from carlasc_recorders.carla.recording import record as record  # noqa: PLC0414
 
 GROUP = "carlasc.recorders"
 

@@ -233,8 +233,15 @@ def simulate(
         CarlascError: a worker process died.
     """
     drive: Simulator = load_recorder(simulator, Simulator)(
-        count=count, first_frame=first_frame, sensors=sensors, seed=seed, traffic=traffic, lidar=lidar, bev=bev, cameras=cameras
-    )  # fmt: skip
+        count=count,
+        first_frame=first_frame,
+        sensors=sensors,
+        seed=seed,
+        traffic=traffic,
+        lidar=lidar,
+        bev=bev,
+        cameras=cameras,
+    )
     check_shared(os.fspath(out), run)
     settings = {
         **{"seed": seed, "traffic": traffic, "sensors": sensors, "bev": bev},

@@ -191,8 +191,8 @@ class CaptureWriter:
                 elapsed_s = float(times[sensor])
                 lines[frame] = (
                     f"{frame}, "
-                    f"Timestamp(frame={frame},elapsed_seconds={elapsed_s},delta_seconds={FRAME_PERIOD_S},"
-                    f"platform_timestamp={elapsed_s})"
+                    f"Timestamp(frame={frame},elapsed_seconds={elapsed_s},"
+                    f"delta_seconds={FRAME_PERIOD_S},platform_timestamp={elapsed_s})"
                 )
             files[times_path(sensor)] = "".join(
                 f"{lines[frame]}\n" for frame in sorted(lines)

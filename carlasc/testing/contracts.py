@@ -68,8 +68,8 @@ class SourceContract:
         assert list(source.sequences()) == sorted([WHOLE, SCANS, GRIDS])
 
     def test_sequences_have_their_split_name_and_coordinates(self, source: Source) -> None:
-        found = {(s.split, s.name, s.coordinates) for s in source.sequences().values()}
-        assert found == {
+        parts = {(s.split, s.name, s.coordinates) for s in source.sequences().values()}
+        assert parts == {
             ("Train", "Town01_Light", "cartesian"),
             ("Val", "Town07_Heavy", "cartesian"),
             ("Test", "Town10_Medium", "cylindrical"),
@@ -116,14 +116,12 @@ class SourceContract:
         self, source: Source, expected: dict[str, Sequence]
     ) -> None:
         sequence = source.sequences()[WHOLE]
-        none, found, wanted = sequence.boxes(0), sequence.boxes(5), expected[WHOLE].boxes(5)
+        none, some, wanted = sequence.boxes(0), sequence.boxes(5), expected[WHOLE].boxes(5)
         assert none is not None and len(none) == 0 and sequence.boxes(2) is None
-        assert found is not None and wanted is not None and len(found) == 5
-        assert found.annotated.dtype == np.bool_ and np.array_equal(
-            found.annotated, wanted.annotated
-        )
-        assert np.array_equal(found.tracks, wanted.tracks) and np.array_equal(
-            found.sensor_T_box, wanted.sensor_T_box
+        assert some is not None and wanted is not None and len(some) == 5
+        assert some.annotated.dtype == np.bool_ and np.array_equal(some.annotated, wanted.annotated)
+        assert np.array_equal(some.tracks, wanted.tracks) and np.array_equal(
+            some.sensor_T_box, wanted.sensor_T_box
         )
         assert sequence.read("boxes", 5).dtype == BOXES_DTYPE
 
@@ -139,12 +137,12 @@ class SourceContract:
         sequence = source.sequences()[WHOLE]
         spare: list[NDArray[np.float32]] = []
         for frames in ([0, 1, 2], [5, 2], [1, 0, 5]):
-            found = sequence.read_xyz(frames, spare)
-            for frame, xyz in zip(frames, found, strict=True):
+            arrays = sequence.read_xyz(frames, spare)
+            for frame, xyz in zip(frames, arrays, strict=True):
                 points = sequence.read("points", frame)
                 assert xyz.dtype == np.float32 and xyz.shape[0] == len(points)
                 assert xyz[:, :3].tobytes() == points[:, :3].tobytes()
-            spare = found
+            spare = arrays
 
     def test_reading_no_frames_gives_an_empty_list(self, source: Source) -> None:
         assert source.sequences()[WHOLE].read_many("points", []) == []
@@ -244,17 +242,17 @@ class SinkContract:
 
     def test_gives_back_what_it_took(self, given: Source, out: Path) -> None:
         self.write_all(given, self.sink(out))
-        found = self.read(out).sequences()
-        assert list(found) == list(given.sequences())
+        read_back = self.read(out).sequences()
+        assert list(read_back) == list(given.sequences())
         for path, sequence in given.sequences().items():
-            assert found[path].fields() == sequence.fields()
-            assert {n: found[path].read_document(n) for n in found[path].documents()} == {
+            assert read_back[path].fields() == sequence.fields()
+            assert {n: read_back[path].read_document(n) for n in read_back[path].documents()} == {
                 n: sequence.read_document(n) for n in sequence.documents()
             }
             for name in sequence.fields():
-                assert found[path].frames(name).tolist() == sequence.frames(name).tolist()
+                assert read_back[path].frames(name).tolist() == sequence.frames(name).tolist()
                 for frame in sequence.frames(name).tolist():
-                    got, wanted = found[path].read(name, frame), sequence.read(name, frame)
+                    got, wanted = read_back[path].read(name, frame), sequence.read(name, frame)
                     assert published_bytes(name, got) == published_bytes(name, wanted), (
                         path,
                         name,

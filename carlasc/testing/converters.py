@@ -105,9 +105,9 @@ class ConverterContract:
         assert sequence.frames("points").tolist() == list(range(self.drive.frames))
         for frame in range(self.drive.frames):
             expected = self.arrange(frame, list(self._points(frame)))
-            found = sequence.read("points", frame)[:, :3]
-            assert found.shape == expected.shape
-            np.testing.assert_allclose(found, expected, rtol=0, atol=self.points_m)
+            points = sequence.read("points", frame)[:, :3]
+            assert points.shape == expected.shape
+            np.testing.assert_allclose(points, expected, rtol=0, atol=self.points_m)
 
     def test_poses_are_those_of_the_drive(self, sequence: Sequence) -> None:
         if "poses" not in self.keeps:
@@ -137,10 +137,10 @@ class ConverterContract:
         numbers: dict[int, int] = {}
         for frame in self.labelled(sequence):
             truth = self.arrange(frame, [scan.instances for scan in self._scans(frame)])
-            found = sequence.read("instances", frame)
-            np.testing.assert_array_equal(found > 0, truth > 0)
+            instances = sequence.read("instances", frame)
+            np.testing.assert_array_equal(instances > 0, truth > 0)
             for track, number in np.unique(
-                np.stack([truth, found])[:, truth > 0], axis=1
+                np.stack([truth, instances])[:, truth > 0], axis=1
             ).T.tolist():
                 assert numbers.setdefault(track, number) == number
         assert len(numbers) == len(set(numbers.values())) > 0
@@ -151,9 +151,9 @@ class ConverterContract:
         numbers: dict[int, int] = {}
         frames = 0
         for frame in sequence.frames("boxes").tolist():
-            found = sequence.boxes(frame)
-            assert found is not None
-            annotated = found.select(found.annotated)
+            boxes = sequence.boxes(frame)
+            assert boxes is not None
+            annotated = boxes.select(boxes.annotated)
             if not len(annotated):
                 continue
             frames += 1
@@ -284,6 +284,6 @@ class ConverterContract:
 
 
 def _centers(sequence: Sequence, frame: int) -> NDArray[np.float64]:
-    found = sequence.boxes(frame)
-    assert found is not None
-    return found.centers
+    boxes = sequence.boxes(frame)
+    assert boxes is not None
+    return boxes.centers

@@ -8,7 +8,7 @@ satellite receiver.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,13 @@ from carlasc.core.geometry import invert, multiply, rotations_of
 from carlasc.errors import ArgumentError
 from carlasc.storage import field_files, layout
 from carlasc.storage.folder import FolderSink
+from carlasc.storage.sinks import SequenceWriter
 
 FRAMES = (0, 1, 2, 5)
 """Frames of the sequence WHOLE."""
 SIZE, SECOND = (4, 6, 2), (8, 4, 3)
 """Sizes of the two grids."""
+FIRST_GRID, SECOND_GRID = "evaluation", "evaluation_8x4x3"
 
 WHOLE = "Train/Town01_Light/cartesian"
 SCANS = "Val/Town07_Heavy/cartesian"
@@ -38,14 +40,9 @@ def params(size: tuple[int, int, int], coordinates: str = "cartesian") -> bytes:
         "min_bound": [0.0 if coordinates == "cylindrical" else -25.6, -3.0, -2.0],
         "max_bound": [25.6, 3.0, 1.0],
     }
-    return json.dumps(
-        {
-            "grid_size": [float(n) for n in size],
-            **bounds,
-            "num_channels": 25,
-            "coordinates": coordinates,
-        }
-    ).encode()
+    grid_size = [float(n) for n in size]
+    settings = {"grid_size": grid_size, **bounds, "num_channels": 25, "coordinates": coordinates}
+    return json.dumps(settings).encode()
 
 
 def scan(rng: np.random.Generator, count: int) -> dict[str, NDArray[Any]]:
@@ -106,7 +103,7 @@ def evidence(
 def actors(
     rng: np.random.Generator, size: tuple[int, int, int], count: int
 ) -> dict[str, NDArray[Any]]:
-    """Return the actor fields of a random grid with `count` moving voxels: instance and velocity."""
+    """Return the instance and velocity of a random grid with `count` moving voxels."""
     velocity = np.zeros(count, field_files.VELOCITY_DTYPE)
     velocity["voxel"] = np.sort(rng.permutation(int(np.prod(size)))[:count])
     velocity["velocity"] = rng.normal(scale=5, size=(count, 3))
@@ -141,63 +138,65 @@ def write_dataset(root: Path, seed: int = 0) -> Path:
     for name, data in zip(("poses.txt", "times.txt"), lines(FRAMES[-1] + 1), strict=True):
         whole.write_document(name, data)
     whole.write_document("carlasc.json", b'{"format": 2, "axes": "right",  "sensor": "a"}\n')
-    whole.write_document("evaluation/params.json", params(SIZE))
-    whole.write_document("evaluation_8x4x3/params.json", params(SECOND))
+    whole.write_document(f"{FIRST_GRID}/params.json", params(SIZE))
+    whole.write_document(f"{SECOND_GRID}/params.json", params(SECOND))
     for frame, count in zip(FRAMES, (0, 1, 777, 1001), strict=True):
-        for name, array in scan(rng, count).items():
-            whole.write(name, frame, array)
+        _write_all(whole, frame, scan(rng, count))
         if frame != 1:  # a frame without grids
-            for part, array in grid(rng, SIZE).items():
-                whole.write(f"evaluation/{part}", frame, array)
-        for part, array in grid(rng, SECOND, whole=False).items():
-            whole.write(f"evaluation_8x4x3/{part}", frame, array)
+            _write_all(whole, frame, grid(rng, SIZE), FIRST_GRID)
+        _write_all(whole, frame, grid(rng, SECOND, whole=False), SECOND_GRID)
         if frame != 2:  # frame 2 is not annotated; the first frame has no objects
             whole.write("boxes", frame, boxes(rng, frame).to_table())
-        whole.write("bev", frame, rng.integers(0, 256, 300 + frame).astype(np.uint8))
+        whole.write("bev", frame, _bytes(rng, 300 + frame))
     whole.write_document("cameras.json", b'{"format": 1,  "cameras": []}\n')
     for frame in FRAMES[1:]:  # each camera has one kind of images
         for number, field in enumerate(
             ("images.front.jpg", "images.left-1.png", "image_depths.front.png")
         ):
-            whole.write(
-                field, frame, rng.integers(0, 256, 200 + 10 * frame + number).astype(np.uint8)
-            )
-        whole.write("evaluation_8x4x3/seen", frame, rng.integers(0, 256, SECOND).astype(np.uint8))
+            whole.write(field, frame, _bytes(rng, 200 + 10 * frame + number))
+        whole.write(f"{SECOND_GRID}/seen", frame, _bytes(rng, SECOND))
     scans = sink.sequence(SCANS)
     for frame in range(3):
-        some = scan(rng, 50 + frame)
-        scans.write("points", frame, some["points"])
-        scans.write("labels", frame, some["labels"])
+        count = 50 + frame
+        fields = scan(rng, count)
+        del fields["flow"], fields["instances"]
         places = rng.normal(size=(3, 3)).astype(np.float32)
-        scans.write("seconds", frame, rng.normal(scale=0.05, size=50 + frame).astype(np.float32))
-        scans.write("sensor", frame, rng.integers(0, 3, 50 + frame).astype(np.uint8))
-        scans.write("origins", frame, places[rng.integers(0, 3, 50 + frame)])
+        fields["seconds"] = rng.normal(scale=0.05, size=count).astype(np.float32)
+        fields["sensor"] = rng.integers(0, 3, count).astype(np.uint8)
+        _write_all(scans, frame, fields | {"origins": places[rng.integers(0, 3, count)]})
     grids = sink.sequence(GRIDS)
-    grids.write_document("evaluation/params.json", params(SIZE, "cylindrical"))
+    grids.write_document(f"{FIRST_GRID}/params.json", params(SIZE, "cylindrical"))
     for frame in (3, 4):
-        for part, array in grid(rng, SIZE).items():
-            grids.write(f"evaluation/{part}", frame, array)
+        _write_all(grids, frame, grid(rng, SIZE), FIRST_GRID)
     votes = np.zeros(5, field_files.VOTES_DTYPE)
     votes["voxel"], votes["label"], votes["votes"] = (
         [0, 1, 7, 20, 47],
         [1, 2, 3, 22, 0],
         [1, 300, 65535, 2, 1],
     )
-    grids.write("evaluation/votes", 4, votes)
-    for part, array in evidence(rng, SIZE).items():
-        grids.write(f"evaluation/{part}", 4, array)
+    _write_all(grids, 4, {"votes": votes} | evidence(rng, SIZE), FIRST_GRID)
     for frame in FRAMES:
         fields = evidence(rng, SECOND, wide=True)
         if frame == FRAMES[0]:  # integers first, because stores often keep them in another type
             fields["occupied"] = np.round(fields["occupied"])
-        for part, array in fields.items():
-            whole.write(f"evaluation_8x4x3/{part}", frame, array)
+        _write_all(whole, frame, fields, SECOND_GRID)
     for frame, count in zip(FRAMES, (0, 1, 17, 33), strict=True):
-        for part, array in actors(rng, SECOND, count).items():
-            whole.write(f"evaluation_8x4x3/{part}", frame, array)
+        _write_all(whole, frame, actors(rng, SECOND, count), SECOND_GRID)
     for frame, count in zip(FRAMES, (0, 1, 777, 1001), strict=True):
         whole.write("probabilities", frame, rng.integers(0, 65536, (count, 6)).astype(np.uint16))
     return root
+
+
+def _write_all(
+    writer: SequenceWriter, frame: int, fields: Mapping[str, NDArray[Any]], grid: str = ""
+) -> None:
+    """Write fields of a frame; with `grid`, the fields of a grid."""
+    for name, array in fields.items():
+        writer.write(f"{grid}/{name}" if grid else name, frame, array)
+
+
+def _bytes(rng: np.random.Generator, shape: int | tuple[int, ...]) -> NDArray[np.uint8]:
+    return rng.integers(0, 256, shape).astype(np.uint8)
 
 
 def published_bytes(field: str, array: NDArray[Any]) -> bytes:
@@ -303,13 +302,14 @@ def wrong_poses(
     Raises:
         ArgumentError: a standard deviation is negative or not a number.
     """
-    given = {
+    deviations = {
         "jitter_m": jitter_m,
         "jitter_rad": jitter_rad,
         "drift_m": drift_m,
         "drift_rad": drift_rad,
+        "height_drift_m": height_drift_m,
     }
-    for name, value in (given | {"height_drift_m": height_drift_m}).items():
+    for name, value in deviations.items():
         if not 0 <= value < np.inf:
             raise ArgumentError(name, expected="a standard deviation, 0 or more", found=str(value))
     rng = np.random.default_rng(seed)

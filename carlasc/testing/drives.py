@@ -170,17 +170,17 @@ class SimulatedDrive:
             labels: class id of each kind; None takes the indices of `KINDS`.
         """
         vehicle_T_world = invert(self.world_T_vehicle(frame * self.period_s))
-        found = [
+        near = [
             (track, thing, vehicle_T_world @ thing.world_T_box(frame * self.period_s))
             for track, thing in enumerate(self._movable, 1)
         ]
-        found = [row for row in found if np.linalg.norm(row[2][:3, 3]) < 60.0]
+        near = [row for row in near if np.linalg.norm(row[2][:3, 3]) < 60.0]
         ids = {kind: place for place, kind in enumerate(KINDS)} if labels is None else labels
         return Boxes.from_poses(
-            np.array([track for track, _, _ in found], np.uint32),
-            np.array([ids[thing.kind] for _, thing, _ in found], np.uint32),
-            np.array([pose for _, _, pose in found]).reshape(-1, 4, 4),
-            np.array([thing.size for _, thing, _ in found]).reshape(-1, 3),
+            np.array([track for track, _, _ in near], np.uint32),
+            np.array([ids[thing.kind] for _, thing, _ in near], np.uint32),
+            np.array([pose for _, _, pose in near]).reshape(-1, 4, 4),
+            np.array([thing.size for _, thing, _ in near]).reshape(-1, 3),
         )
 
     def scan(self, frame: int, sensor: int = 0) -> DriveScan:

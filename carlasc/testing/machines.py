@@ -217,17 +217,17 @@ class StoreMachine(RuleBasedStateMachine):
 
     def check(self) -> None:
         """Compare the finished store with the model. A subclass may add checks."""
-        found = self.read(self.out).sequences()
-        assert set(found) == {key[0] for key in self.model}
+        sequences = self.read(self.out).sequences()
+        assert set(sequences) == {key[0] for key in self.model}
         keys = {
             (path, field, frame)
-            for path, sequence in found.items()
+            for path, sequence in sequences.items()
             for field in sequence.fields()
             for frame in sequence.frames(field).tolist()
         }
         assert keys == set(self.model)
         for path, field, frame in sorted(keys):
-            array = found[path].read(field, frame)
+            array = sequences[path].read(field, frame)
             data = published_bytes(field, array)
             allowed = [
                 self.model[path, field, frame],
@@ -236,9 +236,9 @@ class StoreMachine(RuleBasedStateMachine):
             assert data in [published_bytes(field, each) for each in allowed], (path, field, frame)
             self.model[path, field, frame] = np.array(array)
         texts = {
-            (path, name): found[path].read_document(name)
-            for path in found
-            for name in found[path].documents()
+            (path, name): sequences[path].read_document(name)
+            for path in sequences
+            for name in sequences[path].documents()
         }
         assert texts == self.documents
 

@@ -27,7 +27,7 @@ from carlasc.errors import FormatError, MissingDataError
 from carlasc_converters.argoverse2_classes import ARGOVERSE2, CATEGORIES, TO_CARLA
 from carlasc_converters.feather import read_columns
 from carlasc_converters.image_files import nearest_images
-from carlasc_converters.rigid import poses_of
+from carlasc_converters.transforms import poses_of
 
 _SPLITS: dict[str, Split] = {"train": "Train", "val": "Val", "test": "Test"}
 _LEVELS = 4  # depth of a log below the given folder: root/sensor/train/LOG, and one more
@@ -134,11 +134,11 @@ class Argoverse2Log(Recording):
     @cached_property
     def frames(self) -> Sequence[FrameHandle]:  # type: ignore[override]
         """The sweeps that exist."""
-        found = enumerate(self._timeline.tolist())
+        sweeps = enumerate(self._timeline.tolist())
         count = len(self.sensors)
         return [
             Sweep(str(self._sweeps[at]), number, count)
-            for number, at in found
+            for number, at in sweeps
             if at in self._sweeps
         ]
 
@@ -220,7 +220,7 @@ class Argoverse2Log(Recording):
             _stack(places, _QUATERNION), _stack(places, _TRANSLATION), str(self._calibration)
         )
         by_name = dict(zip(places["sensor_name"].tolist(), poses, strict=True))
-        found = []
+        cameras = []
         for row, name in enumerate(table["sensor_name"].tolist()):
             if name not in by_name:
                 expected = f"a row for each of {', '.join(table['sensor_name'].tolist())}"
@@ -229,7 +229,7 @@ class Argoverse2Log(Recording):
                 float(table[key][row]) for key in _INTRINSICS
             )
             times, images = self._images_of(name)
-            found.append(
+            cameras.append(
                 CameraModel(
                     name=name,
                     width=int(width),
@@ -242,7 +242,7 @@ class Argoverse2Log(Recording):
                     images=images,
                 )
             )
-        return found
+        return cameras
 
     def _images_of(self, name: str) -> tuple[NDArray[np.float64] | None, tuple[str, ...] | None]:
         """Return the time and the path of the image nearest to each frame; None if the camera has
@@ -276,19 +276,19 @@ class Argoverse2Log(Recording):
         centers, quaternions, sizes = (
             _stack(table, names) for names in (_TRANSLATION, _QUATERNION, _SIZE)
         )
-        found = {}
+        boxes = {}
         for number, at in enumerate(self._timeline.tolist()):
             own = table["timestamp_ns"] == at
             if not own.any():
                 continue  # this sweep was not annotated
             annotated = np.ones(np.count_nonzero(own), np.bool_)
             try:
-                found[number] = Boxes(
+                boxes[number] = Boxes(
                     tracks[own], labels[own], centers[own], quaternions[own], sizes[own], annotated
                 )
             except FormatError as error:
                 raise error.within(f"{path}: timestamp {at}") from error
-        return found
+        return boxes
 
     def problems(self) -> list[tuple[int, str]]:
         """Return the annotated sweeps without a file that are between sweeps with files."""

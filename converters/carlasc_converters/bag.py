@@ -15,9 +15,8 @@ from carlasc.converting.protocol import Converter, FrameHandle, Recording, Senso
 from carlasc.core import CameraModel
 from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError, FormatError, MissingDataError
-from carlasc_converters.bag_cameras import BagCamera, find_cameras
-from carlasc_converters.bag_frames import BagFrame, CloudPlace, LidarTopic
 from carlasc_converters.bag_messages import PATH, TRANSFORMS, read_placed
+from carlasc_converters.bag_sensors import BagCamera, BagFrame, CloudPlace, LidarTopic, find_cameras
 from carlasc_converters.bag_topics import BagFiles, Topic, find_bags
 from carlasc_converters.files import sequence_name
 from carlasc_converters.point_fields import TimeUnit
@@ -119,7 +118,7 @@ class BagRecording(Recording):
                 *((k, rows[number], others[k - 1].unit) for k, rows in enumerate(near, 1)),
             ]
             given = tuple(
-                CloudPlace(k, found, unit) for k, found, unit in parts if found is not None
+                CloudPlace(k, message, unit) for k, message, unit in parts if message is not None
             )
             frames.append(BagFrame(number, f"{place}: message {number}", stamp, given))
         return frames
@@ -155,10 +154,10 @@ class BagRecording(Recording):
         """
         topic = self._files.poses(self._options.pose_topic)
         if topic is None or topic.channel.type in TRANSFORMS:
-            found = self._poses_of_tree(required=topic is not None)
-            if found is None:
+            moving = self._poses_of_tree(required=topic is not None)
+            if moving is None:
                 return None
-            stamps, poses = found
+            stamps, poses = moving
             where = f"{self.location}: transforms"
         else:
             where = f"{self.location}: {topic.channel.topic}"
@@ -169,11 +168,17 @@ class BagRecording(Recording):
                 raise FormatError(where, expected="poses", found="none that can be read")
             stamps, poses = track.values
         if self._unplaced and not force:
-            advice = "name a connected frame with `pose_frame`, or take both as the same frame with `force=True`"
+            advice = (
+                "name a connected frame with `pose_frame`, or take both as the same frame with "
+                "`force=True`"
+            )
             raise self._no_path(self._lidars[0].frame, self._unplaced, advice)
         own = self._lidars[0].stamps
         if stamps[-1] < own[0] or stamps[0] > own[-1]:
-            expected = f"poses between {own[0] / 1e9:.3f} and {own[-1] / 1e9:.3f} s, the times of the scans"
+            expected = (
+                f"poses between {own[0] / 1e9:.3f} and {own[-1] / 1e9:.3f} s, the times of the "
+                f"scans"
+            )
             raise FormatError(
                 where, expected=expected, found=f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s"
             )
@@ -184,10 +189,13 @@ class BagRecording(Recording):
         """Return the cameras that transforms place on the vehicle, with the image nearest to each
         frame.
         """
-        found, stamps = list[CameraModel](), self._lidars[0].stamps
+        cameras, stamps = list[CameraModel](), self._lidars[0].stamps
         for camera in self._cameras.values():
             if not self._tree.connected(camera.frame, self._vehicle):
-                note = f"{self.location}: no transforms lead from {camera.frame} to {self._vehicle}: {camera.name} is left out"
+                note = (
+                    f"{self.location}: no transforms lead from {camera.frame} to {self._vehicle}: "
+                    f"{camera.name} is left out"
+                )
                 self._notes.append(note)
                 continue
             rows = self._images[camera.name]
@@ -196,8 +204,8 @@ class BagRecording(Recording):
                 for row in rows
             ]
             place = self._tree.lookup(self._vehicle, camera.frame, stamps[:1])[0]
-            found.append(camera.model(place, np.array(taken) if len(camera.images[0]) else None))
-        return found
+            cameras.append(camera.model(place, np.array(taken) if len(camera.images[0]) else None))
+        return cameras
 
     def image(self, camera: CameraModel, frame: int) -> tuple[str, bytes] | None:
         """Return the image of a frame, which lies in the bag."""

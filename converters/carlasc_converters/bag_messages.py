@@ -1,4 +1,9 @@
-"""Messages of bags with points, poses or transforms: the types, and how they are read.
+"""The messages of bags: where they lie in a file, and how messages of points, poses or transforms
+are read.
+
+The index of a file is made in one pass over its records, so that any message can be read alone.
+The pass does not need the index at the end of a file: of a file that was cut short, all messages
+before the cut are read.
 
 Definitions: sensor_msgs, nav_msgs and geometry_msgs of ROS as rosbags has them; tf2_msgs/TFMessage
 of https://docs.ros.org/en/noetic/api/tf2_msgs/html/msg/TFMessage.html; CustomMsg and CustomPoint of
@@ -8,7 +13,10 @@ https://github.com/Livox-SDK/livox_ros_driver2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from bz2 import decompress
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cache
 from struct import unpack_from
 from typing import Any
@@ -17,12 +25,94 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform
-from carlasc.errors import import_extra, reading
+from carlasc.errors import FormatError, import_extra, reading
 from carlasc_converters import foxglove_messages
-from carlasc_converters.bag_index import EXTRA, Channel
-from carlasc_converters.point_cloud2 import read_columns, unpack_fields
-from carlasc_converters.rigid import poses_of
-from carlasc_converters.transforms import PlacedFrame
+from carlasc_converters.point_fields import TimeUnit, read_columns, unpack_fields
+from carlasc_converters.transforms import PlacedFrame, poses_of
+
+EXTRA = "bags"
+PLACE = np.dtype([("time", "<i8"), ("chunk", "<i8"), ("offset", "<i8")])
+"""The position of a message: time of its recording, nanoseconds; start of its chunk, -1 without
+one; its place in the chunk or file.
+"""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """The topic and the type of messages.
+
+    Attributes:
+        topic: its name.
+        type: of its messages, such as "sensor_msgs/msg/PointCloud2" or "foxglove.PointCloud".
+        encoding: "ros1", "cdr", "protobuf", "json", or another one, which is not read.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+
+
+@dataclass
+class FileIndex:
+    """The messages of a file.
+
+    Attributes:
+        path: the file.
+        channels: by their numbers.
+        lost: what is incomplete, in a few words; None if the file is complete.
+    """
+
+    path: str
+    channels: dict[int, Channel] = field(default_factory=dict)
+    lost: str | None = None
+    _parts: dict[int, list[NDArray[Any]]] = field(default_factory=dict)
+
+    def add(self, channel: int, chunk: int, times: Any, offsets: Any) -> None:
+        """Add messages of a channel that are in one chunk, or in none (-1)."""
+        part = np.empty(np.size(times), PLACE)
+        part["time"], part["chunk"], part["offset"] = times, chunk, offsets
+        self._parts.setdefault(channel, []).append(part)
+
+    def places(self, channel: int) -> NDArray[Any]:
+        """Return (N,) `PLACE`, the messages of a channel, in the order of the file."""
+        return np.concatenate([np.empty(0, PLACE), *self._parts.get(channel, [])])
+
+
+def ros_type(name: str) -> str:
+    """Return the name of a type of ROS 1 or 2 as in ROS 2: "sensor_msgs/msg/PointCloud2"."""
+    package, slash, kind = name.partition("/")
+    return name if "/" in kind or not slash else f"{package}/msg/{kind}"
+
+
+def decompressed(data: bytes, codec: str, where: str) -> bytes:
+    """Return the content of a chunk.
+
+    Raises:
+        FormatError: the codec is not known, or the chunk is damaged.
+        DependencyError: the codec is not installed.
+    """
+    if codec in ("", "none"):
+        return data
+    if codec not in ("bz2", "lz4", "zstd"):
+        raise FormatError(
+            where,
+            expected="chunks that are not compressed, or with bz2, lz4 or zstd",
+            found=repr(codec),
+            advice="write the bag again with one of these",
+        )
+    zstd = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
+    unpack: Callable[[bytes], bytes] = (
+        decompress
+        if codec == "bz2"
+        else import_extra("lz4.frame" if codec == "lz4" else zstd, EXTRA).decompress
+    )
+    try:
+        return unpack(data)
+    except Exception as error:  # each codec has its own errors
+        raise FormatError(
+            where, expected=f"a chunk compressed with {codec}", found=f"damage ({error})"
+        ) from error
+
 
 _LIVOX = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 PATH = "nav_msgs/msg/Path"
@@ -45,14 +135,25 @@ TRANSFORMS = (
 )
 
 _TRANSFORM_TEXT = "geometry_msgs/TransformStamped[] transforms\n"
-_POINT_TEXT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-_CUSTOM_TEXT = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
+_POINT_TEXT = (
+    "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\n"
+    "uint8 reflectivity\nuint8 tag\nuint8 line\n"
+)
+_CUSTOM_TEXT = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\n"
+    "uint8[3] rsvd\nCustomPoint[] points\n"
+)
 _TEXTS = dict.fromkeys(TRANSFORMS[:2], _TRANSFORM_TEXT) | {
     f"{package}/msg/{name}": text
     for package in ("livox_ros_driver", "livox_ros_driver2")
     for name, text in (("CustomPoint", _POINT_TEXT), ("CustomMsg", _CUSTOM_TEXT))
 }
-_POINT = np.dtype([("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1")])  # fmt: skip
+_POINT = np.dtype(
+    {
+        "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
+        "formats": ["u4", "f4", "f4", "f4", "u1", "u1", "u1"],
+    }
+)
 _ENCODINGS = {"ros1": "ros", "cdr": "ros", "protobuf": "foxglove", "json": "foxglove"}
 
 
@@ -72,7 +173,7 @@ class CloudMessage:
     frame: str
     columns: dict[str, NDArray[Any]]
     pose: Transform | None = None
-    time_unit: str | None = None
+    time_unit: TimeUnit | None = None
 
 
 def is_readable(channel: Channel) -> bool:
@@ -135,10 +236,13 @@ def read_placed(data: bytes, channel: Channel, where: str) -> list[PlacedFrame]:
         if channel.type.startswith("foxglove."):
             return [
                 PlacedFrame(
-                    _stamp(one.timestamp), _frame(one.parent_frame_id), _frame(one.child_frame_id), _numbers(one.translation, one.rotation)
+                    _stamp(one.timestamp),
+                    _frame(one.parent_frame_id),
+                    _frame(one.child_frame_id),
+                    _numbers(one.translation, one.rotation),
                 )
                 for one in (message.transforms if channel.type.endswith("s") else [message])
-            ]  # fmt: skip
+            ]
         if channel.type in TRANSFORMS:
             return [
                 _placed(

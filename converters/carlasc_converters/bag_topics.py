@@ -14,8 +14,15 @@ from numpy.typing import NDArray
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc_converters import db3_file, mcap_file, ros1_bag
-from carlasc_converters.bag_index import Channel, FileIndex, decompressed
-from carlasc_converters.bag_messages import CLOUDS, POSES, TRANSFORMS, is_readable
+from carlasc_converters.bag_messages import (
+    CLOUDS,
+    POSES,
+    TRANSFORMS,
+    Channel,
+    FileIndex,
+    decompressed,
+    is_readable,
+)
 from carlasc_converters.files import opening
 
 _KINDS = (ros1_bag, mcap_file, db3_file)
@@ -128,10 +135,10 @@ class BagFiles:
 
     def of_types(self, types: Sequence[str]) -> list[Topic]:
         """Return the topics of some types, by name, in an encoding that is read."""
-        found = sorted(self.topics.items())
+        by_name = sorted(self.topics.items())
         return [
             topic
-            for _, topic in found
+            for _, topic in by_name
             if topic.channel.type in types and is_readable(topic.channel)
         ]
 
@@ -146,10 +153,10 @@ class BagFiles:
             ArgumentError: the bag has several and none is named, or a named one does not exist or
                 does not hold points.
         """
-        found = self.of_types(CLOUDS)
+        topics = self.of_types(CLOUDS)
         if names:
-            return [self._named("topics", name.strip(), found) for name in names.split(",")]
-        if not found:
+            return [self._named("topics", name.strip(), topics) for name in names.split(",")]
+        if not topics:
             lost = [f"{index.path}: {index.lost}" for index in self.indexes if index.lost]
             raise MissingDataError(
                 self.location,
@@ -160,15 +167,15 @@ class BagFiles:
                 if lost
                 else "if the bag holds packets of a LiDAR, replay them with its driver",
             )
-        if len(found) > 1:
+        if len(topics) > 1:
             raise ArgumentError(
                 "topics",
-                expected=f"one or several of {_listed(found)} in {self.location}",
+                expected=f"one or several of {_listed(topics)} in {self.location}",
                 found="none",
                 advice="name the LiDARs, separated by commas; the messages of the first become the "
                 "frames",
             )
-        return found
+        return topics
 
     def poses(self, name: str | None) -> Topic | None:
         """Return the named topic of poses, or the only one; None without one.
@@ -177,13 +184,13 @@ class BagFiles:
             ArgumentError: the bag has several and none is named, or the named one does not exist or
                 does not hold poses.
         """
-        found = self.of_types(POSES)
+        topics = self.of_types(POSES)
         if name:
-            return self._named("pose_topic", name, found + self.of_types(TRANSFORMS))
-        if len(found) > 1:
-            expected = f"one of {_listed(found)} in {self.location}"
+            return self._named("pose_topic", name, topics + self.of_types(TRANSFORMS))
+        if len(topics) > 1:
+            expected = f"one of {_listed(topics)} in {self.location}"
             raise ArgumentError("pose_topic", expected=expected, found="none")
-        return found[0] if found else None
+        return topics[0] if topics else None
 
     def notes(self) -> list[str]:
         """Return notes on files that are incomplete."""
@@ -195,15 +202,15 @@ class BagFiles:
             )
         return lost
 
-    def _named(self, option: str, name: str, found: Sequence[Topic]) -> Topic:
+    def _named(self, option: str, name: str, topics: Sequence[Topic]) -> Topic:
         if (
-            topic := next((topic for topic in found if topic.channel.topic == name), None)
+            topic := next((topic for topic in topics if topic.channel.topic == name), None)
         ) is not None:
             return topic
         other = self.topics.get(name)
         said = f"{name!r}" if other is None else f"{other}, which is not read"
         raise ArgumentError(
-            option, expected=f"one of {_listed(found)} in {self.location}", found=said
+            option, expected=f"one of {_listed(topics)} in {self.location}", found=said
         )
 
 
@@ -234,11 +241,11 @@ def find_bags(source: Path) -> list[list[Path]]:
         part = _PART.search(path.stem)
         name = (path.parent, path.stem if part is None else path.stem[: part.start()])
         groups.setdefault(name, []).append((-1 if part is None else int(part[1]), path))
-    found: list[list[Path]] = []
+    recordings: list[list[Path]] = []
     for parts in groups.values():
         paths = [path for _, path in sorted(parts)]
-        found.extend([paths] if min(parts)[0] == 0 else [[path] for path in paths])
-    return found
+        recordings.extend([paths] if min(parts)[0] == 0 else [[path] for path in paths])
+    return recordings
 
 
 def _kind_of(path: Path) -> ModuleType:

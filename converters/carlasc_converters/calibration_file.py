@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import ArgumentError, FormatError, import_extra
 from carlasc_converters.files import opening, read_text
-from carlasc_converters.rigid import poses_of
+from carlasc_converters.transforms import poses_of
 
 _EXPECTED = (
     "sensors, each with translation (x, y, z) and rotation (qx, qy, qz, qw), or with matrix (4 x 4)"

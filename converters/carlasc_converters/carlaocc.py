@@ -44,7 +44,10 @@ class CarlaOcc(Converter):
     """Reads CarlaOcc, or one of its sequences."""
 
     title: ClassVar[str] = "CarlaOcc: CARLA 0.10 with voxels from meshes"
-    citation = "Y. Feng et al., An Instance-Centric Panoptic Occupancy Prediction Benchmark for Autonomous Driving, CVPR 2026"
+    citation = (
+        "Y. Feng et al., An Instance-Centric Panoptic Occupancy Prediction Benchmark for "
+        "Autonomous Driving, CVPR 2026"
+    )
     simulated = True
     classes = CARLAOCC
     to_carla = CARLAOCC_TO_CARLA
@@ -266,4 +269,4 @@ def _read_splits(root: Path) -> dict[str, Split]:
             if len(words := line.split()) == 3:
                 town = "Town10HD" if words[0] == "10" else f"Town{words[0]}"
                 counts.setdefault(f"{town}_Opt_Seq{words[1]}", Counter())[split] += 1
-    return {name: found.most_common(1)[0][0] for name, found in counts.items()}
+    return {name: splits.most_common(1)[0][0] for name, splits in counts.items()}

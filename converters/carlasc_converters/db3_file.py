@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from carlasc.errors import FormatError
-from carlasc_converters.bag_index import Channel, FileIndex
+from carlasc_converters.bag_messages import Channel, FileIndex
 
 MAGIC = b"SQLite format 3\0"
 _EXPECTED = "a bag of ROS 2: a database with topics and messages"

@@ -35,8 +35,8 @@ def nearest_images(
     stamps = np.array(sorted(paths), np.int64)
     nearest = stamps[nearest_rows(stamps, frames)]
     near = np.abs(nearest - frames) < within
-    found = (
+    names = (
         str(paths[at].absolute()) if ok else ""
         for at, ok in zip(nearest.tolist(), near, strict=True)
     )
-    return nearest, near, tuple(found)
+    return nearest, near, tuple(names)

@@ -117,28 +117,28 @@ class KittiRecording(Recording):
 
     def _calibration(self, poses: Path, *, force: bool) -> Transform:
         path = self.folder / "calib.txt"
-        found = Calibration.read(path) if path.is_file() else None
-        if found is not None and "Tr" in found.values:
-            return found.transform("Tr")
+        calibration = Calibration.read(path) if path.is_file() else None
+        if calibration is not None and "Tr" in calibration.values:
+            return calibration.transform("Tr")
         if force:
             return np.eye(4)
-        error = MissingDataError if found is None else FormatError
+        error = MissingDataError if calibration is None else FormatError
         raise error(
             path,
             expected=f"Tr, which takes LiDAR points to the camera whose poses {poses.name} holds",
             found="no such file"
-            if found is None
-            else f"only {', '.join(found.values) or 'other lines'}",
+            if calibration is None
+            else f"only {', '.join(calibration.values) or 'other lines'}",
             advice="copy calib.txt of the KITTI odometry data, estimate poses from the scans with "
             '`poses="kiss-icp"`, or, if the'
             " poses are those of the LiDAR, accept them with `force=True`",
         )
 
     def cameras(self) -> Sequence[CameraModel]:
-        """Return the rectified cameras of calib.txt; none without that file, or without Tr in it."""
+        """Return the rectified cameras of calib.txt; none without that file or Tr in it."""
         path = self.folder / "calib.txt"
-        found = Calibration.read(path) if path.is_file() else None
-        if found is None or "Tr" not in found.values:
+        calibration = Calibration.read(path) if path.is_file() else None
+        if calibration is None or "Tr" not in calibration.values:
             return ()
 
         def image_of(name: str, frame: int) -> Path:
@@ -146,7 +146,9 @@ class KittiRecording(Recording):
 
         projections = {f"image_{number}": f"P{number}" for number in range(4)}
         numbers = [frame.number for frame in self.frames]
-        return rectified_cameras(found, found.transform("Tr"), projections, image_of, numbers)
+        return rectified_cameras(
+            calibration, calibration.transform("Tr"), projections, image_of, numbers
+        )
 
     def times(self) -> NDArray[np.float64] | None:
         """Return the lines of times.txt."""
@@ -160,14 +162,14 @@ class KittiRecording(Recording):
             *frames_of(self.folder / "labels", ".label"),
             *frames_of(self.folder / "voxels", ".label"),
         }
-        found = []
+        problems = []
         for number in sorted(others - scanned):
             file = self.folder / "velodyne" / f"{number:06d}.bin"
             error = MissingDataError(
                 file, expected="a scan beside its labels", found="no such file"
             )
-            found.append((number, str(error)))
-        return found
+            problems.append((number, str(error)))
+        return problems
 
 
 @dataclass(frozen=True)
@@ -234,9 +236,9 @@ def find_sequences(root: Path) -> list[Path]:
         return [root.resolve()]
     for folder in (root / "sequences", root / "dataset" / "sequences", root):
         if folder.is_dir() and (
-            found := sorted(path for path in folder.iterdir() if (path / "velodyne").is_dir())
+            folders := sorted(path for path in folder.iterdir() if (path / "velodyne").is_dir())
         ):
-            return found
+            return folders
     raise MissingDataError(
         root,
         expected="sequences/00/velodyne/ and so on, or a folder with velodyne/ in it",

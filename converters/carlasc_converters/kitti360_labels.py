@@ -84,8 +84,8 @@ def windows_of(static: Path) -> dict[str, tuple[int, int]]:
     folder does not exist.
     """
     names: Iterable[str] = (path.name for path in static.iterdir()) if static.is_dir() else ()
-    found = {name: match for name in sorted(names) if (match := _WINDOW.fullmatch(name))}
-    return {name: (int(match[1]), int(match[2])) for name, match in found.items()}
+    matches = {name: match for name in sorted(names) if (match := _WINDOW.fullmatch(name))}
+    return {name: (int(match[1]), int(match[2])) for name, match in matches.items()}
 
 
 def window_at(windows: dict[str, tuple[int, int]], frame: int) -> str | None:

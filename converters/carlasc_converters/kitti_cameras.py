@@ -44,7 +44,7 @@ def rectified_cameras(
     Raises:
         FormatError: a projection is not valid.
     """
-    found = []
+    models = []
     for name, key in projections.items():
         if key not in calibration.values:
             continue
@@ -63,7 +63,7 @@ def rectified_cameras(
         width, height = _size_of(existing[0]) if existing else size
         last = max(frames)
         there = {frame: str(path.absolute()) for frame, path in paths.items() if path.is_file()}
-        found.append(
+        models.append(
             CameraModel(
                 name=name,
                 width=width,
@@ -75,7 +75,7 @@ def rectified_cameras(
                 else None,
             )
         )
-    return found
+    return models
 
 
 def _size_of(path: Path) -> tuple[int, int]:

@@ -43,7 +43,10 @@ class KittiRaw(KittiConverter):
     """Reads KITTI's raw data (the "synced+rectified" drives): all dates, one date, or one drive."""
 
     title: ClassVar[str] = "KITTI raw data: synced drives, with tracklets where they exist"
-    citation = "A. Geiger, P. Lenz, C. Stiller, R. Urtasun, Vision meets Robotics: The KITTI Dataset, IJRR 2013"
+    citation = (
+        "A. Geiger, P. Lenz, C. Stiller, R. Urtasun, Vision meets Robotics: The KITTI Dataset, "
+        "IJRR 2013"
+    )
     classes = KITTI
     to_carla = KITTI_TO_CARLA
 
@@ -54,10 +57,10 @@ class KittiRaw(KittiConverter):
             MissingDataError: none exists.
         """
         for pattern in (f"{_SCANS}/data", f"*/{_SCANS}/data", f"*/*/{_SCANS}/data"):
-            if found := sorted(
+            if drives := sorted(
                 path.parents[1].resolve() for path in self.source.glob(pattern) if path.is_dir()
             ):
-                return [RawDrive(folder) for folder in found]
+                return [RawDrive(folder) for folder in drives]
         raise MissingDataError(
             self.source,
             expected=f"2011_09_26/2011_09_26_drive_0001_sync/{_SCANS}/data/ and so on, one date, "
@@ -139,7 +142,10 @@ class RawDrive(Recording):
         path = self.folder.parent / "calib_imu_to_velo.txt"
         if force and not path.is_file():
             return np.eye(4)
-        expected = "R and T, which take points of the IMU to the LiDAR: the poses in oxts/ are those of the IMU"
+        expected = (
+            "R and T, which take points of the IMU to the LiDAR: the poses in oxts/ are those of "
+            "the IMU"
+        )
         return Calibration.read(path, expected).rotation_and_translation()
 
     def times(self) -> NDArray[np.float64] | None:
@@ -169,13 +175,13 @@ class RawDrive(Recording):
 
     def notes(self) -> list[str]:
         """Return notes on missing packets, and on the area that the boxes cover."""
-        found = []
+        notes = []
         if self._packets and (without := sorted(set(self._numbers) - set(self._packets))):
-            found.append(
+            notes.append(
                 f"{len(without)} frames have no packet in oxts/ (first {without[0]}): their poses "
                 f"are interpolated"
             )
-        return found + ([ONLY_IN_VIEW] if (self.folder / "tracklet_labels.xml").is_file() else [])
+        return notes + ([ONLY_IN_VIEW] if (self.folder / "tracklet_labels.xml").is_file() else [])
 
 
 @dataclass(frozen=True)

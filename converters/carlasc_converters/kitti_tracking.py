@@ -58,7 +58,7 @@ class KittiTracking(KittiConverter):
         Raises:
             MissingDataError: none exists.
         """
-        found: list[Recording] = []
+        recordings: list[Recording] = []
         for part, split, prefix in _SPLITS:
             folder = self.source if self.source.name == part else self.source / part
             scans = folder.resolve() / "velodyne"
@@ -67,11 +67,11 @@ class KittiTracking(KittiConverter):
                 if scans.is_dir()
                 else []
             )
-            found += [
+            recordings += [
                 TrackingSequence(scans.parent, name, f"KITTI_tracking_{prefix}{name}", split)
                 for name in names
             ]
-        if not found:
+        if not recordings:
             raise MissingDataError(
                 self.source,
                 expected="training/velodyne/0000/ and so on, or one of the folders training and "
@@ -79,7 +79,7 @@ class KittiTracking(KittiConverter):
                 found="none" if self.source.is_dir() else "no folder",
                 advice="give the folder that holds training/",
             )
-        return found
+        return recordings
 
 
 class TrackingSequence(Recording):
@@ -138,7 +138,10 @@ class TrackingSequence(Recording):
     def _lidar_T_imu(self, force: bool) -> Transform:
         if force and not self._file("calib").is_file():
             return np.eye(4)
-        purpose = "Tr_imu_to_velo, which takes points of the IMU to the LiDAR: the poses in oxts/ are those of the IMU"
+        purpose = (
+            "Tr_imu_to_velo, which takes points of the IMU to the LiDAR: the poses in oxts/ are "
+            "those of the IMU"
+        )
         return self._calibration(purpose).transform("Tr_imu_to_velo", "Tr_imu_velo")
 
     def times(self) -> NDArray[np.float64] | None:
@@ -203,7 +206,10 @@ class TrackingSequence(Recording):
 
     def notes(self) -> list[str]:
         """Return notes on what was assumed, and on the area that the boxes cover."""
-        times = f"the benchmark has no times: {PERIOD_S} s between frames is assumed, the mean of KITTI's raw data"
+        times = (
+            f"the benchmark has no times: {PERIOD_S} s between frames is assumed, the mean of "
+            f"KITTI's raw data"
+        )
         view = [ONLY_IN_VIEW] if self._file("label_02").is_file() else []
         return [times, *view]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
-from carlasc_converters.bag_index import Channel, FileIndex, decompressed, ros_type
+from carlasc_converters.bag_messages import Channel, FileIndex, decompressed, ros_type
 from carlasc_converters.files import Version, version_of
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -120,7 +120,7 @@ class _McapRecords:
             self._learn(kind, content)
 
     def end_chunk(self, *, whole: bool = True) -> None:
-        """Add the messages of the last chunk, from its index if that is whole, or from its content."""
+        """Add the messages of the last chunk, from its index if it is whole, or its content."""
         chunk, entries = self.chunk, self._entries
         self.chunk, self._entries = -1, []
         if chunk < 0:
@@ -128,7 +128,7 @@ class _McapRecords:
         if whole and entries and all(number in self.channels for number, _ in entries):
             self._add(chunk, entries)
             return
-        found: dict[int, list[tuple[int, int]]] = {}
+        messages: dict[int, list[tuple[int, int]]] = {}
         try:
             data = _read_chunk(self.index.path, chunk, version_of(self.index.path))
         except FormatError:
@@ -140,10 +140,10 @@ class _McapRecords:
         for kind, begin, end in _records(data):
             if kind == _MESSAGE:
                 number, _, time = unpack_from("<HIQ", data, begin)
-                found.setdefault(number, []).append((time, begin - _HEAD))
+                messages.setdefault(number, []).append((time, begin - _HEAD))
             else:
                 self._learn(kind, data[begin:end])
-        for number, places in found.items():
+        for number, places in messages.items():
             times, offsets = np.array(places, np.int64).T
             self.index.add(number, chunk, times, offsets)
 

@@ -61,15 +61,15 @@ class Ncore(Converter):
                     found=str(about.get("version", "no version")),
                 )
             stores[path.parent, str(about["sequence_id"])].append(store)
-        found = [NcoreRecording(name, parts) for (_, name), parts in sorted(stores.items())]
-        if not found:
+        recordings = [NcoreRecording(name, parts) for (_, name), parts in sorted(stores.items())]
+        if not recordings:
             raise MissingDataError(
                 self.source,
                 expected=f"stores of NCore: {' or '.join(f'*{suffix}' for suffix in SUFFIXES)}",
                 found="none",
                 advice="check the path, or unpack the archives",
             )
-        return list(found)
+        return list(recordings)
 
     def _paths(self) -> list[Path]:
         if self.source.name.endswith(SUFFIXES):
@@ -100,9 +100,9 @@ class NcoreRecording(Recording):
     @cached_property
     def _components(self) -> dict[str, dict[str, tuple[NcoreStore, str]]]:
         """Store and group of each component that is read, by its kind and its name."""
-        found: dict[str, dict[str, tuple[NcoreStore, str]]] = {kind: {} for kind in _KINDS}
+        by_kind: dict[str, dict[str, tuple[NcoreStore, str]]] = {kind: {} for kind in _KINDS}
         for store in self._stores:
-            for kind, components in found.items():
+            for kind, components in by_kind.items():
                 for name in store.groups(kind):
                     group = f"{kind}/{name}"
                     version = store.attributes(group).get("component_version")
@@ -113,18 +113,18 @@ class NcoreRecording(Recording):
                             found=str(version),
                         )
                     components[name] = (store, group)
-        return found
+        return by_kind
 
     def _component(self, kind: str) -> tuple[NcoreStore, str] | None:
         """Return the component of a kind with the name default, as in NCore, otherwise the first;
         None without one.
         """
-        found = self._components[kind]
-        return found.get("default") or next(iter(found.values()), None)
+        groups = self._components[kind]
+        return groups.get("default") or next(iter(groups.values()), None)
 
     @cached_property
     def _spans(self) -> dict[str, NDArray[np.int64]]:
-        """(F, 2) microseconds of the start and the end of each frame of each LiDAR that has frames."""
+        """(F, 2) microseconds of the start and the end of each frame, by LiDAR that has frames."""
         spans = {}
         for name, (store, group) in self._components["lidars"].items():
             with opening(f"{store.path}: {group}/frames", "the times of frames"):
@@ -147,7 +147,7 @@ class NcoreRecording(Recording):
 
     @cached_property
     def _slack_us(self) -> float:
-        """Half of the time between frames: data that are farther from a frame do not belong to it."""
+        """Half of the time between frames: data farther from a frame do not belong to it."""
         ends = self._first[:, 1]
         return float(np.median(np.diff(ends))) / 2 if len(ends) > 1 else _ALONE_US
 
@@ -258,7 +258,7 @@ class NcoreRecording(Recording):
 
     @cached_property
     def _observations(self) -> list[tuple[int, dict[str, Any]]]:
-        """The observations of tracks, each with the number of its frame; -1 where no frame is near."""
+        """The observations of tracks, each with the number of its frame; -1 without one near."""
         if (component := self._component("cuboids")) is None:
             return []
         store, group = component
@@ -301,11 +301,13 @@ class NcoreRecording(Recording):
         if (component := self._component("intrinsics")) is None:
             return []
         store, group = component
-        images, found = self._components["cameras"], []
+        images, cameras = self._components["cameras"], []
         for name in store.groups(f"{group}/cameras"):
             own, place = images.get(name, (store, f"cameras/{name}"))
-            found.append(NcoreCamera(name, own, place, store.attributes(f"{group}/cameras/{name}")))
-        return found
+            cameras.append(
+                NcoreCamera(name, own, place, store.attributes(f"{group}/cameras/{name}"))
+            )
+        return cameras
 
     @cached_property
     def _images(self) -> dict[str, list[int | None]]:
@@ -317,7 +319,7 @@ class NcoreRecording(Recording):
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras with a model of the layout and with poses that lead to the vehicle."""
-        found, at = [], self._first[:1, 1] * _NS
+        models, at = [], self._first[:1, 1] * _NS
         for camera in self._cameras:
             if camera.unknown is None and self._tree.connected(camera.name, self._vehicle):
                 middles = self._seconds(camera.spans.mean(axis=1))
@@ -326,8 +328,8 @@ class NcoreRecording(Recording):
                     for row in self._images[camera.name]
                 ]
                 place = self._tree.lookup(self._vehicle, camera.name, at)[0]
-                found.append(camera.model(place, np.array(taken) if len(middles) else None))
-        return found
+                models.append(camera.model(place, np.array(taken) if len(middles) else None))
+        return models
 
     def image(self, camera: CameraModel, frame: int) -> tuple[str, bytes] | None:
         """Return the image of a camera that is nearest to a frame."""
@@ -347,8 +349,8 @@ class NcoreRecording(Recording):
             if camera.unknown or not self._tree.connected(camera.name, self._vehicle)
         ]
         for kind in ("poses", "cuboids", "intrinsics"):
-            chosen, found = self._component(kind), self._components[kind]
-            if others := [name for name, component in found.items() if component != chosen]:
+            chosen, groups = self._component(kind), self._components[kind]
+            if others := [name for name, component in groups.items() if component != chosen]:
                 notes.append(f"several {kind}: only one was read, not {', '.join(others)}")
         if idle := sorted(self._components["lidars"].keys() - self._lidars.keys()):
             notes.append(f"LiDARs without frames were left out: {', '.join(idle)}")

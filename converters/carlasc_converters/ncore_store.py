@@ -101,8 +101,10 @@ class NcoreStore:
 
     def attributes(self, group: str = "") -> dict[str, Any]:
         """Return the attributes of a group or an array; none if there are none."""
-        found: dict[str, Any] = self._metadata.get(f"{group}/.zattrs" if group else ".zattrs", {})
-        return found
+        attributes: dict[str, Any] = self._metadata.get(
+            f"{group}/.zattrs" if group else ".zattrs", {}
+        )
+        return attributes
 
     def groups(self, parent: str) -> list[str]:
         """Return the sorted names of the groups in a group."""

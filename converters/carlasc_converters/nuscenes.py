@@ -20,7 +20,7 @@ from carlasc_converters.image_files import nearest_images
 from carlasc_converters.nuscenes_classes import MINI_VALIDATION, NUSCENES, TO_CARLA, VALIDATION
 from carlasc_converters.nuscenes_frames import NuScenesFrame
 from carlasc_converters.nuscenes_tables import CHANNEL, Annotations, SceneRow, Tables
-from carlasc_converters.rigid import poses_of
+from carlasc_converters.transforms import poses_of
 
 _NEAR_US = 50_000  # greatest time between an image and its scan
 
@@ -66,7 +66,7 @@ class NuScenes(Converter):
         tables = Tables(self._version())
         tables.check_categories()
         root, names = tables.folder.parent, _Names()
-        found: list[Recording] = []
+        recordings: list[Recording] = []
         for scene in tables.scenes:
             present = {
                 scan.file
@@ -74,8 +74,8 @@ class NuScenes(Converter):
                 if (root / scan.file).name in names.of(root / scan.file)
             }
             if present:
-                found.append(NuScenesScene(tables, scene, present, all_scans=self.sweeps))
-        if not found:
+                recordings.append(NuScenesScene(tables, scene, present, all_scans=self.sweeps))
+        if not recordings:
             raise MissingDataError(
                 root,
                 expected=f"the LiDAR scans that {tables.folder.name} lists, such as "
@@ -83,7 +83,7 @@ class NuScenes(Converter):
                 found="none of them",
                 advice="unpack the archives of the sensor data beside the folder of the tables",
             )
-        return found
+        return recordings
 
     def _version(self) -> Path:
         """Return the folder of the tables."""
@@ -219,7 +219,7 @@ class NuScenesScene(Recording):
 
     def cameras(self) -> Sequence[CameraModel]:
         """Return the cameras of the scene, with the images nearest in time to each frame."""
-        root, found = self.tables.folder.parent, []
+        root, models = self.tables.folder.parent, []
         frames = np.array([scan.timestamp for scan in self._scans], np.int64)
         for token in sorted(
             {image.mount for image in self.scene.images},
@@ -242,8 +242,8 @@ class NuScenesScene(Recording):
                 times=np.where(near, self._seconds(nearest), np.nan),
                 images=images,
             )
-            found.append(camera)
-        return found
+            models.append(camera)
+        return models
 
     def boxes(self) -> Mapping[int, Boxes] | None:
         """Return the boxes of the key frames.
@@ -264,15 +264,15 @@ class NuScenesScene(Recording):
             [rows[number] for number in sorted(rows, key=lambda number: keys[number].sample)]
         )
         poses = self._global_T_vehicle([scan.pose for scan in keys.values()])
-        found = {}
+        kept = {}
         for (number, scan), global_T_vehicle in zip(keys.items(), poses, strict=True):
             try:
-                found[number] = _boxes_of(rows[number], tracks, global_T_vehicle)
+                kept[number] = _boxes_of(rows[number], tracks, global_T_vehicle)
             except FormatError as error:
                 raise error.within(
                     f"{self.tables.path('sample_annotation')}: {scan.file}"
                 ) from error
-        return found
+        return kept
 
     def problems(self) -> list[tuple[int, str]]:
         """Return the scans that the tables list and that have no file."""

@@ -20,7 +20,7 @@ from carlasc.errors import FormatError
 from carlasc.storage.files import leads_outside
 from carlasc_converters import json_rows
 from carlasc_converters.nuscenes_classes import CLASS_IDS
-from carlasc_converters.rigid import poses_of
+from carlasc_converters.transforms import poses_of
 
 CHANNEL = "LIDAR_TOP"
 _POSE = ("translation", "rotation")
@@ -168,7 +168,10 @@ class Tables:
                     self._refuse_categories(f"{index} for {name}, which is {CLASS_IDS[name]}")
 
     def _refuse_categories(self, found: str) -> None:
-        expected = f"the {len(CLASS_IDS)} categories of nuScenes v1.0, with the numbers of nuScenes-lidarseg"
+        expected = (
+            f"the {len(CLASS_IDS)} categories of nuScenes v1.0, with the numbers of "
+            f"nuScenes-lidarseg"
+        )
         raise FormatError(
             self.path("category"),
             expected=expected,
@@ -205,7 +208,7 @@ class Tables:
         keys = ("token", "sensor_token", *_POSE, "camera_intrinsic")
         rows = [row for row in read_rows(path, keys) if row[4]]
         poses = poses_of(_columns(rows, 3, 4), _columns(rows, 2, 3), str(path))
-        found = {}
+        cameras = {}
         for (token, sensor, _, _, intrinsic), pose in zip(rows, poses, strict=True):
             try:
                 matrix = np.array(intrinsic, np.float64).reshape(3, 3)
@@ -213,8 +216,8 @@ class Tables:
                 raise FormatError(
                     path, expected="3 x 3 numbers in camera_intrinsic", found=str(intrinsic)
                 ) from error
-            found[token] = CameraRow(str(channels.get(sensor)), pose, matrix)
-        return found
+            cameras[token] = CameraRow(str(channels.get(sensor)), pose, matrix)
+        return cameras
 
     @cached_property
     def scenes(self) -> list[SceneRow]:
@@ -261,7 +264,7 @@ class Tables:
         rows = list(read_rows(self.path("scene"), ("token", "name")))
         for _, name in rows:
             self._check_inside("scene", name)
-        found = [
+        scenes = [
             SceneRow(
                 name,
                 tuple(sorted(scans.get(token, ()), key=attrgetter("timestamp"))),
@@ -269,7 +272,7 @@ class Tables:
             )
             for token, name in rows
         ]
-        return sorted(found, key=attrgetter("name"))
+        return sorted(scenes, key=attrgetter("name"))
 
     def _label_files(self, table: str) -> dict[str, str]:
         """Return the files of a table of labels by token of the scan; none if there is no such

@@ -224,20 +224,20 @@ def headings(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     after, at least a metre apart. A vehicle at rest keeps its last heading.
     """
     count = len(positions)
-    found, frames = np.full(count, np.nan), np.arange(count)
+    headings, frames = np.full(count, np.nan), np.arange(count)
     for away in range(1, _HEADING_FRAMES + 1):
         way = (
             positions[np.minimum(frames + away, count - 1), :2]
             - positions[np.maximum(frames - away, 0), :2]
         )
-        chosen = np.isnan(found) & (np.hypot(*way.T) >= _HEADING_M)
-        found[chosen] = np.arctan2(way[chosen, 1], way[chosen, 0])
-    known = np.flatnonzero(~np.isnan(found))
+        chosen = np.isnan(headings) & (np.hypot(*way.T) >= _HEADING_M)
+        headings[chosen] = np.arctan2(way[chosen, 1], way[chosen, 0])
+    known = np.flatnonzero(~np.isnan(headings))
     if not known.size:
         return np.zeros(count)
     # the first known one also holds before it
     last = np.maximum(np.searchsorted(known, frames, side="right") - 1, 0)
-    return found[known[last]]
+    return headings[known[last]]
 
 
 def _find_runs(ply: PlyVertices) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,16 +1,87 @@
-"""The fields of points as files and messages of any origin name them, and the times of points in
-any unit.
+"""The fields of points: unpacked from the layouts of ROS' PointCloud2 and Foxglove's PointCloud,
+named as files and messages of any origin name them, and the times of points in any unit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
+
+# Types of sensor_msgs/PointField:
+# https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/PointField.html
+ROS_TYPES = dict(enumerate("i1 u1 i2 u2 i4 u4 f4 f8".split(), 1))
+
+
+def read_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
+    """Return the fields of a sensor_msgs/PointCloud2 by name; the points of all rows, one row after
+    the other.
+
+    Raises:
+        FormatError: the data do not have the layout in the message.
+    """
+    order = ">" if message.is_bigendian else "<"
+    fields = [
+        (field.name, field.offset, f"{order}{ROS_TYPES.get(field.datatype, 'V')}", field.count)
+        for field in message.fields
+    ]
+    height, width, step = message.height, message.width, message.point_step
+    row_step, data = message.row_step or width * step, np.asarray(message.data, np.uint8)
+    if row_step < width * step or len(data) < height * row_step:
+        raise FormatError(
+            where,
+            expected=f"{height} rows of {width} points of {step} bytes",
+            found=f"{len(data)} bytes, {row_step} in a row",
+        )
+    rows = data[: height * row_step].reshape(height, row_step)[:, : width * step]
+    return unpack_fields(np.ascontiguousarray(rows).reshape(-1), fields, step, where)
+
+
+def unpack_fields(
+    data: NDArray[np.uint8], fields: Iterable[tuple[str, int, str, int]], step: int, where: str
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of packed points by name.
+
+    Args:
+        data: the points, one after the other.
+        fields: name, first byte, type and number of values per point of each field. Fields of
+            several values, without a name or of an unknown type are left out.
+        step: bytes of a point.
+        where: the message, for errors.
+
+    Raises:
+        FormatError: a field lies outside of the point, or the points have no bytes.
+    """
+    usable: Mapping[str, tuple[int, np.dtype[Any]]] = {
+        name: (offset, np.dtype(kind))
+        for name, offset, kind, count in fields
+        if name and count <= 1 and "V" not in kind
+    }
+    for name, (offset, kind) in usable.items():
+        if offset + kind.itemsize > step:
+            expected, found = (
+                f"points of {step} bytes",
+                f"the field {name} up to byte {offset + kind.itemsize}",
+            )
+            raise FormatError(where, expected=expected, found=found)
+    if not step or len(data) % step:
+        raise FormatError(where, expected=f"points of {step} bytes", found=f"{len(data)} bytes")
+    points = data.view(
+        np.dtype(
+            {
+                "names": list(usable),
+                "offsets": [offset for offset, _ in usable.values()],
+                "formats": [kind for _, kind in usable.values()],
+                "itemsize": step,
+            }
+        )
+    )
+    return {name: points[name] for name in usable}
+
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
@@ -42,7 +113,7 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "label": ("label", "labels", "class", "semantic", "classification", "scalar_label"),
     "instance": ("instance", "instances", "instance_id", "object_id", "track_id"),
 }
-_NANOSECONDS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+_NANOSECONDS: dict[TimeUnit, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _SCAN_S = (0.004, 0.6)  # duration of a scan: 2 to 200 Hz
 _ABSOLUTE_S = 1e6  # a time of a clock, not one within a scan
 
@@ -63,27 +134,27 @@ def named_fields(columns: Mapping[str, NDArray[Any]], where: str) -> dict[str, N
             0 to 2^32 - 1.
     """
     lower = {name.lower(): values for name, values in columns.items()}
-    found = {
+    given = {
         field: next((lower[name] for name in names if name in lower), None)
         for field, names in _NAMES.items()
     }
-    if missing := [field for field in ("x", "y", "z") if found[field] is None]:
+    if missing := [field for field in ("x", "y", "z") if given[field] is None]:
         raise FormatError(
             where,
             expected=f"points with {', '.join(missing)}",
             found=f"only {', '.join(columns) or 'no fields'}",
         )
-    count = len(found["x"])  # type: ignore[arg-type]
+    count = len(given["x"])  # type: ignore[arg-type]
     points = np.zeros((count, 4), np.float32)
     for axis, field in enumerate(("x", "y", "z", "intensity")):
-        if found[field] is not None:
-            points[:, axis] = found[field]
+        if given[field] is not None:
+            points[:, axis] = given[field]
     fields: dict[str, NDArray[Any]] = {"points": points}
     for field in ("time", "ring"):
-        if (values := found[field]) is not None:
+        if (values := given[field]) is not None:
             fields[field] = values
     for field in ("label", "instance"):
-        if (values := found[field]) is not None:
+        if (values := given[field]) is not None:
             fields[field] = whole_numbers(values, f"{where}: {field}")
     return fields
 
@@ -104,7 +175,7 @@ def whole_numbers(values: NDArray[Any], where: str) -> NDArray[np.uint32]:
 
 def point_seconds(
     times: NDArray[Any], unit: TimeUnit, where: str
-) -> tuple[NDArray[np.float64], int | None, str]:
+) -> tuple[NDArray[np.float64], int | None, TimeUnit]:
     """Return the times of the points of a scan in seconds.
 
     Args:
@@ -148,7 +219,7 @@ def point_seconds(
                 found=f"times from {first} to {last}",
                 advice="give their unit with `time_unit`",
             )
-        unit = usual  # type: ignore[assignment]
+        unit = usual
     scale = _NANOSECONDS[unit]
     if abs(float(first)) * scale / 1e9 < _ABSOLUTE_S:
         return np.asarray(times, np.float64) * (scale / 1e9), None, unit

@@ -38,12 +38,12 @@ def read_columns(path: Path, columns: tuple[str, ...] | None = None) -> dict[str
         ArgumentError: `columns` is needed.
         DependencyError: laspy is needed, and not installed.
     """
-    found = _READERS[path.suffix.lower()](path, columns)
-    if not next(iter(found.values()), np.empty(0)).size:
+    columns_read = _READERS[path.suffix.lower()](path, columns)
+    if not next(iter(columns_read.values()), np.empty(0)).size:
         raise FormatError(
             path, expected="points", found="none", advice="remove the file, or record it again"
         )
-    return found
+    return columns_read
 
 
 def _read_bin(path: Path, columns: tuple[str, ...] | None) -> dict[str, NDArray[Any]]:

@@ -17,7 +17,7 @@ from carlasc.core.geometry import check_rigid
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
 from carlasc_converters.files import opening, read_text
-from carlasc_converters.rigid import poses_of
+from carlasc_converters.transforms import poses_of
 
 PoseOf = Literal["sensor", "vehicle"]
 _Row = TypeVar("_Row")

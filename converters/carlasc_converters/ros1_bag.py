@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
-from carlasc_converters.bag_index import Channel, FileIndex, decompressed, ros_type
+from carlasc_converters.bag_messages import Channel, FileIndex, decompressed, ros_type
 from carlasc_converters.files import Version, version_of
 
 MAGIC = b"#ROSBAG V2.0\n"

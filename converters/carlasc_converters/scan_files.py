@@ -48,7 +48,7 @@ class ScanFile(FrameHandle):
         labels: the file of the classes of its points, of the first LiDAR.
         fields: fields that each file must have, those of the first one.
         options: the options for the files.
-        unit: unit of the times of points; empty if they have none.
+        unit: unit of the times of points; None if they have none.
         stamp: nanoseconds of the scan, where times of points are those of a clock.
     """
 
@@ -57,7 +57,7 @@ class ScanFile(FrameHandle):
     labels: str | None
     fields: tuple[str, ...]
     options: ScanOptions
-    unit: str
+    unit: TimeUnit | None
     stamp: int | None
 
     @property
@@ -73,22 +73,22 @@ class ScanFile(FrameHandle):
         return [self._read(index, path) for index, path in enumerate(self.paths)]
 
     def _read(self, index: int, path: str) -> Cloud:
-        found = named_fields(read_columns(Path(path), self.options.columns), path)
-        if set(found) != set(self.fields):
+        fields = named_fields(read_columns(Path(path), self.options.columns), path)
+        if set(fields) != set(self.fields):
             raise FormatError(
                 path,
                 expected=f"the fields of the first scan ({', '.join(self.fields)})",
-                found=", ".join(found),
+                found=", ".join(fields),
             )
-        points, seconds = found["points"], None
+        points, seconds = fields["points"], None
         if self.unit:
-            seconds, start, _ = point_seconds(found["time"], self.unit, path)  # type: ignore[arg-type]
+            seconds, start, _ = point_seconds(fields["time"], self.unit, path)
             if start is not None and self.stamp is not None:
                 seconds = seconds + (start - self.stamp) / 1e9
-        labels = found.get("label") if self.options.has_classes else None
+        labels = fields.get("label") if self.options.has_classes else None
         if self.labels is not None and index == 0:
             labels = read_labels(Path(self.labels), len(points))
-        instances = found.get("instance") if self.options.has_classes else None
+        instances = fields.get("instance") if self.options.has_classes else None
         finite = np.isfinite(points).all(axis=1)
         if not finite.any():
             raise FormatError(

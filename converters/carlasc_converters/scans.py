@@ -140,17 +140,17 @@ class Scans(Converter):
             for path in (self.options.pose_file, self.options.time_file)
             if path is not None
         }
-        found = folder.iterdir() if folder.is_dir() else iter(())
+        entries = folder.iterdir() if folder.is_dir() else iter(())
         return [
             path
-            for path in found
+            for path in entries
             if path.suffix.lower() in FORMATS and path.resolve() not in others
         ]
 
     def _files(self, folder: Path) -> list[Path]:
         """Return the scans of a folder in their natural order."""
-        found = self._scans_in(folder)
-        kinds = Counter(path.suffix.lower() for path in found)
+        files = self._scans_in(folder)
+        kinds = Counter(path.suffix.lower() for path in files)
         scans = {kind: count for kind, count in kinds.items() if kind not in _TABLES} or dict(kinds)
         if not scans:
             expected, advice = (
@@ -163,7 +163,7 @@ class Scans(Converter):
             raise FormatError(
                 folder, expected="scans of one format", found=counts, advice="move the others away"
             )
-        return sorted((path for path in found if path.suffix.lower() in scans), key=_natural)
+        return sorted((path for path in files if path.suffix.lower() in scans), key=_natural)
 
     def _check_counts(self, files: dict[str, list[Path]]) -> None:
         if len({len(paths) for paths in files.values()}) > 1:
@@ -204,13 +204,13 @@ class ScanFolder(Recording):
         )
 
     @cached_property
-    def _clock(self) -> tuple[str, int | None]:
+    def _clock(self) -> tuple[TimeUnit | None, int | None]:
         """The unit of the times of points, and the start of the first scan, if these are times of a
         clock.
         """
         times = self._first.get("time")
         if times is None:
-            return "", None
+            return None, None
         _, start, unit = point_seconds(times, self._options.time_unit, str(self._paths[0]))
         return unit, start
 
@@ -252,7 +252,8 @@ class ScanFolder(Recording):
 
     def _start_of(self, path: Path) -> int:
         times = named_fields(read_columns(path, self._options.columns), str(path)).get("time")
-        start = None if times is None else point_seconds(times, self._clock[0], str(path))[1]  # type: ignore[arg-type]
+        unit = self._clock[0] or "auto"
+        start = None if times is None else point_seconds(times, unit, str(path))[1]
         if start is None:
             raise FormatError(
                 path, expected="times of points by a clock, as in the first scan", found="others"
@@ -283,19 +284,19 @@ class ScanFolder(Recording):
         folder = self._options.label_dir
         if folder is None:
             return None
-        found = (
+        labels = (
             {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in _LABELS}
             if folder.is_dir()
             else {}
         )
-        if missing := [path.stem for path in self._paths if path.stem not in found]:
+        if missing := [path.stem for path in self._paths if path.stem not in labels]:
             raise MissingDataError(
                 folder,
                 expected=f"a file {', '.join(_LABELS)} for each scan",
                 found=f"none for {missing[0]}"
                 + (f" and {len(missing) - 1} more" if len(missing) > 1 else ""),
             )
-        return [found[path.stem] for path in self._paths]
+        return [labels[path.stem] for path in self._paths]
 
     @cached_property
     def sensors(self) -> Sequence[Sensor]:  # type: ignore[override]

@@ -37,8 +37,9 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError, Storage
 from carlasc_converters.files import opening
 
 _CLASSES = (  # name, class of CarlaSC; the data count from 0, here 0 is unlabelled
-    ("unlabelled", "Free"), ("building", "Building"), ("car", "Vehicle"), ("natural ground", "Terrain"), ("ground", "Ground"),
-    ("pole-like", "Pole"), ("road", "Road"), ("street furniture", "Static"), ("tree", "Vegetation"), ("pavement", "Sidewalk"),
+    ("unlabelled", "Free"), ("building", "Building"), ("car", "Vehicle"),
+    ("natural ground", "Terrain"), ("ground", "Ground"), ("pole-like", "Pole"), ("road", "Road"),
+    ("street furniture", "Static"), ("tree", "Vegetation"), ("pavement", "Sidewalk"),
 )  # fmt: skip
 _TARGETS = {index: CARLA.id_of(target) for index, (_, target) in enumerate(_CLASSES)}
 CLASSES = ClassTable(
@@ -283,18 +284,20 @@ def _find_columns(path: Path, named: Mapping[str, str]) -> dict[str, str]:
         existing = parquet.read_schema(path).names
     columns = {}
     for key, synonyms in _SYNONYMS.items():
-        found = [
+        candidates = [
             name for name in existing if "".join(filter(str.isalpha, name.lower())) in synonyms
         ]
-        found = [name for name in existing if name == named[key]] if key in named else found
-        if len(found) != 1:
+        candidates = (
+            [name for name in existing if name == named[key]] if key in named else candidates
+        )
+        if len(candidates) != 1:
             raise FormatError(
                 path,
                 expected=f"one column {named.get(key, key)}",
-                found=", ".join(found or existing),
+                found=", ".join(candidates or existing),
                 advice=f"name the columns with the option `columns`: {_COLUMNS}",
             )
-        columns[key] = found[0]
+        columns[key] = candidates[0]
     return columns
 
 
@@ -362,9 +365,9 @@ def _append(
     order = np.argsort(codes, kind="stable")
     rows, codes = rows[order], codes[order]
     starts = np.append(0, np.flatnonzero(np.diff(codes)) + 1)
-    found = [(int(x), int(y)) for x, y in tiles[order[starts]]]
+    squares = [(int(x), int(y)) for x, y in tiles[order[starts]]]
     try:
-        for tile, part in zip(found, np.split(rows, starts[1:]), strict=True):
+        for tile, part in zip(squares, np.split(rows, starts[1:]), strict=True):
             with Path(_tile_file(folder, tile)).open("ab") as file:
                 part.tofile(file)
     except OSError as error:
@@ -372,7 +375,7 @@ def _append(
         raise StorageError(
             folder, problem=f"the temporary folder cannot be written ({error})", advice=advice
         ) from error
-    return set(found)
+    return set(squares)
 
 
 def _tile_file(folder: str, tile: tuple[int, int]) -> str:

@@ -1,4 +1,4 @@
-"""The tree of coordinate frames of a bag, over time."""
+"""Poses from quaternions and translations, and the tree of coordinate frames over time."""
 
 from __future__ import annotations
 
@@ -11,9 +11,35 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import inverse_of, multiply, slerp
+from carlasc.core.geometry import check_rigid, inverse_of, multiply, poses_from, slerp
 from carlasc.errors import FormatError
-from carlasc_converters.rigid import poses_of
+
+_UNIT_TOLERANCE = 1e-3  # greatest deviation of a quaternion's norm from 1
+
+
+def poses_of(
+    quaternions: NDArray[np.floating], translations: NDArray[np.floating], where: str
+) -> NDArray[np.float64]:
+    """Return the (N, 4, 4) float64 transforms with given rotations and translations.
+
+    Args:
+        quaternions: (N, 4) w, x, y, z.
+        translations: (N, 3) metres.
+        where: the file, for errors.
+
+    Raises:
+        FormatError: a quaternion does not have length 1, or a number is not finite.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        valid = np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= _UNIT_TOLERANCE
+    if not valid.all():
+        row = int(np.argmin(valid))
+        found = f"{np.asarray(quaternions[row], np.float64).tolist()} in row {row}"
+        raise FormatError(
+            where, expected="a rotation: a quaternion w, x, y, z of length 1", found=found
+        )
+    return check_rigid(poses_from(quaternions, translations), where, 4 * _UNIT_TOLERANCE)
+
 
 _STILL = 1e-9  # a transform that changes by less is static
 
@@ -99,14 +125,14 @@ class FrameTree:
         Raises:
             FormatError: the frames form a circle.
         """
-        found = [frame]
-        while parents := self._tracks.get(found[-1]):
-            found.append(max(parents, key=lambda parent: len(parents[parent])))
-            if found[-1] in found[:-1]:
+        line = [frame]
+        while parents := self._tracks.get(line[-1]):
+            line.append(max(parents, key=lambda parent: len(parents[parent])))
+            if line[-1] in line[:-1]:
                 raise FormatError(
-                    self._where, expected="a tree of frames", found=f"a circle: {', '.join(found)}"
+                    self._where, expected="a tree of frames", found=f"a circle: {', '.join(line)}"
                 )
-        return found
+        return line
 
     def edges(self, frame: str, ancestor: str) -> list[FrameTrack]:
         """Return the tracks from a frame up to one of its ancestors."""

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from carlasc_converters.bag import Bag
-from carlasc_converters.bag_index import decompressed
+from carlasc_converters.bag_messages import decompressed
 from carlasc_converters.bag_topics import BagFiles
 from helpers.converters.bags import KINDS, Messages, drive_messages, file_of, write_bag
 

@@ -4,7 +4,7 @@ be.
 
 import numpy as np
 import pytest
-from carlasc_converters.point_cloud2 import read_columns, unpack_fields
+from carlasc_converters.point_fields import read_columns, unpack_fields
 from helpers.converters.bags import VELODYNE, Messages
 
 from carlasc.errors import FormatError

@@ -171,13 +171,13 @@ def classes_of(
         FormatError: a label has no class.
     """
     beyond = len(lookup) - 1
-    found: NDArray[np.int32] = lookup[
+    classes: NDArray[np.int32] = lookup[
         labels if np.iinfo(labels.dtype).max <= beyond else np.minimum(labels, beyond)
     ]
-    if (found == _NONE).any():
-        bad = int(labels[found == _NONE][0])
+    if (classes == _NONE).any():
+        bad = int(labels[classes == _NONE][0])
         times = int(np.count_nonzero(labels == bad))
         raise FormatError(
             where, expected=f"class ids of {table.name}", found=f"{bad} ({times} times)"
         )
-    return found
+    return classes

@@ -139,7 +139,7 @@ class GridExporter(FrameExporter):
     def read_codes(
         self, sequence: storage.Sequence, frame: int
     ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
-        """Return the result of `read`, with 0 for free or unknown voxels, and class + 1 for others."""
+        """Return the result of `read`, with 0 for free or unknown voxels, else class + 1."""
         name, axes, place = self.grid_of(sequence), sequence.metadata.axes, self.frame_of(sequence)
         grid, table = sequence.grid(name, frame), sequence.classes_of(name)
         where = f"{sequence.location}: {name} of frame {frame}"
@@ -244,7 +244,7 @@ def sensor_height(sequence: storage.Sequence, given: float | None) -> tuple[floa
 
 
 def read_points(sequence: storage.Sequence, frame: int) -> NDArray[np.float32]:
-    """Return (N, 4) points and remission of a frame, right-handed; none if the frame has no scan."""
+    """Return (N, 4) right-handed points and remission of a frame; none without a scan."""
     if not np.isin(frame, sequence.frames("points")):
         return np.empty((0, 4), np.float32)
     points = np.asarray(sequence.read("points", frame), np.float32)

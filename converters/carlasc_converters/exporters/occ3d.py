@@ -173,7 +173,7 @@ class Occ3dExporter(GridExporter):
 
 
 def _pose(sequence: storage.Sequence, frame: int, place: TargetFrame) -> dict[str, list[float]]:
-    """Return the pose of the vehicle in the frame of the vehicle at the first scan, right-handed."""
+    """Return the right-handed pose of the vehicle in its frame at the first scan."""
     first_T_scan = sequence.read_pose(frame)
     if sequence.metadata.axes == "left":
         first_T_scan = mirror_poses(first_T_scan)

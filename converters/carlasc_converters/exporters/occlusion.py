@@ -151,7 +151,7 @@ def _walk(
     depth: int,
     width: int,
 ) -> np.uint32:
-    """Return the voxels of column (x, y) whose line to the sensor meets an occupied voxel, as bits."""
+    """Return, as bits, the voxels of column (x, y) hidden from the sensor by an occupied one."""
     rx, ry = sensor[0] - x - 0.5, sensor[1] - y - 0.5
     sx, sy = (1 if rx > 0 else -1), (1 if ry > 0 else -1)
     # Per axis: the fraction of the way between two faces (d), and the fraction at which the next

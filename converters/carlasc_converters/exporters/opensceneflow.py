@@ -41,9 +41,10 @@ _PROTOCOL = 4  # of the pickle: fixed, so that the bytes do not depend on the ve
 _BICYCLE, _BICYCLIST, _BUS, _LARGE_VEHICLE, _MOTORCYCLE, _MOTORCYCLIST = 3, 4, 7, 11, 14, 15
 _PEDESTRIAN, _RAILED_VEHICLE, _REGULAR_VEHICLE, _TRUCK = 17, 18, 19, 25
 _KITTI = {
-    10: _REGULAR_VEHICLE, 11: _BICYCLE, 13: _BUS, 15: _MOTORCYCLE, 16: _RAILED_VEHICLE, 18: _TRUCK, 20: _LARGE_VEHICLE, 30: _PEDESTRIAN,
-    31: _BICYCLIST, 32: _MOTORCYCLIST, 252: _REGULAR_VEHICLE, 253: _BICYCLIST, 254: _PEDESTRIAN, 255: _MOTORCYCLIST, 256: _RAILED_VEHICLE,
-    257: _BUS, 258: _TRUCK, 259: _LARGE_VEHICLE,
+    10: _REGULAR_VEHICLE, 11: _BICYCLE, 13: _BUS, 15: _MOTORCYCLE, 16: _RAILED_VEHICLE,
+    18: _TRUCK, 20: _LARGE_VEHICLE, 30: _PEDESTRIAN, 31: _BICYCLIST, 32: _MOTORCYCLIST,
+    252: _REGULAR_VEHICLE, 253: _BICYCLIST, 254: _PEDESTRIAN, 255: _MOTORCYCLIST,
+    256: _RAILED_VEHICLE, 257: _BUS, 258: _TRUCK, 259: _LARGE_VEHICLE,
 }  # fmt: skip
 _CARLA = {4: _PEDESTRIAN, 10: _REGULAR_VEHICLE}
 CATEGORIES: Mapping[str, Mapping[int, int]] = {
@@ -285,15 +286,15 @@ class _LogFile(SequenceFile):
             group.create_dataset(name, data=array)
 
     def _number(self, instances: NDArray[np.unsignedinteger]) -> NDArray[np.int16]:
-        found = np.unique(instances)
-        for instance in found.tolist():
+        actors = np.unique(instances)
+        for instance in actors.tolist():
             self._numbers.setdefault(instance, len(self._numbers))
         if len(self._numbers) > np.iinfo(np.int16).max + 1:
             raise FormatError(
                 self._path, expected="at most 32767 objects", found=str(len(self._numbers) - 1)
             )
-        return np.array([self._numbers[instance] for instance in found.tolist()], np.int16)[
-            np.searchsorted(found, instances)
+        return np.array([self._numbers[instance] for instance in actors.tolist()], np.int16)[
+            np.searchsorted(actors, instances)
         ]
 
 

@@ -88,21 +88,22 @@ def check_submission(root: Path, dataset: Path, task: Task, ids: Collection[int]
 
 def _check_file(path: Path, scan: Path, task: Task, ids: Collection[int]) -> None:
     """Check the size of a file of predictions against its input, and its ids."""
-    size, found = scan.stat().st_size, path.stat().st_size
+    size, actual = scan.stat().st_size, path.stat().st_size
     number, width = (size * _BITS, 2) if task == "completion" else (size // _BYTES_PER_POINT, 4)
     what = "voxels" if task == "completion" else "points"
-    if found != number * width:
+    if actual != number * width:
         expected = f"{number * width} bytes: {number} {what}, {width} bytes each"
-        raise FormatError(path, expected=expected, found=f"{found} bytes")
+        raise FormatError(path, expected=expected, found=f"{actual} bytes")
     labels = np.fromfile(path, f"<u{width}") & 0xFFFF
     counts = np.bincount(labels, minlength=max(ids) + 1)
     bad = [label for label in np.flatnonzero(counts).tolist() if label not in ids]
     if bad:
         raise FormatError(
-            path, expected=f"class ids that the evaluator takes, {', '.join(map(str, sorted(ids)))}",
-            found=f"{bad[0]} ({counts[bad[0]]} times)", advice="`carlasc export kitti "
-                                                               "--predictions` writes only these",
-        )  # fmt: skip
+            path,
+            expected=f"class ids that the evaluator takes, {', '.join(map(str, sorted(ids)))}",
+            found=f"{bad[0]} ({counts[bad[0]]} times)",
+            advice="`carlasc export kitti --predictions` writes only these",
+        )
 
 
 def pack_submission(root: Path, files: Iterable[Path], archive: Path) -> None:

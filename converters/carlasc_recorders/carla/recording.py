@@ -13,14 +13,21 @@ from typing import Any
 import numpy as np
 
 from carlasc.captures.raw import Capture, SensorRecording
-from carlasc.captures.settings import TRAFFIC, Lidar, TrafficLevel, check_at_least, sensor_offsets
+from carlasc.captures.settings import (
+    TRAFFIC,
+    Lidar,
+    ServerOptions,
+    TrafficLevel,
+    check_at_least,
+    sensor_offsets,
+)
 from carlasc.captures.writing import CaptureWriter, TimesLog
 from carlasc.errors import ConflictError, MissingDataError, check_choice, import_extra
 from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.layout import CAMERAS
-from carlasc_recorders.carla.sensors import ActorNumbers, SensorRig, photo_fields
-from carlasc_recorders.carla.server import Server, ServerOptions
-from carlasc_recorders.town.photographs import roof_cameras
+from carlasc_recorders.carla.sensors import CAMERA_KINDS, ActorNumbers, SensorRig
+from carlasc_recorders.carla.server import Server
+from carlasc_recorders.town.photographs import photo_fields, roof_cameras
 
 SETTINGS_FILE = "recording.json"
 # maximum distance between the ego sensor positions of the replay and of the recorded drive
@@ -116,7 +123,7 @@ def record(
     check_at_least(0, seed=seed)
     check_choice("traffic", traffic, TrafficLevel)
     models = roof_cameras(cameras)
-    images = photo_fields(models)
+    images = photo_fields(models, CAMERA_KINDS)
     if bev or cameras:
         import_extra("PIL.Image", "carla")
     writer, written = CaptureWriter(out), 0

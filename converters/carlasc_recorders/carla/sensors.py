@@ -20,13 +20,15 @@ from carlasc.errors import MissingDataError
 from carlasc.storage.camera_files import encode_image
 from carlasc.storage.layout import FRAME_PERIOD_S
 from carlasc_recorders.carla.server import SemanticSweep, Server, decode_sweep
+from carlasc_recorders.town.photographs import photo_fields
 
-# by folder of images: camera of CARLA and file suffix
-_KINDS = {
-    "images": ("rgb", "jpg"),
-    "image_labels": ("semantic_segmentation", "png"),
-    "image_depths": ("depth", "png"),
+CAMERA_KINDS = {
+    "images": "rgb",
+    "image_labels": "semantic_segmentation",
+    "image_depths": "depth",
 }
+"""The cameras of CARLA, by the folder of their images."""
+
 _FARTHEST_M, _DEPTH_STEP = 1000.0, 256.0
 
 RENUMBERED_FROM = (0, 9, 14)
@@ -94,7 +96,9 @@ class SensorRig:
         self._photos = {
             field: self._mount_camera(ego, camera, offsets[0], kind)
             for camera in cameras
-            for field, kind in zip(photo_fields([camera]), _KINDS.values(), strict=True)
+            for field, kind in zip(
+                photo_fields([camera], CAMERA_KINDS), CAMERA_KINDS.values(), strict=True
+            )
         }
 
     def measure(
@@ -140,7 +144,7 @@ class SensorRig:
         return recordings, [sweep.elapsed_s for sweep in sweeps], picture, photos
 
     def _mount_camera(
-        self, ego: Any, camera: CameraModel, ego_lidar: NDArray[np.float64], kind: tuple[str, str]
+        self, ego: Any, camera: CameraModel, ego_lidar: NDArray[np.float64], kind: str
     ) -> queue.Queue[Any]:
         """Spawn a camera of CARLA at the pose of a camera model, and return the queue of its
         images.
@@ -151,7 +155,7 @@ class SensorRig:
         width_deg = math.degrees(2 * math.atan(camera.width / 2 / camera.matrix[0, 0]))
         attributes = {"image_size_x": camera.width, "image_size_y": camera.height, "fov": width_deg}
         where = self._server.transform((x, y, z), yaw_deg=yaw_deg)
-        return self._mount(ego, f"sensor.camera.{kind[0]}", attributes, where)
+        return self._mount(ego, f"sensor.camera.{kind}", attributes, where)
 
     def _to_file(self, field: str, image: Any) -> NDArray[np.uint8]:
         """Return an image as the bytes of a file: colours, class ids, or depths, which CARLA
@@ -162,28 +166,33 @@ class SensorRig:
         if folder == "images":
             return encode_image(pixels, "JPEG")
         if folder == "image_labels":
-            where = f"CARLA {self._server.version}, semantic camera"
-            if self._remap is None:
-                CARLA.check(pixels[..., 0], where)
-                return encode_image(pixels[..., 0], "PNG")
-            return encode_image(self._remap(pixels[..., 0], where).astype(np.uint8), "PNG")
+            labels = self._classes_of(pixels[..., 0], "semantic camera")
+            return encode_image(labels.astype(np.uint8), "PNG")
         shares = (pixels @ np.array([1.0, 256.0, 65536.0])) / (256**3 - 1)
         return encode_image(
             np.rint(shares * _FARTHEST_M * _DEPTH_STEP).clip(1, 65535).astype(np.uint16), "PNG"
         )
 
+    def _classes_of(self, tags: NDArray[Any], sensor: str) -> NDArray[Any]:
+        """Return the class ids of the data set for those of the server."""
+        where = f"CARLA {self._server.version}, {sensor}"
+        if self._remap is not None:
+            return self._remap(tags, where)
+        CARLA.check(tags, where)
+        return tags
+
     def _mount(
         self, ego: Any, name: str, attributes: dict[str, Any], transform: Any
     ) -> queue.Queue[Any]:
         """Spawn a sensor on the ego vehicle, and return the queue of its measurements."""
-        found = self._server.blueprints(name)
-        if not found:
+        blueprints = self._server.blueprints(name)
+        if not blueprints:
             raise MissingDataError(
                 self._server.where,
                 expected=f"the sensor {name}",
                 found=f"no such sensor in CARLA {self._server.version}",
             )
-        blueprint = found[0]
+        blueprint = blueprints[0]
         for key, value in attributes.items():
             blueprint.set_attribute(key, str(value))
         sensor = self._server.spawn(blueprint, transform, parent=ego, before_destroy="stop")
@@ -201,12 +210,7 @@ class SensorRig:
             points + rng.uniform(-self._lidar.noise_m, self._lidar.noise_m, points.shape)
         ).astype(np.float32)
         tags = np.ascontiguousarray(seen["tag"])
-        where = f"CARLA {self._server.version}, semantic LiDAR"
-        if self._remap is not None:
-            labels = self._remap(tags, where).astype(np.uint32)
-        else:
-            CARLA.check(tags, where)
-            labels = tags.astype(np.uint32)
+        labels = self._classes_of(tags, "semantic LiDAR").astype(np.uint32)
         actors = np.unique(seen["actor"][seen["actor"] > 0])
         velocities = rotate_vectors(invert(sweep.world_T_sensor), self._server.velocities(actors))
         rows = np.column_stack([numbers.of(actors).astype(np.float64), velocities])
@@ -237,15 +241,6 @@ class ActorNumbers:
             if len(ids)
             else np.empty(0, np.uint32)
         )
-
-
-def photo_fields(cameras: Sequence[CameraModel]) -> tuple[str, ...]:
-    """Return the fields of the layout for the images of cameras."""
-    return tuple(
-        f"{folder}.{camera.name}.{suffix}"
-        for camera in cameras
-        for folder, (_, suffix) in _KINDS.items()
-    )
 
 
 def encode_bev(image: Any) -> bytes:

@@ -162,7 +162,7 @@ class Server:
         pitch_deg: float = 0.0,
         yaw_deg: float = 0.0,
     ) -> Any:
-        """Return a CARLA transform from a position, metres, pitch and yaw, degrees, without roll."""
+        """Return a CARLA transform without roll, from a position in metres, and degrees."""
         carla = self.carla
         return carla.Transform(
             carla.Location(*xyz), carla.Rotation(pitch=pitch_deg, yaw=yaw_deg, roll=0.0)
@@ -242,9 +242,9 @@ class Server:
         snapshot = self._world.get_snapshot()
         velocities = np.zeros((len(actors), 3))
         for row, actor in enumerate(actors):
-            found = snapshot.find(int(actor))
-            if found is not None:
-                velocity = found.get_velocity()
+            actor_snapshot = snapshot.find(int(actor))
+            if actor_snapshot is not None:
+                velocity = actor_snapshot.get_velocity()
                 velocities[row] = velocity.x, velocity.y, velocity.z
         return velocities
 

@@ -75,10 +75,10 @@ def draw_walks(rng: np.random.Generator, blocks: tuple[CityBlock, ...], count: i
     walks: list[Walk] = []
     occupied: dict[tuple[int, int], list[float]] = {}
     while len(walks) < count:
-        number, direction = int(rng.integers(len(blocks))), int(rng.integers(3))
+        number, direction = rng.integers(len(blocks)), rng.integers(3)
         loop = close_loop(blocks[number].outline.at(HALF_ROAD_M + _OFFSETS_M[direction]))
         length = float(np.linalg.norm(np.diff(loop, axis=0), axis=1).sum())
-        start = float(rng.uniform(0, length))
+        start = rng.uniform(0, length)
         if any(
             min(abs(start - other), length - abs(start - other)) < 1.0
             for other in occupied.get((number, direction), [])
@@ -86,7 +86,7 @@ def draw_walks(rng: np.random.Generator, blocks: tuple[CityBlock, ...], count: i
             continue
         occupied.setdefault((number, direction), []).append(start)
         speed = float(speeds[number, direction]) * (1, -1)[direction] if direction < 2 else 0.0
-        walks.append(Walk(loop, start, speed, float(rng.uniform(-np.pi, np.pi))))
+        walks.append(Walk(loop, start, speed, rng.uniform(-np.pi, np.pi)))
     return walks
 
 
@@ -205,8 +205,8 @@ def _draw_ego_start(rng: np.random.Generator, town: Town) -> tuple[int, float]:
     """
     lanes = [(i, lane) for i, lane in enumerate(town.streets.lanes) if not lane.turn]
     lanes.sort(key=lambda item: float(np.linalg.norm(item[1].point(item[1].length_m / 2))))
-    index, lane = lanes[int(rng.integers(8))]
-    return index, lane.length_m * float(rng.uniform(0.15, 0.35))
+    index, lane = lanes[rng.integers(8)]
+    return index, lane.length_m * rng.uniform(0.15, 0.35)
 
 
 def _draw_parked_vehicles(rng: np.random.Generator, town: Town, first_id: int) -> list[TownActor]:

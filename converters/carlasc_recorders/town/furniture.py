@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlasc.core.geometry import Transform, rotation_z, translation
 from carlasc.core.tables import CARLA
@@ -51,9 +52,9 @@ def bollard() -> Mesh:
 def sign(rng: np.random.Generator) -> Mesh:
     """Return a traffic sign that faces traffic along +x."""
     builder = MeshBuilder()
-    height = float(rng.uniform(2.0, 2.4))
+    height = rng.uniform(2.0, 2.4)
     builder.cylinder(POLE, (0, 0, -POST_DEPTH_M), 0.045, height + 0.7 + POST_DEPTH_M, 7)
-    shape = int(rng.integers(3))
+    shape = rng.integers(3)
     if shape == 0:
         builder.rod(
             TRAFFIC_SIGN, (-0.07, 0, height + 0.35), (-0.04, 0, height + 0.35), 0.36, sections=14
@@ -102,7 +103,7 @@ def litter_bin() -> Mesh:
 def planter(rng: np.random.Generator) -> Mesh:
     """Return a concrete planter."""
     builder = MeshBuilder()
-    builder.boxes(STATIC, (0, 0, -0.1), (float(rng.uniform(1.0, 2.0)), 0.8, 0.65))
+    builder.boxes(STATIC, (0, 0, -0.1), (rng.uniform(1.0, 2.0), 0.8, 0.65))
     return builder.build()
 
 
@@ -117,14 +118,14 @@ def hydrant() -> Mesh:
 def trash(rng: np.random.Generator) -> Mesh:
     """Return a heap of trash bags and boxes, of CARLA's class Dynamic."""
     builder = MeshBuilder()
-    for _ in range(int(rng.integers(2, 5))):
+    for _ in range(rng.integers(2, 5)):
         position, size = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.3, 0.65, 3)
         if rng.random() < 0.5:
             builder.cylinder(
                 DYNAMIC, (*position, 0), float(size[0]) / 2, float(size[2]), 7, top=0.5
             )
         else:
-            builder.boxes(DYNAMIC, (*position, 0), size, float(rng.uniform(0, np.pi)))
+            builder.boxes(DYNAMIC, (*position, 0), size, rng.uniform(0, np.pi))
     return builder.build()
 
 
@@ -145,37 +146,36 @@ def kiosk() -> Mesh:
     return builder.build()
 
 
+def _post_places(length_m: float, spacing_m: float) -> NDArray[np.float64]:
+    """Return (P,) x of posts, about a spacing apart, from one end of an object to the other."""
+    return np.linspace(-length_m / 2, length_m / 2, max(int(length_m / spacing_m), 1) + 1)
+
+
+def _row(x: NDArray[np.float64], z: float) -> NDArray[np.float64]:
+    """Return (P, 3) points on a line along x, at a height z."""
+    return np.column_stack([x, 0 * x, 0 * x + z])
+
+
 def fence(length_m: float, height_m: float = 1.3) -> Mesh:
     """Return a fence along x with its middle at the origin: posts, rails, and slats with gaps that
     some rays pass.
     """
     builder = MeshBuilder()
-    posts = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 2.2), 1) + 1)
-    builder.boxes(
-        FENCE,
-        np.column_stack([posts, 0 * posts, 0 * posts - POST_DEPTH_M]),
-        (0.1, 0.1, height_m + POST_DEPTH_M),
-    )
-    slats = np.arange(-length_m / 2 + 0.1, length_m / 2, 0.17)
-    builder.boxes(
-        FENCE, np.column_stack([slats, 0 * slats, 0 * slats]), (0.1, 0.025, height_m - 0.08)
-    )
+    posts = _row(_post_places(length_m, 2.2), -POST_DEPTH_M)
+    builder.boxes(FENCE, posts, (0.1, 0.1, height_m + POST_DEPTH_M))
+    slats = _row(np.arange(-length_m / 2 + 0.1, length_m / 2, 0.17), 0.0)
+    builder.boxes(FENCE, slats, (0.1, 0.025, height_m - 0.08))
     for z in (0.25, height_m - 0.3):
         builder.boxes(FENCE, (0, 0.03, z), (length_m, 0.04, 0.09))
     return builder.build()
 
 
 def wall(length_m: float, height_m: float) -> Mesh:
-    """Return a free-standing wall along x with its middle at the origin, with a coping and pillars."""
+    """Return a wall along x with its middle at the origin, with a coping and pillars."""
     builder = MeshBuilder()
     builder.boxes(WALL, (0, 0, -0.5), (length_m, 0.24, height_m + 0.5))
     builder.boxes(WALL, (0, 0, height_m), (length_m + 0.1, 0.34, 0.09))
-    pillars = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 4), 1) + 1)
-    builder.boxes(
-        WALL,
-        np.column_stack([pillars, 0 * pillars, 0 * pillars - 0.5]),
-        (0.4, 0.4, height_m + 0.65),
-    )
+    builder.boxes(WALL, _row(_post_places(length_m, 4), -0.5), (0.4, 0.4, height_m + 0.65))
     return builder.build()
 
 
@@ -185,12 +185,8 @@ def guard_rail(length_m: float) -> Mesh:
     Its beam is on the side of the street.
     """
     builder = MeshBuilder()
-    posts = np.linspace(-length_m / 2, length_m / 2, max(int(length_m / 2.0), 1) + 1)
-    builder.boxes(
-        GUARD_RAIL,
-        np.column_stack([posts, 0 * posts, 0 * posts - POST_DEPTH_M]),
-        (0.1, 0.14, 0.72 + POST_DEPTH_M),
-    )
+    posts = _row(_post_places(length_m, 2.0), -POST_DEPTH_M)
+    builder.boxes(GUARD_RAIL, posts, (0.1, 0.14, 0.72 + POST_DEPTH_M))
     for z, y in ((0.48, -0.12), (0.6, -0.16), (0.7, -0.12)):
         builder.boxes(GUARD_RAIL, (0, y, z), (length_m, 0.05, 0.12))
     return builder.build()
@@ -222,10 +218,8 @@ def rail_track(length_m: float) -> Mesh:
     """
     builder = MeshBuilder()
     builder.boxes(GROUND, (0, 0, -0.6), (length_m, 3.6, 0.78))
-    sleepers = np.arange(-length_m / 2, length_m / 2, 0.65)
-    builder.boxes(
-        RAIL_TRACK, np.column_stack([sleepers, 0 * sleepers, 0 * sleepers + 0.1]), (0.26, 2.5, 0.16)
-    )
+    sleepers = _row(np.arange(-length_m / 2, length_m / 2, 0.65), 0.1)
+    builder.boxes(RAIL_TRACK, sleepers, (0.26, 2.5, 0.16))
     for y in (-0.72, 0.72):
         builder.boxes(RAIL_TRACK, (0, y, 0.2), (length_m, 0.08, 0.2))
     return builder.build()
@@ -236,7 +230,7 @@ def add_street_furniture(plan: TownPlan, side: Side, trees: bool) -> None:
     sidewalk.
     """
     rng = plan.rng
-    lamps = np.arange(float(rng.uniform(2, 8)), side.length_m, 22.0)
+    lamps = np.arange(rng.uniform(2, 8), side.length_m, 22.0)
     for at in lamps:
         plan.add(street_lamp(), side.point(at, side.kerb_offset(at) + 0.45), side.yaw_rad)
     occupied = list(lamps)
@@ -289,7 +283,7 @@ def add_traffic_signals(plan: TownPlan, streets: Streets) -> None:
 
 def add_footbridge(plan: TownPlan, streets: Streets) -> None:
     """Add one footbridge across the middle of a street."""
-    block = streets.blocks[int(plan.rng.integers(len(streets.blocks) - 1))]
+    block = streets.blocks[plan.rng.integers(len(streets.blocks) - 1)]
     side = block.sides[0]
     plan.add(footbridge(2 * INNER_M + 1.0), side.point(side.length_m / 2, 0.0), side.yaw_rad)
 
@@ -331,7 +325,7 @@ def make_building(
         4) world_T_building.
     """
     width, depth = footprint.size
-    storey = float(rng.uniform(2.9, 3.5))
+    storey = rng.uniform(2.9, 3.5)
     builder = MeshBuilder()
     builder.boxes(BUILDING, (0, 0, -FOUNDATION_M), (width, depth, height_m + FOUNDATION_M))
     _add_entrance(builder, rng, width, depth)
@@ -347,7 +341,7 @@ def _add_entrance(
     builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float
 ) -> None:
     """Add a door with steps and a porch roof on the side of the street (y < 0)."""
-    x = float(rng.uniform(-0.3, 0.3)) * width
+    x = rng.uniform(-0.3, 0.3) * width
     builder.boxes(BUILDING, (x, -depth / 2 - 0.35, -0.5), (2.0, 0.7, 0.5 + 0.3))
     builder.boxes(BUILDING, (x, -depth / 2 - 0.45, 2.6), (2.4, 0.9, 0.12))
     for side in (-1.0, 1.0):
@@ -365,7 +359,7 @@ def _add_facades(
     """Add window frames and sills on all four sides, a ledge per storey, pillars at the corners,
     and some balconies.
     """
-    pitch = float(rng.uniform(2.2, 3.6))
+    pitch = rng.uniform(2.2, 3.6)
     floors = np.arange(int(height // storey)) * storey
     balconies = rng.random() < 0.35
     for length, reach, yaw in (
@@ -392,9 +386,7 @@ def _add_facades(
         if rng.random() < 0.7:
             levels = floors[1:]
             if len(levels):
-                ledge = np.column_stack(
-                    [np.zeros(len(levels)), np.full(len(levels), -reach / 2 - 0.05), levels - 0.1]
-                )
+                ledge = [(0, -reach / 2 - 0.05, level - 0.1) for level in levels]
                 frame.boxes(BUILDING, ledge, (length, 0.16, 0.18))
         builder.add_mesh(frame.build(), rotation_z(yaw))
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * (width / 2, depth / 2, 1)
@@ -408,7 +400,7 @@ def _add_flat_roof(
         builder.boxes(BUILDING, (0, y * (depth / 2), height - 0.1), (width + 0.5, 0.45, 0.75))
     for x in (-1, 1):
         builder.boxes(BUILDING, (x * (width / 2), 0, height - 0.1), (0.45, depth, 0.75))
-    for _ in range(int(rng.integers(1, 4))):
+    for _ in range(rng.integers(1, 4)):
         place = rng.uniform(-0.3, 0.3, 2) * (width, depth)
         builder.boxes(BUILDING, (*place, height), rng.uniform((1.0, 1.0, 0.8), (2.5, 2.5, 2.0)))
 
@@ -416,7 +408,7 @@ def _add_flat_roof(
 def _add_pitched_roof(
     builder: MeshBuilder, rng: np.random.Generator, width: float, depth: float, height: float
 ) -> None:
-    eaves, rise = 0.45, depth / 2 * float(rng.uniform(0.5, 0.9))
+    eaves, rise = 0.45, depth / 2 * rng.uniform(0.5, 0.9)
     roof = np.array([(-width / 2 - eaves, height - 0.15), (width / 2 + eaves, height - 0.15)])
     x = np.array([roof[0, 0], roof[1, 0], roof[1, 0], roof[0, 0], roof[0, 0], roof[1, 0]])
     y = np.array(
@@ -427,6 +419,6 @@ def _add_pitched_roof(
     builder.add(BUILDING, np.column_stack([x, y, z]), faces)
     builder.boxes(
         BUILDING,
-        (width * float(rng.uniform(-0.35, 0.35)), depth * 0.15, height),
+        (width * rng.uniform(-0.35, 0.35), depth * 0.15, height),
         (0.7, 0.7, rise + 0.6),
     )

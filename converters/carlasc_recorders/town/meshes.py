@@ -1,4 +1,4 @@
-"""Triangle meshes with a class per triangle, simple solids to build the town from, and ray casting."""
+"""Triangle meshes with a class per triangle, solids to build the town from, and ray casting."""
 
 from __future__ import annotations
 
@@ -52,20 +52,11 @@ class MeshBuilder:
     """Collects buildings in one mesh."""
 
     def __init__(self) -> None:
-        self._vertices: list[Vertices] = []
-        self._faces: list[Faces] = []
-        self._labels: list[NDArray[np.uint8]] = []
-        self._count = 0
+        self._parts = list[Mesh]()
 
     def build(self) -> Mesh:
         """Return the mesh of all added parts."""
-        if not self._faces:
-            return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.uint8))
-        return Mesh(
-            np.concatenate(self._vertices),
-            np.concatenate(self._faces),
-            np.concatenate(self._labels),
-        )
+        return concatenate(self._parts)
 
     def add(self, label: int, vertices: ArrayLike, faces: ArrayLike) -> None:
         """Add triangles of one class.
@@ -76,19 +67,13 @@ class MeshBuilder:
             faces: (F, 3) rows of `vertices`.
         """
         corners, rows = np.asarray(vertices, np.float64), np.asarray(faces, np.int32)
-        self._vertices.append(corners)
-        self._faces.append(rows + np.int32(self._count))
-        self._labels.append(np.full(len(rows), label, np.uint8))
-        self._count += len(corners)
+        self._parts.append(Mesh(corners, rows, np.full(len(rows), label, np.uint8)))
 
     def add_mesh(self, mesh: Mesh, dst_T_src: Transform) -> None:
         """Add a mesh with its classes, transformed from its frame `src` to the frame `dst` of the
         builder.
         """
-        self._vertices.append(transform_points(dst_T_src, mesh.vertices))
-        self._faces.append(mesh.faces + np.int32(self._count))
-        self._labels.append(mesh.labels)
-        self._count += len(mesh.vertices)
+        self._parts.append(mesh.transformed(dst_T_src))
 
     def boxes(self, label: int, base: ArrayLike, size: ArrayLike, yaw_rad: ArrayLike = 0.0) -> None:
         """Add upright boxes.
@@ -99,10 +84,7 @@ class MeshBuilder:
             size: (3,) or (N, 3) lengths along x, y and z of each box, metres.
             yaw_rad: () or (N,) rotations about z.
         """
-        base, size = (
-            np.atleast_2d(np.asarray(base, np.float64)),
-            np.atleast_2d(np.asarray(size, np.float64)),
-        )
+        base, size = np.array(base, np.float64, ndmin=2), np.array(size, np.float64, ndmin=2)
         count = max(len(base), len(size))
         corners, faces = _unit_box()
         local = corners * np.broadcast_to(size, (count, 3))[:, None, :]
@@ -124,10 +106,7 @@ class MeshBuilder:
             size: (2,) or (N, 2) lengths along x and y of each rectangle, metres.
             yaw_rad: rotation about z.
         """
-        centre, size = (
-            np.atleast_2d(np.asarray(centre, np.float64)),
-            np.atleast_2d(np.asarray(size, np.float64)),
-        )
+        centre, size = np.array(centre, np.float64, ndmin=2), np.array(size, np.float64, ndmin=2)
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
         local = corners * at_height(np.broadcast_to(size, (len(centre), 2)), 1.0)[:, None, :]
         moved = _rotate_z(local, np.full(len(centre), yaw_rad)) + centre[:, None, :]
@@ -222,13 +201,12 @@ class MeshBuilder:
 
 def concatenate(meshes: list[Mesh]) -> Mesh:
     """Return the mesh of all triangles of several meshes of one frame."""
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    faces = [
-        mesh.faces + np.int32(offset) for mesh, offset in zip(meshes, offsets[:-1], strict=True)
-    ]
+    if not meshes:
+        return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.uint8))
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)], dtype=np.int32)
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate(faces),
+        np.concatenate([mesh.faces + row for mesh, row in zip(meshes, first, strict=False)]),
         np.concatenate([mesh.labels for mesh in meshes]),
     )
 
@@ -335,9 +313,11 @@ class RayScene:
         """
         start = np.broadcast_to((origin - self._centre).astype(np.float32), directions.shape)
         limits = np.full(len(directions), range_m, np.float32)
-        found = self._scene.run(np.ascontiguousarray(start), directions.astype(np.float32), limits)
-        rays = np.flatnonzero(found >= 0)
-        triangles = found[rays]
+        first_hits = self._scene.run(
+            np.ascontiguousarray(start), directions.astype(np.float32), limits
+        )
+        rays = np.flatnonzero(first_hits >= 0)
+        triangles = first_hits[rays]
         x, y, z = (self._normals[triangles, axis] for axis in range(3))
         # Embree returns the triangle only. The distance to its plane is computed here in double
         # precision.

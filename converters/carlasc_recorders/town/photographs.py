@@ -39,16 +39,12 @@ CAMERA_YAWS_DEG = MappingProxyType(
 IMAGE_SIZE = (800, 450)
 """Numbers of columns and rows of the images."""
 
-_FIELD_DEG, _AHEAD_M, _BELOW_M = (
-    70.0,
-    0.4,
-    0.15,
-    # horizontal field of view; position of a camera relative to the ego sensor: ahead in its
-    # viewing direction, and below
-)
+# horizontal field of view; position of a camera relative to the ego sensor: ahead in its viewing
+# direction, and below
+_FIELD_DEG, _AHEAD_M, _BELOW_M = 70.0, 0.4, 0.15
 _RANGE_M, _DEPTH_STEP = 255.0, 256.0
 _SKY, _SKY_LABEL = (196, 216, 235), 13
-_SUN = np.array([0.35, -0.45, 0.82])
+_SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
 PHOTO_SUFFIXES = MappingProxyType(
     {"images": "jpg", "image_labels": "png", "image_instances": "png", "image_depths": "png"}
 )
@@ -81,12 +77,14 @@ def _camera(name: str) -> CameraModel:
     )
 
 
-def photo_fields(cameras: Iterable[CameraModel]) -> tuple[str, ...]:
-    """Return the fields of the layout for the images of cameras."""
+def photo_fields(
+    cameras: Iterable[CameraModel], folders: Iterable[str] = tuple(PHOTO_SUFFIXES)
+) -> tuple[str, ...]:
+    """Return the fields of the layout for the images of cameras, one in each folder."""
     return tuple(
-        f"{folder}.{camera.name}.{suffix}"
+        f"{folder}.{camera.name}.{PHOTO_SUFFIXES[folder]}"
         for camera in cameras
-        for folder, suffix in PHOTO_SUFFIXES.items()
+        for folder in folders
     )
 
 
@@ -106,19 +104,16 @@ def photograph(
     others = snapshot.instances != EGO_ID
     mesh, instances = snapshot.mesh.select(others), snapshot.instances[others]
     scene = RayScene(mesh, snapshot.world_T_ego[:3, 3])
-    found: dict[str, NDArray[np.uint8]] = {}
+    files: dict[str, NDArray[np.uint8]] = {}
     for camera in cameras:
         world_T_camera = world_T_sensor @ camera.sensor_T_camera
         rows, columns = np.mgrid[: camera.height, : camera.width].reshape(2, -1)
         looks = camera.unproject(np.stack([columns, rows], axis=1))
         rays = rotate_exactly(world_T_camera, looks)
         hit, triangles, distances = scene.cast(world_T_camera[:3, 3], rays, _RANGE_M)
-        normals = scene.normals(triangles)
-        normals *= -np.sign(np.einsum("ri,ri->r", normals, rays[hit]))[:, None]
-        light = 0.55 + 0.45 * np.clip(normals @ (_SUN / np.linalg.norm(_SUN)), 0, 1)
         shape, labels = (camera.height, camera.width), mesh.labels[triangles]
         color = np.tile(np.array(_SKY, np.uint8), (len(rays), 1))
-        color[hit] = CARLA.palette[labels] * light[:, None]
+        color[hit] = shaded_colors(scene, triangles, labels, rays[hit])
         classes, actors, depths = (
             np.full(len(rays), _SKY_LABEL, np.uint8),
             *np.zeros((2, len(rays)), np.uint16),
@@ -133,7 +128,27 @@ def photograph(
         )
         for (folder, suffix), pixels in zip(PHOTO_SUFFIXES.items(), layers, strict=True):
             image = pixels if folder == "images" else pixels.reshape(shape)
-            found[f"{folder}.{camera.name}.{suffix}"] = encode_image(
+            files[f"{folder}.{camera.name}.{suffix}"] = encode_image(
                 image, "JPEG" if suffix == "jpg" else "PNG"
             )
-    return found
+    return files
+
+
+def shaded_colors(
+    scene: RayScene,
+    triangles: NDArray[np.integer],
+    labels: NDArray[np.uint8],
+    rays: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return (H, 3) colours of the classes of triangles in the light of the sun, 0 to 255.
+
+    Args:
+        scene: the scene of the triangles.
+        triangles: (H,) the triangle that each ray hits.
+        labels: (H,) its class.
+        rays: (H, 3) directions of the rays.
+    """
+    normals = scene.normals(triangles)
+    normals *= -np.sign(np.einsum("ri,ri->r", normals, rays))[:, None]  # towards the camera
+    light = 0.55 + 0.45 * np.clip(normals @ (_SUN / np.linalg.norm(_SUN)), 0, 1)
+    return CARLA.palette[labels] * light[:, None]

@@ -45,20 +45,20 @@ class PlantCatalogue:
         return self._pick(self._bushes)
 
     def _pick(self, kinds: list[Mesh]) -> Mesh:
-        plant = kinds[int(self._rng.integers(len(kinds)))]
-        scale = float(self._rng.uniform(0.85, 1.15))
-        rotated = plant.transformed(rotation_z(float(self._rng.uniform(-np.pi, np.pi))))
+        plant = kinds[self._rng.integers(len(kinds))]
+        scale = self._rng.uniform(0.85, 1.15)
+        rotated = plant.transformed(rotation_z(self._rng.uniform(-np.pi, np.pi)))
         return Mesh(rotated.vertices * scale, rotated.faces, rotated.labels)
 
 
 def broadleaf(rng: np.random.Generator) -> Mesh:
     """Return a tree, 5 to 10 m high, whose crown consists of several ellipsoids."""
     builder = MeshBuilder()
-    height = float(rng.uniform(5.0, 10.0))
-    clear, radius = height * float(rng.uniform(0.28, 0.4)), height * float(rng.uniform(0.2, 0.3))
-    trunk = float(rng.uniform(0.1, 0.22))
+    height = rng.uniform(5.0, 10.0)
+    clear, radius = height * rng.uniform(0.28, 0.4), height * rng.uniform(0.2, 0.3)
+    trunk = rng.uniform(0.1, 0.22)
     builder.cylinder(VEGETATION, (0, 0, -0.3), trunk, height * 0.6 + 0.3, 8, top=0.6)
-    for _ in range(int(rng.integers(4, 8))):
+    for _ in range(rng.integers(4, 8)):
         angle = rng.uniform(0, 2 * np.pi)
         reach = radius * rng.uniform(0.2, 0.75)
         crown = np.array(
@@ -86,7 +86,7 @@ def broadleaf(rng: np.random.Generator) -> Mesh:
 def conifer(rng: np.random.Generator) -> Mesh:
     """Return a tree, 6 to 12 m high, that narrows towards its top."""
     builder = MeshBuilder()
-    height, radius = float(rng.uniform(6.0, 12.0)), float(rng.uniform(1.2, 2.0))
+    height, radius = rng.uniform(6.0, 12.0), rng.uniform(1.2, 2.0)
     builder.cylinder(VEGETATION, (0, 0, -0.3), 0.16, height * 0.9, 7, top=0.4)
     for level in np.linspace(1.0, height - 0.6, int(height / 0.7)):
         reach = radius * (1.05 - level / height)
@@ -108,7 +108,7 @@ def bush(rng: np.random.Generator) -> Mesh:
 def hedge(rng: np.random.Generator, length_m: float) -> Mesh:
     """Return a hedge along x, about 1.2 m high, with its middle at the origin."""
     builder = MeshBuilder()
-    height = float(rng.uniform(0.9, 1.4))
+    height = rng.uniform(0.9, 1.4)
     builder.boxes(VEGETATION, (0, 0, -0.3), (length_m, 0.45, height + 0.2))
     count = int(length_m * 22)
     positions = rng.uniform((-length_m / 2, -0.32, 0.1), (length_m / 2, 0.32, height), (count, 3))

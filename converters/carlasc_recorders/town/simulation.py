@@ -14,16 +14,18 @@ from carlasc.captures.settings import BEV_HEIGHT_M, BEV_QUALITY, BEV_SIZE, Lidar
 from carlasc.captures.simulation import Simulator
 from carlasc.core.cameras import CameraModel
 from carlasc.core.geometry import Transform, rotate_vectors
-from carlasc.core.tables import CARLA
 from carlasc.errors import import_extra
 from carlasc_recorders.town.drive import Snapshot, TownDrive
-from carlasc_recorders.town.photographs import photo_fields, photograph, roof_cameras
-
-_SUN = np.array([0.35, -0.45, 0.82])  # direction towards the sun
-_BACKGROUND = (255, 255, 255)
-_REDUCTION = (
-    2  # rays are cast for every second row and column of pixels; the picture is enlarged afterwards
+from carlasc_recorders.town.photographs import (
+    photo_fields,
+    photograph,
+    roof_cameras,
+    shaded_colors,
 )
+
+_BACKGROUND = (255, 255, 255)
+# rays are cast for every second row and column of pixels; the picture is enlarged afterwards
+_REDUCTION = 2
 
 
 def render_birdseye(snapshot: Snapshot) -> bytes:
@@ -33,41 +35,18 @@ def render_birdseye(snapshot: Snapshot) -> bytes:
     Raises:
         DependencyError: a package of the extra `simulate` is missing.
     """
-    pixels = _render(snapshot, snapshot.world_T_ego, (0.0, 0.0, BEV_HEIGHT_M), _downward_rays())
     image = import_extra("PIL.Image", "simulate")
-    picture = image.fromarray(pixels).resize(BEV_SIZE, image.Resampling.BICUBIC)
-    buffer = io.BytesIO()
-    picture.save(buffer, "JPEG", quality=BEV_QUALITY)
-    return buffer.getvalue()
-
-
-def _render(
-    snapshot: Snapshot,
-    world_T_view: Transform,
-    origin: tuple[float, float, float],
-    directions: NDArray[np.float64],
-) -> NDArray[np.uint8]:
-    """Return a picture of the surfaces that rays hit.
-
-    Args:
-        snapshot: the town.
-        world_T_view: (4, 4) from the frame of `origin` and `directions` to the world frame.
-        origin: (3,) start of the rays, metres.
-        directions: (H, W, 3) unit vectors, one per pixel.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
-    """
-    height, width, _ = directions.shape
-    rays = rotate_vectors(world_T_view, directions.reshape(-1, 3))
-    eye = world_T_view[:3, :3] @ np.array(origin) + world_T_view[:3, 3]
+    directions, world_T_ego = _downward_rays(), snapshot.world_T_ego
+    rays = rotate_vectors(world_T_ego, directions.reshape(-1, 3))
+    eye = world_T_ego[:3, :3] @ np.array((0.0, 0.0, BEV_HEIGHT_M)) + world_T_ego[:3, 3]
     hit, triangles, _ = snapshot.scene.cast(eye, rays, 1000.0)
-    normals = snapshot.scene.normals(triangles)
-    normals *= -np.sign(np.einsum("ri,ri->r", normals, rays[hit]))[:, None]  # towards the camera
-    light = 0.55 + 0.45 * np.clip(normals @ (_SUN / np.linalg.norm(_SUN)), 0, 1)
-    pixels = np.full((height * width, 3), _BACKGROUND, np.uint8)
-    pixels[hit] = CARLA.palette[snapshot.mesh.labels[triangles]] * light[:, None]
-    return pixels.reshape(height, width, 3)
+    pixels = np.full(rays.shape, _BACKGROUND, np.uint8)
+    labels = snapshot.mesh.labels[triangles]
+    pixels[hit] = shaded_colors(snapshot.scene, triangles, labels, rays[hit])
+    picture = image.fromarray(pixels.reshape(directions.shape))
+    buffer = io.BytesIO()
+    picture.resize(BEV_SIZE, image.Resampling.BICUBIC).save(buffer, "JPEG", quality=BEV_QUALITY)
+    return buffer.getvalue()
 
 
 def _downward_rays() -> NDArray[np.float64]:

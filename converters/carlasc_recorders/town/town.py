@@ -72,14 +72,11 @@ def paint_markings(plan: TownPlan, streets: Streets) -> None:
                     _paint_line(plan, side, 0.0, 0.0, side.length_m, dashed=True)
             _paint_line(plan, side, HALF_ROAD_M - 0.25, 0.0, side.length_m, dashed=side.has_bay)
             zebra = np.arange(0.4, HALF_ROAD_M, 0.9)
-            bars = np.array([side.point(-2.0 - 0.5, offset) for offset in zebra])
-            plan.builder.level_rectangles(
-                ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad
-            )
-            bars = np.array([side.point(side.length_m + 2.0 + 0.5, offset) for offset in zebra])
-            plan.builder.level_rectangles(
-                ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad
-            )
+            for along in (-2.0 - 0.5, side.length_m + 2.0 + 0.5):
+                bars = np.array([side.point(along, offset) for offset in zebra])
+                plan.builder.level_rectangles(
+                    ROAD_LINE, at_height(bars, PAINT_M), (2.4, 0.45), side.yaw_rad
+                )
             stop = side.point(side.length_m + 0.25, HALF_ROAD_M / 2)
             plan.builder.level_rectangles(
                 ROAD_LINE, (*stop, PAINT_M), (0.4, HALF_ROAD_M - 0.3), side.yaw_rad
@@ -157,22 +154,22 @@ def _add_row_of_buildings(plan: TownPlan, side: Side, land: Land, downtown: bool
     """Add buildings along a street: without gaps downtown, with front gardens elsewhere."""
     rng, along = plan.rng, -6.0
     while along < side.length_m + 6:
-        width = float(rng.uniform(12, 22) if downtown else rng.uniform(8, 13))
-        depth = float(rng.uniform(10, 15) if downtown else rng.uniform(8, 11))
-        back = float(rng.uniform(0.9, 1.6) if downtown else rng.uniform(3.0, 6.5))
+        width = rng.uniform(*((12, 22) if downtown else (8, 13)))
+        depth = rng.uniform(*((10, 15) if downtown else (8, 11)))
+        back = rng.uniform(*((0.9, 1.6) if downtown else (3.0, 6.5)))
         bay = side.kerb_offset(min(max(along + width / 2, 0), side.length_m)) - HALF_ROAD_M
         middle = side.point(
             along + width / 2, INNER_M + max(bay, BAY_M * side.has_bay) + back + depth / 2
         )
         footprint = Rectangle(middle, (width, depth), side.yaw_rad)
         if land.reserve(footprint, margin_m=0.0 if downtown else 2.0, edge_m=0.6):
-            height = float(rng.uniform(8, 24) if downtown else rng.uniform(3.2, 7.0))
+            height = rng.uniform(*((8, 24) if downtown else (3.2, 7.0)))
             add_building(plan, footprint, height, pitched=not downtown)
             if not downtown:
                 _add_front_garden(plan, side, land, along, width, back)
-            along += width + float(rng.uniform(0.0, 0.4) if downtown else rng.uniform(3.0, 7.0))
+            along += width + rng.uniform(*((0.0, 0.4) if downtown else (3.0, 7.0)))
             if downtown and rng.random() < 0.2:
-                along += float(rng.uniform(4, 8))  # an alley between two buildings
+                along += rng.uniform(4, 8)  # an alley between two buildings
         else:
             along += 2.0
 
@@ -190,9 +187,9 @@ def _add_front_garden(
     style = rng.random()
     if style < 0.8 and land.reserve(piece, 0.0):
         if style < 0.35:
-            plan.add(furniture.fence(width, float(rng.uniform(1.0, 1.5))), edge, side.yaw_rad)
+            plan.add(furniture.fence(width, rng.uniform(1.0, 1.5)), edge, side.yaw_rad)
         elif style < 0.55:
-            plan.add(furniture.wall(width, float(rng.uniform(0.7, 1.3))), edge, side.yaw_rad)
+            plan.add(furniture.wall(width, rng.uniform(0.7, 1.3)), edge, side.yaw_rad)
         else:
             plan.add(hedge(rng, width), edge, side.yaw_rad)
     drive = side.point(along + width + 1.8, INNER_M + bay + 3.2)
@@ -204,15 +201,15 @@ def _add_front_garden(
         plan.parking.append(pose)
     for _ in range(2):
         position = side.point(
-            along + float(rng.uniform(0, width)),
-            INNER_M + bay + float(rng.uniform(1.2, max(back - 0.5, 1.5))),
+            along + rng.uniform(0, width),
+            INNER_M + bay + rng.uniform(1.2, max(back - 0.5, 1.5)),
         )
         if land.reserve(Rectangle(position, (1.2, 1.2), 0.0), 0.0):
             plan.add(plan.plants.bush(), position, 0.0)
 
 
 def _add_yard(plan: TownPlan, block: CityBlock, land: Land, attempts: int) -> None:
-    """Add trees, fences, walls, bushes and trash behind the buildings, each where the land is free."""
+    """Add trees, fences, walls, bushes and trash behind the buildings where the land is free."""
     rng = plan.rng
     span = np.ptp(land.boundary, axis=0)
     low = land.boundary.min(axis=0)
@@ -223,8 +220,8 @@ def _add_yard(plan: TownPlan, block: CityBlock, land: Land, attempts: int) -> No
             if land.reserve(Rectangle(position, (2.4, 2.4), 0.0), 0.5, 1.5):
                 plan.add(plan.plants.tree(), position, 0.0)
         elif number < 0.75:
-            yaw = block.sides[int(rng.integers(len(block.sides)))].yaw_rad
-            length = float(rng.uniform(6, 12))
+            yaw = block.sides[rng.integers(len(block.sides))].yaw_rad
+            length = rng.uniform(6, 12)
             if land.reserve(Rectangle(position, (length, 0.4), yaw), 0.2, 0.5):
                 plan.add(
                     furniture.fence(length, 1.7)
@@ -245,7 +242,7 @@ def _add_park(plan: TownPlan, block: CityBlock, land: Land) -> None:
     along another.
     """
     rng, centre = plan.rng, land.boundary.mean(axis=0)
-    radius = float(rng.uniform(5, 8))
+    radius = rng.uniform(5, 8)
     land.occupied.append(Rectangle(centre, (2 * radius + 2, 2 * radius + 2), 0.0))
     angles = np.linspace(0, 2 * np.pi, 25)
     rim = centre + radius * (1 + 0.15 * np.sin(3 * angles + 1))[:, None] * np.column_stack(
@@ -292,12 +289,10 @@ def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
     building.
     """
     rng, centre = plan.rng, land.boundary.mean(axis=0)
-    side = block.sides[int(rng.integers(len(block.sides)))]
-    footprint = Rectangle(
-        centre + side.normal * 6, (float(rng.uniform(18, 26)), 13.0), side.yaw_rad
-    )
+    side = block.sides[rng.integers(len(block.sides))]
+    footprint = Rectangle(centre + side.normal * 6, (rng.uniform(18, 26), 13.0), side.yaw_rad)
     if land.reserve(footprint, edge_m=3.0):
-        add_building(plan, footprint, float(rng.uniform(7, 14)), pitched=False)
+        add_building(plan, footprint, rng.uniform(7, 14), pitched=False)
     for edge in block.sides:
         offset = INNER_M + BAY_M * edge.has_bay
         for at in np.arange(2.0, edge.length_m, 3.0):
@@ -325,7 +320,7 @@ def _add_square(plan: TownPlan, block: CityBlock, land: Land) -> None:
     for index in range(60):
         position = low + rng.uniform(0, 1, 2) * span
         if land.reserve(Rectangle(position, (3.2, 3.2), 0.0), 0.3, 1.0):
-            plan.add(makers[index % len(makers)](), position, float(rng.uniform(0, 6)))
+            plan.add(makers[index % len(makers)](), position, rng.uniform(0, 6))
 
 
 @dataclass(frozen=True)
@@ -379,7 +374,7 @@ def fill_outskirts(plan: TownPlan, block: CityBlock) -> None:
         current = at_height(close_loop(points), close_loop(heights[:, None])[:, 0])
         plan.builder.ribbon(TERRAIN, previous, current)
         previous = current
-    railway = int(rng.integers(len(block.sides)))
+    railway = rng.integers(len(block.sides))
     for number, side in enumerate(block.sides):
         add_street_furniture(plan, side, trees=True)
         middle = side.length_m / 2
@@ -416,15 +411,13 @@ def fill_outskirts(plan: TownPlan, block: CityBlock) -> None:
         )
         if rng.random() < 0.6:
             footprint = Rectangle(
-                side.point(middle, INNER_M + 24), (float(rng.uniform(14, 24)), 12.0), side.yaw_rad
+                side.point(middle, INNER_M + 24), (rng.uniform(14, 24), 12.0), side.yaw_rad
             )
             if land.reserve(footprint):
                 add_building(
-                    plan, footprint, float(rng.uniform(6, 14)), pitched=False, base_m=KERB_M + 0.6
+                    plan, footprint, rng.uniform(6, 14), pitched=False, base_m=KERB_M + 0.6
                 )
         for _ in range(22):
-            position = side.point(
-                float(rng.uniform(2, side.length_m - 2)), INNER_M + float(rng.uniform(13, 40))
-            )
+            position = side.point(rng.uniform(2, side.length_m - 2), INNER_M + rng.uniform(13, 40))
             if land.reserve(Rectangle(position, (3.0, 3.0), 0.0), 0.3):
                 plan.add(plan.plants.tree(), position, 0.0, KERB_M + 0.8)

@@ -348,13 +348,11 @@ def place_vehicles(
     vehicles: list[Vehicle] = []
     for length in lengths_m:
         turns = rng.random(997)
-        cruise = float(rng.uniform(6.0, 12.0))
+        cruise = rng.uniform(6.0, 12.0)
         for _ in range(1000):
-            lane = ego_lane if not vehicles else lanes[int(rng.integers(len(lanes)))]
+            lane = ego_lane if not vehicles else lanes[rng.integers(len(lanes))]
             room = streets.lanes[lane].length_m
-            along = (
-                ego_along_m if not vehicles else float(rng.uniform(length, room - length / 2 - 1))
-            )
+            along = ego_along_m if not vehicles else rng.uniform(length, room - length / 2 - 1)
             apart = all(
                 abs(along - other) > (length + size) / 2 + 8.0
                 for other, size in occupied.get(lane, [])

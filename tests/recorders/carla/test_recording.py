@@ -19,10 +19,10 @@ pytest.importorskip(
 import carla
 from carlasc_recorders import ServerError
 from carlasc_recorders.carla.sensors import ActorNumbers
-from carlasc_recorders.carla.server import DETECTION, Server, ServerOptions, decode_sweep
+from carlasc_recorders.carla.server import DETECTION, Server, decode_sweep
 from helpers.servers.carla_server import PEDESTRIAN, SPEED_M_S, TAGS, FakeServer
 
-from carlasc.captures import Capture, Lidar, record
+from carlasc.captures import Capture, Lidar, ServerOptions, record
 from carlasc.captures.settings import sensor_offsets
 from carlasc.cli import app
 from carlasc.core.geometry import transform_points
