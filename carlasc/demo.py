@@ -170,7 +170,8 @@ def _check_packages() -> None:
         for module in _MODULES:
             import_extra(module, "demo")
     except DependencyError as error:
-        raise DependencyError(f"{error} (about {_EXTRA_MB} MB)") from error
+        error.advice += f" (about {_EXTRA_MB} MB)"
+        raise
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.captures import make_recording, write_capture
+from helpers.errors import raises
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -81,10 +82,10 @@ def test_the_last_line_of_a_frame_in_a_times_file_is_valid(tmp_path):
     with (tmp_path / "raw/times0.txt").open("a") as file:
         file.write("100, Timestamp(frame=100,elapsed_seconds=77.5)\n")
     assert Capture(tmp_path).read_time(100) == 77.5
-    with pytest.raises(MissingDataError, match=r"times0.txt: expected a line for frame 4"):
+    with raises(MissingDataError, where="times0.txt", expected="a line for frame 4"):
         Capture(tmp_path).read_time(4)
     (tmp_path / "raw/times0.txt").write_text("100 10.0\n")
-    with pytest.raises(FormatError, match=r"times0.txt: expected .* found '100 10.0' in line 1"):
+    with raises(FormatError, where="times0.txt", found="'100 10.0' in line 1"):
         Capture(tmp_path).read_time(100)
 
 
@@ -124,25 +125,27 @@ def test_captures_are_found_with_their_paths(tmp_path):
     assert list(find_captures(tmp_path / "Val")) == ["Town07_Heavy"]
     assert list(find_captures(tmp_path / "Val/Town07_Heavy")) == [""]
     assert list(find_captures(tmp_path / "Val/Town07_Heavy/raw")) == [""]
-    with pytest.raises(MissingDataError, match="expected a capture .*found none"):
+    with raises(MissingDataError, expected="a capture ", found="none"):
         find_captures(tmp_path / "Val/Town07_Heavy/raw/bev")
 
 
 def test_a_missing_folder_sensor_or_frame_is_named(tmp_path):
-    with pytest.raises(MissingDataError, match="nowhere: expected a folder, found nothing"):
+    with raises(MissingDataError, where="nowhere", expected="a folder", found="nothing"):
         Capture(tmp_path / "nowhere")
     (tmp_path / "raw").mkdir()
-    with pytest.raises(
+    with raises(
         MissingDataError,
-        match="raw: expected the folder velodyne0 of the ego sensor, found no sensor",
+        where="raw",
+        expected="the folder velodyne0 of the ego sensor",
+        found="no sensor",
     ):
         _ = Capture(tmp_path).sensors
     (tmp_path / "raw/velodyne2").mkdir()
-    with pytest.raises(MissingDataError, match=r"found only the sensors \[2\]"):
+    with raises(MissingDataError, found=r"only the sensors \[2\]"):
         _ = Capture(tmp_path).sensors
     (tmp_path / "raw/velodyne0").mkdir()
-    with pytest.raises(
-        MissingDataError, match="raw: expected frames such as velodyne0/100.npy, found none"
+    with raises(
+        MissingDataError, where="raw", expected="frames such as velodyne0/100.npy", found="none"
     ):
         _ = Capture(tmp_path).frames
 
@@ -150,7 +153,7 @@ def test_a_missing_folder_sensor_or_frame_is_named(tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     capture = write_capture(tmp_path, frames=1)
     _npy(capture, "labels1").unlink()
-    with pytest.raises(MissingDataError, match=r"labels1/100.npy: expected a file, found nothing"):
+    with raises(MissingDataError, where="labels1/100.npy", expected="a file", found="nothing"):
         capture.read(1, 100)
 
 
@@ -161,91 +164,98 @@ def test_a_sensor_without_points_is_listed_all_the_same(tmp_path):
     assert Capture(tmp_path).sensors == (0, 1)
 
 
-INVALID = {  # folder -> (array that is written over it, what the error says)
-    "wrong type": ("velodyne0", np.zeros((300, 3)), "expected float32 values, found float64"),
+INVALID = {  # folder -> (array that is written over it, what is expected and found)
+    "wrong type": ("velodyne0", np.zeros((300, 3)), "float32 values", "float64"),
     "wrong shape": (
         "velodyne0",
         np.zeros((300, 4), np.float32),
-        "expected an array of N x 3 values, found 300 x 4",
+        "an array of N x 3 values",
+        "300 x 4",
     ),
     "too flat": (
         "velodyne0",
         np.zeros(900, np.float32),
-        "expected an array of N x 3 values, found 900",
+        "an array of N x 3 values",
+        "900",
     ),
     "NaN": (
         "velodyne0",
         np.full((300, 3), np.nan, np.float32),
-        "expected finite coordinates, found .*nan.* at point 0",
+        "finite coordinates",
+        ".*nan.* at point 0",
     ),
     "infinite": (
         "velodyne0",
         np.full((300, 3), np.inf, np.float32),
-        "expected finite coordinates, found .*inf.*",
+        "finite coordinates",
+        ".*inf.*",
     ),
     "beyond the table": (
         "labels0",
         np.full(300, 25, np.uint32),
-        "expected class ids 0..24 .*, found 25 in 300 of 300",
+        "class ids 0..24 .*",
+        "25 in 300 of 300",
     ),
     "short labels": (
         "labels0",
         np.zeros(299, np.uint32),
-        "expected 300 values, one per point .*, found 299",
+        "300 values, one per point .*",
+        "299",
     ),
     "long instances": (
         "instances0",
         np.zeros(301, np.uint32),
-        "expected 300 values, one per point .*, found 301",
+        "300 values, one per point .*",
+        "301",
     ),
-    "signed labels": ("labels0", np.zeros(300, np.int32), "expected uint32 values, found int32"),
-    "NaN velocity": ("velocities0", np.full((1, 4), np.nan), "expected finite"),
-    "scaled pose": ("pose0", 2 * np.eye(4), "expected a rigid transform"),
-    "mirrored pose": ("pose0", np.diag([1.0, -1, 1, 1]), "expected a rotation, found a reflection"),
-    "NaN pose": ("pose0", np.full((4, 4), np.nan), "expected finite numbers"),
-    "three rows": ("pose0", np.eye(4)[:3], "expected an array of 4 x 4 values, found 3 x 4"),
-    "objects": ("pose0", np.array([{}], object), "expected float64 values, found object"),
+    "signed labels": ("labels0", np.zeros(300, np.int32), "uint32 values", "int32"),
+    "NaN velocity": ("velocities0", np.full((1, 4), np.nan), "finite", ""),
+    "scaled pose": ("pose0", 2 * np.eye(4), "a rigid transform", ""),
+    "mirrored pose": ("pose0", np.diag([1.0, -1, 1, 1]), "a rotation", "a reflection"),
+    "NaN pose": ("pose0", np.full((4, 4), np.nan), "finite numbers", ""),
+    "three rows": ("pose0", np.eye(4)[:3], "an array of 4 x 4 values", "3 x 4"),
+    "objects": ("pose0", np.array([{}], object), "float64 values", "object"),
 }
 
 
 @pytest.mark.parametrize("invalid", INVALID)
 def test_an_invalid_file_is_named_with_what_was_expected_and_found(tmp_path, invalid):
-    folder, array, message = INVALID[invalid]
+    folder, array, expected, found = INVALID[invalid]
     capture = write_capture(tmp_path, frames=1)
     np.save(_npy(capture, folder), array)
-    with pytest.raises(FormatError, match=f"{folder}/100.npy: {message}") as caught:
+    with raises(FormatError, where=f"{folder}/100.npy", expected=expected, found=found) as caught:
         capture.read(0, 100)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "expected", "found", "advice"),
     [
-        (
-            lambda data: data[:-5],
-            r"expected 3728 bytes \(300 x 3 float32\), found 3723: the file is cut short",
-        ),
-        (
-            lambda data: data + b"more",
-            r"expected 3728 bytes .*, found 3732: the file is cut short, or something was added",
-        ),
-        (lambda data: data[:60], "expected a .npy array, found something else"),
-        (lambda data: b"", "expected a .npy array, found something else"),
-        (lambda data: b"x" * 4000, "expected a .npy array, found something else"),
+        (lambda data: data[:-5], r"3728 bytes \(300 x 3 float32\)", "3723", "cut short"),
+        (lambda data: data + b"more", "3728 bytes", "3732", "cut short, or something was added"),
+        (lambda data: data[:60], "a .npy array", "something else", ""),
+        (lambda data: b"", "a .npy array", "something else", ""),
+        (lambda data: b"x" * 4000, "a .npy array", "something else", ""),
     ],
 )
-def test_a_file_of_another_size_is_named(tmp_path, change, message):
+def test_a_file_of_another_size_is_named(tmp_path, change, expected, found, advice):
     capture = write_capture(tmp_path, frames=1)
     path = _npy(capture, "velodyne0")
     path.write_bytes(change(path.read_bytes()))
-    with pytest.raises(FormatError, match=f"velodyne0/100.npy: {message}"):
+    with raises(
+        FormatError,
+        where="velodyne0/100.npy",
+        expected=expected,
+        found=found,
+        advice=advice,
+    ):
         capture.read(0, 100)
 
 
 def test_a_recording_without_labels_is_not_written(tmp_path):
     scan = Scan(np.zeros((1, 3), np.float32))
-    with pytest.raises(
-        FormatError, match="sensor 0, frame 5: expected a scan with labels and instances"
+    with raises(
+        FormatError, where="sensor 0, frame 5", expected="a scan with labels and instances"
     ):
         CaptureWriter(tmp_path).write(0, 5, SensorRecording(scan, np.eye(4), np.empty((0, 4))))
 
@@ -257,7 +267,7 @@ def test_a_folder_that_cannot_be_written_to_is_named(tmp_path):
         lambda w: w.write_settings("simulation.json", {}),
         lambda w: w.write_bev(1, b""),
     ):
-        with pytest.raises(StorageError, match=r"raw/.*: cannot be written"):
+        with raises(StorageError, where="raw/", problem="cannot be written"):
             write(CaptureWriter(tmp_path))
 
 
@@ -294,7 +304,7 @@ def test_times_of_each_sensor_are_its_own(tmp_path):
     writer.write(0, 1, make_recording())
     writer.write_times({1: [0.1, 0.3]})
     assert (Capture(tmp_path).read_time(1), Capture(tmp_path).read_time(1, 1)) == (0.1, 0.3)
-    with pytest.raises(MissingDataError, match=r"times2\.txt: expected a file, found nothing"):
+    with raises(MissingDataError, where=r"times2\.txt", expected="a file", found="nothing"):
         Capture(tmp_path).read_time(1, 2)
 
 
@@ -315,7 +325,7 @@ def test_times_files_are_in_the_order_of_frames_and_keep_the_lines_that_they_hav
 
 def test_a_pose_that_is_not_rigid_is_not_written(tmp_path):
     recording = make_recording()
-    with pytest.raises(FormatError, match="sensor 0, frame 5: expected a rigid transform"):
+    with raises(FormatError, where="sensor 0, frame 5", expected="a rigid transform"):
         CaptureWriter(tmp_path).write(
             0, 5, SensorRecording(recording.scan, 2 * np.eye(4), recording.velocities)
         )

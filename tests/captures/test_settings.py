@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.errors import raises
 
 from carlasc.captures import Lidar
 from carlasc.captures.settings import sensor_offsets
@@ -49,7 +50,7 @@ def test_the_default_is_the_lidar_of_the_data_set() -> None:
     ],
 )
 def test_values_out_of_range_are_refused(settings: dict[str, float], word: str) -> None:
-    with pytest.raises(ArgumentError, match=f"^{word}: expected"):
+    with raises(ArgumentError, where=f"^{word}$"):
         Lidar(**settings)  # type: ignore[arg-type]
 
 

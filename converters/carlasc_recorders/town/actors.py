@@ -75,7 +75,7 @@ def draw_walks(rng: np.random.Generator, blocks: tuple[CityBlock, ...], count: i
     walks: list[Walk] = []
     occupied: dict[tuple[int, int], list[float]] = {}
     while len(walks) < count:
-        number, direction = rng.integers(len(blocks)), rng.integers(3)
+        number, direction = int(rng.integers(len(blocks))), int(rng.integers(3))
         loop = close_loop(blocks[number].outline.at(HALF_ROAD_M + _OFFSETS_M[direction]))
         length = float(np.linalg.norm(np.diff(loop, axis=0), axis=1).sum())
         start = rng.uniform(0, length)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.errors import raises
 from typer.testing import CliRunner
 
 pytest.importorskip(
@@ -194,9 +195,11 @@ def test_a_measurement_of_another_tick_is_skipped_or_refused():
         for tick in (4, 5, 7):
             arrived.put(SimpleNamespace(frame=tick))
         assert server.measurement(arrived, 5, "LiDAR 0").frame == 5
-        with pytest.raises(
+        with raises(
             ServerError,
-            match="expected tick 6 of LiDAR 0, found tick 7: check that no other client",
+            expected="tick 6 of LiDAR 0",
+            found="tick 7",
+            advice="check that no other client",
         ):
             server.measurement(arrived, 6, "LiDAR 0")
 
@@ -240,7 +243,7 @@ def test_the_server_is_cleaned_up_after_any_error(tmp_path, error, what, after):
 def test_a_failed_clean_up_is_reported(tmp_path):
     server = FakeServer()
     server.cannot_destroy = True
-    with pytest.raises(ServerError, match="could not be cleaned up"):
+    with raises(ServerError, problem="could not be cleaned up"):
         call(tmp_path, server)
     # the others were destroyed all the same
     assert set(server.left_behind) <= {
@@ -278,7 +281,7 @@ def test_a_replay_that_departs_from_the_drive_is_refused(tmp_path):
     call(tmp_path, FakeServer(), count=2)
     server = FakeServer()
     server.drift = 0.5
-    with pytest.raises(ConflictError, match="frame 0: expected a replay that follows"):
+    with raises(ConflictError, where="frame 0", expected="a replay that follows"):
         call(tmp_path, server, count=4)
     assert Capture(tmp_path).frames.tolist() == [0, 1]
     assert_cleaned_up(server)
@@ -293,7 +296,7 @@ def test_a_replay_follows_within_two_centimetres(tmp_path, drift_m, follows):
     if follows:
         assert call(tmp_path, server, count=2).written == 1
     else:
-        with pytest.raises(ConflictError, match=f"found the ego sensor {drift_m:.2f} m away"):
+        with raises(ConflictError, found=f"the ego sensor {drift_m:.2f} m away"):
             call(tmp_path, server, count=2)
 
 
@@ -391,19 +394,19 @@ def test_without_pillow_nothing_is_written(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("PIL.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(DependencyError, match=r"pip install .*\[carla\]'"):
+    with raises(DependencyError, advice=r"pip install .*\[carla\]'"):
         call(tmp_path / "out", FakeServer(), bev=True)
     assert not (tmp_path / "out").exists()
 
 
 def test_other_settings_are_refused(tmp_path):
     call(tmp_path, FakeServer(), count=1)
-    with pytest.raises(ConflictError, match="seed"):
+    with raises(ConflictError, expected="seed"):
         call(tmp_path, FakeServer(), count=1, seed=1)
-    with pytest.raises(ConflictError, match="server_version"):
+    with raises(ConflictError, expected="server_version"):
         call(tmp_path, FakeServer("0.9.15"), count=1)
     (tmp_path / "else" / "raw" / "velodyne0").mkdir(parents=True)
-    with pytest.raises(ConflictError, match=r"recording\.json"):
+    with raises(ConflictError, found=r"recording\.json"):
         call(tmp_path / "else", FakeServer())
 
 
@@ -414,20 +417,20 @@ def test_a_town_without_room_has_fewer_vehicles_but_the_ego_vehicle(tmp_path):
     assert result.vehicles == 2
     server = FakeServer()
     server.places = 0
-    with pytest.raises(CarlascError, match="spawn point"):
+    with raises(CarlascError, expected="spawn point"):
         call(tmp_path / "none", server)
 
 
 def test_a_sensor_without_measurements_is_named(tmp_path):
     server = FakeServer()
     server.silent = True
-    with pytest.raises(ServerError, match="expected a measurement of LiDAR 0 within"):
+    with raises(ServerError, expected="a measurement of LiDAR 0 within"):
         call(tmp_path, server, timeout_s=0.2)
     assert_cleaned_up(server)
 
 
 def test_the_error_of_an_unknown_town_lists_the_towns(tmp_path):
-    with pytest.raises(ArgumentError, match="Town01, Town10HD_Opt"):
+    with raises(ArgumentError, expected="Town01, Town10HD_Opt"):
         call(tmp_path / "a", FakeServer(), town="Town99")
     assert not (tmp_path / "a").exists()
 
@@ -459,7 +462,7 @@ def test_bytes_and_poses_of_the_official_package_are_decoded():
         atol=1e-4,
     )
     measurement.raw_data = b"abc"
-    with pytest.raises(CarlascError, match="24 bytes"):
+    with raises(CarlascError, expected="24 bytes"):
         decode_sweep(measurement)
 
 

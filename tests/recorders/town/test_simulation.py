@@ -21,6 +21,7 @@ from carlasc_recorders.town.drive import Snapshot
 from carlasc_recorders.town.meshes import MeshBuilder, RayScene
 from carlasc_recorders.town.simulation import render_birdseye
 from helpers.datasets.captures import read_tree
+from helpers.errors import raises
 from typer.testing import CliRunner
 
 import carlasc
@@ -146,31 +147,31 @@ def test_a_capture_of_other_settings_is_refused_and_left_alone(recorded: Path) -
         {"lidar": Lidar(4, 800)},
         {"bev": False},
     ):
-        with pytest.raises(ConflictError, match=str(next(iter(change)))):
+        with raises(ConflictError, expected=str(next(iter(change)))):
             simulate(recorded, **{**SMALL, **change}, run=Run(workers=1))
     assert digests(recorded) == before
 
 
 def test_a_capture_without_settings_is_refused(tmp_path: Path) -> None:
     (tmp_path / "raw" / "velodyne0").mkdir(parents=True)
-    with pytest.raises(ConflictError, match=r"simulation\.json"):
+    with raises(ConflictError, found=r"simulation\.json"):
         simulate(tmp_path, **SMALL)
 
 
 @pytest.mark.parametrize(
-    ("change", "word"),
+    ("change", "expected"),
     [
-        ({"count": 0}, "count"),
-        ({"sensors": 0}, "sensors"),
+        ({"count": 0}, "at least 1"),
+        ({"sensors": 0}, "at least 1"),
         ({"traffic": "none"}, "light, medium, heavy"),
-        ({"seed": -1}, "seed"),
-        ({"first_frame": -1}, "first_frame"),
+        ({"seed": -1}, "at least 0"),
+        ({"first_frame": -1}, "at least 0"),
     ],
 )
 def test_arguments_out_of_range_are_refused_before_anything_is_written(
-    tmp_path: Path, change: dict[str, Any], word: str
+    tmp_path: Path, change: dict[str, Any], expected: str
 ) -> None:
-    with pytest.raises(ArgumentError, match=word):
+    with raises(ArgumentError, where=f"^{next(iter(change))}$", expected=expected):
         simulate(tmp_path / "out", **{**SMALL, **change})
     assert not (tmp_path / "out").exists()
 
@@ -221,7 +222,7 @@ def test_without_a_package_of_the_extra_nothing_is_written(
     for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(DependencyError, match=rf"{package} .*pip install .*\[{extra}\]'"):
+    with raises(DependencyError, where=package, advice=rf"pip install .*\[{extra}\]'"):
         run(tmp_path / "out", count=1, sensors=1)
     assert not (tmp_path / "out").exists()
 
@@ -261,7 +262,7 @@ def test_a_capture_of_another_version_of_the_town_is_refused(
     settings = json.loads((recorded / "raw" / "simulation.json").read_text())
     assert settings["recipe"] == 1  # the name of the town's version in the file
     (tmp_path / "raw" / "simulation.json").write_text(json.dumps(settings | {"recipe": 0}))
-    with pytest.raises(ConflictError, match="recipe"):
+    with raises(ConflictError, expected="recipe"):
         simulate(tmp_path, **SMALL)
 
 
@@ -342,7 +343,7 @@ def test_it_returns_what_the_capture_on_disk_holds(written):
     assert np.array_equal(simulated.read_poses(1, [3, 4]), on_disk.read_poses(1, [3, 4]))
     assert simulated.read_times() == on_disk.read_times()
     assert simulated.read_bev(4) == on_disk.read_bev(4)
-    with pytest.raises(MissingDataError, match="expected frame 8, found frames 3 to 7"):
+    with raises(MissingDataError, expected="frame 8", found="frames 3 to 7"):
         simulated.read(0, 8)
 
 
@@ -357,9 +358,9 @@ def test_grids_are_made_without_files_in_between(written, tmp_path, kind):
 
 
 def test_it_has_no_scans_to_merge_and_no_place_to_write_to(tmp_path):
-    with pytest.raises(ArgumentError, match=r"observe: expected FromCapture\(\)"):
+    with raises(ArgumentError, where="observe", expected=r"FromCapture\(\)"):
         regrid(SimulatedCapture(**HOW), SPEC, tmp_path, observe=FromScans())
-    with pytest.raises(ArgumentError, match="out: expected where to write"):
+    with raises(ArgumentError, where="out", expected="where to write"):
         regrid(SimulatedCapture(**HOW), SPEC)
 
 

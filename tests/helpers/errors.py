@@ -1,0 +1,27 @@
+"""Assertions about errors: their kind and their parts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from carlasc.errors import CarlascError
+
+
+@contextmanager
+def raises(kind: type[CarlascError], **parts: str) -> Iterator[pytest.ExceptionInfo[CarlascError]]:
+    """Assert that a block raises an error of a kind, some parts of which match.
+
+    Args:
+        kind: its class.
+        **parts: a regular expression that is found in each part: `where`, `problem`, `expected`,
+            `found` or `advice`.
+    """
+    with pytest.raises(kind) as error:
+        yield error
+    for name, pattern in parts.items():
+        part = getattr(error.value, name)
+        assert re.search(pattern, part), f"{name}: {pattern!r} is not in {part!r}"
