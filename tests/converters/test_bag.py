@@ -21,6 +21,7 @@ from helpers.converters.bags import (
     velodyne,
     write_bag,
 )
+from helpers.errors import raises
 
 import carlasc
 from carlasc.converting import Sensor, convert
@@ -148,9 +149,7 @@ def test_several_lidars_without_transforms_between_them_are_refused(tmp_path):
             for name in ("one", "two"):
                 yield store.cloud(f"/{name}", stamp, velodyne(POINTS), name)
 
-    with pytest.raises(
-        MissingDataError, match="expected transforms from two to one, found only no frames"
-    ):
+    with raises(MissingDataError, expected="transforms from two to one", found="only no frames"):
         _ = recording_of(tmp_path, "db3", messages, topics="/one,/two").sensors
 
 
@@ -184,9 +183,7 @@ def test_poses_of_a_frame_that_the_lidar_has_no_path_to_are_refused_or_forced(tm
         "bag",
         clouds_and(lambda store, stamp, pose: store.odometry("/odom", stamp, pose, "imu")),
     )
-    with pytest.raises(
-        MissingDataError, match="expected transforms from lidar to imu, found only no frames"
-    ):
+    with raises(MissingDataError, expected="transforms from lidar to imu", found="only no frames"):
         recording.poses()
     np.testing.assert_array_equal(recording.sensors[0].vehicle_T_sensor, np.eye(4))
     assert recording.poses(force=True).world_T_vehicle[2, 0, 3] == 2
@@ -215,8 +212,8 @@ def test_a_quaternion_that_is_no_rotation_is_named(tmp_path):
         message[3].pose.pose.orientation.w = 0.0
         return message
 
-    with pytest.raises(
-        FormatError, match="/odom: expected a rotation: a quaternion w, x, y, z of length 1"
+    with raises(
+        FormatError, where="/odom", expected="a rotation: a quaternion w, x, y, z of length 1"
     ):
         recording_of(tmp_path, "mcap", clouds_and(zero)).poses()
 
@@ -237,7 +234,7 @@ def test_poses_of_the_tree_are_in_odom_unless_another_frame_is_asked_for(tmp_pat
         recording.poses().at(recording.times())[:, 0, 3], [0, 2, 4], atol=1e-6
     )
     (recording,) = Bag(tmp_path / "one", world_frame="utm").sequences()
-    with pytest.raises(MissingDataError, match="transforms from lidar to utm, found only"):
+    with raises(MissingDataError, expected="transforms from lidar to utm", found="only"):
         recording.poses()
 
 
@@ -349,7 +346,7 @@ def test_a_bag_that_was_written_again_is_read_again(tmp_path, kind):
             True
         ] * DRIVE.frames
         shutil.rmtree(bag) if bag.is_dir() else bag.unlink()
-    with pytest.raises(MissingDataError, match="expected a bag: .bag, .db3, .mcap, found nothing"):
+    with raises(MissingDataError, expected="a bag: .bag, .db3, .mcap", found="nothing"):
         recording.frames[0].read()
 
 

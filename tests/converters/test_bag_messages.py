@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from carlasc_converters.bag import Bag
 from helpers.converters.bags import KINDS, START_NS, Messages, velodyne, write_bag
+from helpers.errors import raises
 
 from carlasc.errors import FormatError
 
@@ -127,7 +128,7 @@ def test_times_in_no_known_unit_are_named_until_the_unit_is_given(tmp_path):
     store = Messages("db3")
     cloud = store.cloud("/points", START_NS, packed(OUSTER, 0, "t", np.arange(COUNT) * 10))
     bag = write_bag(tmp_path, "db3", [cloud], store=store)
-    with pytest.raises(FormatError, match="give their unit with `time_unit`"):
+    with raises(FormatError, advice="give their unit with `time_unit`"):
         _ = Bag(bag).sequences()[0].frames
     (cloud,) = Bag(bag, time_unit="us").sequences()[0].frames[0].read()
     np.testing.assert_allclose(cloud.seconds, np.arange(COUNT) * 1e-5)
@@ -152,5 +153,5 @@ def test_a_message_without_points_is_named(tmp_path):
     store = Messages("mcap")
     empty = store.cloud("/points", START_NS, velodyne(np.zeros((5, 4), np.float32)))
     (recording,) = Bag(write_bag(tmp_path, "mcap", [empty], store=store)).sequences()
-    with pytest.raises(FormatError, match="/points: message 0: expected points, found none"):
+    with raises(FormatError, where="/points: message 0", expected="points", found="none"):
         recording.frames[0].read()

@@ -8,6 +8,7 @@ import pytest
 from carlasc_converters.bag import Bag
 from carlasc_converters.foxglove_messages import read_message
 from helpers.converters.bags import write_one_message
+from helpers.errors import raises
 from helpers.scenes.road_blocks import write_blocks
 
 from carlasc.core.geometry import quaternions_of, rotation_z, translation
@@ -128,8 +129,10 @@ def test_protobuf_that_is_cut_short_is_no_message():
 def test_a_message_that_is_none_is_named(tmp_path):
     pytest.importorskip("mcap.writer")
     write_one_message(tmp_path / "drive.mcap", "protobuf", b"\x0a\xff")
-    with pytest.raises(
+    with raises(
         FormatError,
-        match="/points: expected a message of type foxglove.PointCloud, found something else",
+        where="/points",
+        expected="a message of type foxglove.PointCloud",
+        found="something else",
     ):
         _ = Bag(tmp_path / "drive.mcap").sequences()[0].frames

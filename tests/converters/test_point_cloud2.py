@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from carlasc_converters.point_fields import read_columns, unpack_fields
 from helpers.converters.bags import VELODYNE, Messages
+from helpers.errors import raises
 
 from carlasc.errors import FormatError
 
@@ -46,16 +47,14 @@ def test_every_field_comes_back_to_the_bit(big_endian, height, padding):
 def test_data_of_another_size_are_named():
     message = Messages("bag").cloud("/points", 1, points_of(6, VELODYNE))[3]
     message.data = message.data[:-1]
-    with pytest.raises(
-        FormatError, match="message: expected 1 rows of 6 points of 32 bytes, found 191 bytes"
+    with raises(
+        FormatError, where="message", expected="1 rows of 6 points of 32 bytes", found="191 bytes"
     ):
         read_columns(message, "message")
 
 
 def test_a_field_outside_of_the_point_is_named():
-    with pytest.raises(
-        FormatError, match="expected points of 8 bytes, found the field z up to byte 12"
-    ):
+    with raises(FormatError, expected="points of 8 bytes", found="the field z up to byte 12"):
         unpack_fields(np.zeros(8, np.uint8), [("x", 0, "f4", 1), ("z", 8, "f4", 1)], 8, "message")
 
 

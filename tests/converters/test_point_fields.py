@@ -1,8 +1,8 @@
 """Fields of points by their usual names, and the unit of their times."""
 
 import numpy as np
-import pytest
 from carlasc_converters.point_fields import named_fields, point_seconds
+from helpers.errors import raises
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,12 +24,15 @@ def test_the_unit_is_found_from_the_span_of_a_scan_and_times_come_back(unit, spa
 
 
 def test_a_span_that_no_lidar_has_asks_for_the_unit():
-    with pytest.raises(
-        FormatError, match=r"x: times of points: expected a scan of 4 ms to 0.6 s .* `time_unit`"
+    with raises(
+        FormatError,
+        where="x: times of points",
+        expected="a scan of 4 ms to 0.6 s",
+        advice="`time_unit`",
     ):
         point_seconds(np.array([0.0, 2.0]), "auto", "x")
     assert point_seconds(np.array([0.0, 2.0]), "s", "x")[0].tolist() == [0, 2]
-    with pytest.raises(FormatError, match="finite"):
+    with raises(FormatError, expected="finite"):
         point_seconds(np.array([0.0, np.nan]), "s", "x")
 
 
@@ -48,7 +51,7 @@ def test_names_are_recognised_in_any_case_and_absent_intensity_is_zero():
     assert named_fields(columns, "x")["points"].tolist() == [[1, 1, 1, 3], [1, 1, 1, 4]]
     del columns["Reflectivity"]
     assert named_fields(columns | {"label": np.array([1.0, 2.0])}, "x")["label"].dtype == np.uint32
-    with pytest.raises(FormatError, match="x: label: expected whole numbers .* found 1.5"):
+    with raises(FormatError, where="x: label", expected="whole numbers", found="1.5"):
         named_fields(columns | {"label": np.array([1.5, 2.0])}, "x")
-    with pytest.raises(FormatError, match="expected points with z, found only X, Y"):
+    with raises(FormatError, expected="points with z", found="only X, Y"):
         named_fields({"X": np.ones(1), "Y": np.ones(1)}, "x")

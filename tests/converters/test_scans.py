@@ -11,6 +11,7 @@ import pytest
 from carlasc_converters.scans import Scans
 from helpers.converters import bags
 from helpers.converters.scan_writers import PCD, write_poses, write_scan
+from helpers.errors import raises
 
 import carlasc
 from carlasc import GridSpec, Run
@@ -170,9 +171,7 @@ def test_poses_of_the_vehicle_and_several_lidars_go_by_the_calibration(tmp_path)
     clouds = recording.frames[2].read()
     assert [cloud.sensor for cloud in clouds] == [0, 1]
     np.testing.assert_array_equal(clouds[1].points, drive.scan(2, 1).points)
-    with pytest.raises(
-        MissingDataError, match="`calibration`, because these are poses of the vehicle"
-    ):
+    with raises(MissingDataError, expected="`calibration`, because these are poses of the vehicle"):
         Scans(tmp_path / "in/top", pose_file=options["pose_file"]).sequences()[0].poses()
 
 
@@ -239,7 +238,7 @@ def test_a_table_of_ones_own_keeps_its_ids(tmp_path):
         tmp_path / "in/a.npy", {name: np.ones(5, np.float32) for name in ("x", "y", "z", "label")}
     )
     given = {"source_classes": str(tmp_path / "mine.json")}
-    with pytest.raises(ArgumentError, match="classes: expected mine, because no map to CarlaSC"):
+    with raises(ArgumentError, where="classes", expected="mine, because no map to CarlaSC"):
         convert(
             "scans",
             tmp_path / "in",
@@ -465,14 +464,12 @@ def test_classes_outside_of_the_table_are_failures_of_their_frames(tmp_path):
 def test_a_folder_that_another_converter_reads_names_it(tmp_path):
     (tmp_path / "in/sensors").mkdir(parents=True)
     write_scan(tmp_path / "in/a.npy", fields_of(DRIVE, 0))
-    with pytest.raises(
-        MissingDataError, match="use `carlasc convert scans`, which can read this folder"
-    ):
+    with raises(MissingDataError, advice="use `carlasc convert scans`, which can read this folder"):
         convert("argoverse2", tmp_path / "in", tmp_path / "out", run=Run(workers=1))
     options = {"pose_file": str(tmp_path / "p.npy")}
     np.save(tmp_path / "p.npy", np.eye(4)[None])
     convert(
         "scans", tmp_path / "in", tmp_path / "own", grids=None, options=options, run=Run(workers=1)
     )
-    with pytest.raises(MissingDataError, match="this folder has CarlaSC.s layout already"):
+    with raises(MissingDataError, advice="this folder has CarlaSC.s layout already"):
         convert("argoverse2", tmp_path / "own", tmp_path / "out", run=Run(workers=1))
