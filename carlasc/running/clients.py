@@ -20,6 +20,7 @@ from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
+from carlasc.core.first_use import is_first_use
 from carlasc.errors import CarlascError, carlasc_version, import_extra
 from carlasc.running.pools import ONE_THREAD, LostTaskError
 from carlasc.running.spreading import DaskClient, LazyClient
@@ -171,7 +172,8 @@ def run_on_cluster(
         tasks = _Tasks(client, function, distributed)
         waiting = iter(items)
         try:
-            tasks.submit(list(islice(waiting, tasks.window)))
+            # the first time, one worker compiles before the others start
+            tasks.submit(list(islice(waiting, 1 if is_first_use(function) else tasks.window)))
             while tasks.pending:
                 yield from tasks.take(lost)
                 # several at once, because a call costs as much as a task

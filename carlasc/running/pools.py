@@ -15,7 +15,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.synchronize import Semaphore
 from typing import Any
 
-from carlasc.core.first_use import note_in_workers, wishes
+from carlasc.core.first_use import NoteRequest, note_in_workers, note_requests
 from carlasc.errors import CarlascError
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -188,7 +188,7 @@ class _ProcessGroup(ProcessPoolExecutor):
             workers,
             mp_context=self._context,
             initializer=_prepare_worker,
-            initargs=(self._context.Semaphore(), wishes()),
+            initargs=(self._context.Semaphore(), note_requests),
         )
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -245,8 +245,8 @@ def inherited_by_workers() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _prepare_worker(first: Semaphore, wishes: tuple[tuple[Callable[[], None], float], ...]) -> None:
-    note_in_workers(wishes, first)
+def _prepare_worker(first: Semaphore, requests: list[NoteRequest]) -> None:
+    note_in_workers(requests, first)
     signal.signal(signal.SIGTERM, _exit_worker)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
