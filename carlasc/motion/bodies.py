@@ -133,6 +133,8 @@ def seen_from(
         counts: (F,) number of points of the actor in each scan.
         sensors: (F, 3) position of the sensor in each scan, metres, actor frame.
     """
+    # A face is seen from beyond its plane. Height over distance is the sine of the angle between
+    # the rays and the face; flatter rays give points of its edges only.
     distance = np.maximum(np.linalg.norm(sensors[:, :2], axis=1), 1e-6)
     total = int(counts.sum())
     rear, front, low, high = (
@@ -182,6 +184,7 @@ class Sizes:
             if known[axis] and plausible[axis]:
                 continue
             missing = max(self._expected(label, extent, axis) - (upper[axis] - lower[axis]), 0.0)
+            # What is missing is behind the actor, as the sensor sees it: the near end was seen.
             if extent.seen_from[axis] < 0:
                 upper[axis] += missing
             else:
@@ -202,6 +205,8 @@ class Sizes:
         sizes = self._known.get(label, np.empty((0, 3)))
         far = (sizes - extent.size) / np.maximum(extent.size, _CELL_M)
         alike, as_high = np.abs(far[:, other]) < _ALIKE, far[:, 2] > -_ALIKE
+        # Cars and vans are alike in one size, so the height decides between them, if there are
+        # enough of the same height; the visible height is a lower limit in any case.
         for chosen in (sizes[alike & as_high & (far[:, 2] < _ALIKE)], sizes[alike & as_high]):
             if len(chosen) >= _EXAMPLES:
                 return float(np.median(chosen[:, axis]))
@@ -245,6 +250,7 @@ class Sizes:
         fitted = [(own - other.lower) * (size / other.size) for other, own in chosen]
         bins, points = list[NDArray[np.int64]](), list[NDArray[np.float64]]()
         for own in fitted:
+            # Vehicles are symmetric: what one side shows holds for the other.
             whole = np.concatenate([own, own * (1, -1, 1) + (0, size[1], 0)])
             cells, place = np.unique(
                 np.floor(whole / _BIN_M).astype(np.int64), axis=0, return_inverse=True
@@ -256,8 +262,10 @@ class Sizes:
         _, place, count = np.unique(
             np.concatenate(bins), axis=0, return_inverse=True, return_counts=True
         )
-        found = np.concatenate(points)[2 * count[place.reshape(-1)] > len(chosen)]
-        return (found[found[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
+        # Cells that more than half of the actors share are of the usual shape, not of a load or a
+        # neighbour.
+        shared = np.concatenate(points)[2 * count[place.reshape(-1)] > len(chosen)]
+        return (shared[shared[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
 
 
 def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -90,18 +90,18 @@ def tracks_from_boxes(
         The tracks in order of their numbers, without members: `segment_by_boxes` finds the members
         in a scan. An object whose boxes jump has several tracks with the same number.
     """
-    found: dict[int, list[tuple[int, int]]] = {}  # frames and rows by track
+    places: dict[int, list[tuple[int, int]]] = {}  # frames and rows by track
     for frame in sorted(boxes):
         for row, track in enumerate(boxes[frame].tracks.tolist()):
-            found.setdefault(track, []).append((frame, row))
+            places.setdefault(track, []).append((frame, row))
     world = {frame: boxes[frame].transform(poses[frame]) for frame in boxes}
     known = np.array(sorted(times), np.int64)
     seconds = np.array([times[frame] for frame in known.tolist()])
     return [
         _make_track(track, part, known, seconds, deformable)
-        for track in sorted(found)
+        for track in sorted(places)
         for part in _split_at_jumps(
-            _boxes_of([(frame, world[frame], row) for frame, row in found[track]], times)
+            _boxes_of([(frame, world[frame], row) for frame, row in places[track]], times)
         )
     ]
 
@@ -188,10 +188,10 @@ def _inside(
     return near[inside & above]
 
 
-def _boxes_of(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
+def _boxes_of(places: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
     """Return the boxes of one object, given as (frame, boxes of the frame in the world frame, row)."""
-    chosen = [boxes.select(np.array([row])) for _, boxes, row in found]
-    frames = np.array([frame for frame, _, _ in found], np.int64)
+    chosen = [boxes.select(np.array([row])) for _, boxes, row in places]
+    frames = np.array([frame for frame, _, _ in places], np.int64)
     return _ObjectBoxes(
         frames,
         np.array([times[frame] for frame in frames.tolist()]),

@@ -92,14 +92,14 @@ def follow_actors(
     own = [] if own is None else own
     alive: list[_ActorChain] = []
     number = first_instance
-    for found in evidence:
-        moved[found.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *found.clusters]))
-        ended = [chain for chain in alive if found.seconds - chain.last.seconds > _MAX_GAP_S]
+    for scan in evidence:
+        moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        ended = [chain for chain in alive if scan.seconds - chain.last.seconds > _MAX_GAP_S]
         for actor in _tracked(ended, deformable, number, default_label, own):
             yield actor
             number += 1
-        alive = [chain for chain in alive if found.seconds - chain.last.seconds <= _MAX_GAP_S]
-        _link(found, alive, deformable)
+        alive = [chain for chain in alive if scan.seconds - chain.last.seconds <= _MAX_GAP_S]
+        _link(scan, alive, deformable)
     yield from _tracked(alive, deformable, number, default_label, own)
 
 
@@ -262,11 +262,11 @@ class _ActorChain:
         confidence = self._confidence(samples, positions, headings, seconds)
         if confidence < _LEAST_CONFIDENCE:
             return None
-        found = [
+        parts = [
             replace(segment, label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
-        return FoundActor(tuple(found), rigid, confidence)
+        return FoundActor(tuple(parts), rigid, confidence)
 
     def _confidence(
         self,

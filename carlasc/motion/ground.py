@@ -136,10 +136,10 @@ def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np
     )
     if on.sum() < max(_MIN_CELLS, _MIN_SHARE * len(chosen)):
         return None
-    found: NDArray[np.float64] = least_squares(
+    plane: NDArray[np.float64] = least_squares(
         rows[on] * weight[on, None], (chosen[on, 2] * weight[on])[:, None]
     )[:, 0]
-    return found
+    return plane
 
 
 @cached

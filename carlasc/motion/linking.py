@@ -138,8 +138,8 @@ class Linker:
         )
         possible = gap < np.where(is_other, np.where(is_lost, 0.0, _GATE_M), far)
         cost = gap + change + is_other * _OTHER_NUMBER
-        found = sorted((float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist())
-        return [(i, j, bool(is_other[i, j])) for _, i, j in found]
+        costs = sorted((float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist())
+        return [(i, j, bool(is_other[i, j])) for _, i, j in costs]
 
     def _velocity(self, chain: Chain) -> NDArray[np.float64]:
         """Return the (3,) velocity, m/s, of an actor in its last segment; NaN if it is unknown."""
@@ -158,38 +158,38 @@ class Linker:
         """Return the segments of earlier scans in which the actor of a new chain was static at the
         start of the chain.
         """
-        found: Chain = []
+        earlier: Chain = []
         for _, static in reversed(self._static):
             rest = static.segment_at(segment) if _is_slow(segment) else None
             if rest is None:
                 break
             segment = rest
-            found.append(rest)
-        return found[::-1]
+            earlier.append(rest)
+        return earlier[::-1]
 
     def _match(
-        self, found: list[Segment], alive: list[Chain]
+        self, segments: list[Segment], alive: list[Chain]
     ) -> list[tuple[Segment, Chain | None]]:
         """Pair the segments of one scan with the chains that they continue: the nearest prediction
         first, each chain once.
         """
-        if not found or not alive:
-            return [(segment, None) for segment in found]
+        if not segments or not alive:
+            return [(segment, None) for segment in segments]
         last = [chain[-1] for chain in alive]
         elapsed = np.array(
-            [self._seconds[found[0].frame] - self._seconds[end.frame] for end in last]
+            [self._seconds[segments[0].frame] - self._seconds[end.frame] for end in last]
         )
         centers, velocity, before = (
-            np.stack([s.center for s in found])[:, None],
-            _velocities(found)[:, None],
+            np.stack([s.center for s in segments])[:, None],
+            _velocities(segments)[:, None],
             _velocities(last),
         )
         shift = (before + velocity) / 2 * elapsed[:, None]
         # The visible part of an actor changes: the gap between boxes counts most, and their centres
         # have little weight.
-        gap, change = _gaps(found, last, shift), _lengths(velocity - before)
+        gap, change = _gaps(segments, last, shift), _lengths(velocity - before)
         offset = _lengths(np.stack([end.points.mean(axis=0) for end in last]) + shift - centers)
-        is_other = np.array([s.label for s in found])[:, None] != np.array(
+        is_other = np.array([s.label for s in segments])[:, None] != np.array(
             [end.label for end in last]
         )
         reach = _FARTHEST_M + _MAX_SPEED_M_S * elapsed
@@ -199,7 +199,7 @@ class Linker:
         candidates = [(float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist()]
         taken = best_pairs(candidates)
         return [
-            (segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(found)
+            (segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(segments)
         ]
 
 

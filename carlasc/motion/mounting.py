@@ -98,7 +98,7 @@ def find_mounting(
         runs: the aligned poses, in any frame: the row of the first scan, and the (K, 4, 4) poses of
             this scan and the following ones.
     """
-    parts = [_Motions.of(poses, seconds, first, found) for first, found in runs]
+    parts = [_Motions.of(poses, seconds, first, aligned) for first, aligned in runs]
     if sum(len(part.given) for part in parts) < 2 * len(_LEAST) * len(_LAGS):
         return None
     values = np.zeros(7)
@@ -129,13 +129,13 @@ class _Motions:
 
     Attributes:
         given: (P, 4, 4) motions.
-        found: (K, 4, 4) aligned poses.
+        aligned: (K, 4, 4) aligned poses.
         seconds: (K,) times of these scans.
         at: (P, 2) times of the start and the end of each motion.
     """
 
     given: NDArray[np.float64]
-    found: NDArray[np.float64]
+    aligned: NDArray[np.float64]
     seconds: NDArray[np.float64]
     at: NDArray[np.float64]
 
@@ -145,19 +145,19 @@ class _Motions:
         poses: NDArray[np.float64],
         seconds: NDArray[np.float64],
         first: int,
-        found: NDArray[np.float64],
+        aligned: NDArray[np.float64],
     ) -> _Motions:
         """Pair the scans of a run."""
         rows = np.concatenate(
             [
-                np.stack([np.arange(len(found) - lag), np.arange(lag, len(found))], axis=1)
+                np.stack([np.arange(len(aligned) - lag), np.arange(lag, len(aligned))], axis=1)
                 for lag in _LAGS
-                if lag < len(found)
+                if lag < len(aligned)
             ]
             or [np.empty((0, 2), np.int64)]
         )
-        given, own = poses[first + rows], seconds[first : first + len(found)]
-        return cls(multiply(invert(given[:, 0]), given[:, 1]), found, own, own[rows])
+        given, own = poses[first + rows], seconds[first : first + len(aligned)]
+        return cls(multiply(invert(given[:, 0]), given[:, 1]), aligned, own, own[rows])
 
 
 def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -170,7 +170,7 @@ def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArra
     mounted, between = _transform(values), []
     for part in parts:
         one, other = (
-            slerp(part.found, part.seconds, part.at[:, end] - values[6]) for end in (0, 1)
+            slerp(part.aligned, part.seconds, part.at[:, end] - values[6]) for end in (0, 1)
         )
         between.append(
             multiply(invert(multiply(invert(mounted), part.given, mounted)), invert(one), other)

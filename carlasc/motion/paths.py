@@ -137,15 +137,15 @@ def misalignment(
         multiply(points - positions[i], rotation_z(headings[i])[:3, :3])
         for i, points in enumerate(thinned)
     ]
-    found = []
+    means = []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:
             shifted = [
                 _mean_distance(body[i] + np.array([shift, 0.0, 0.0]), body[j]) for shift in shifts_m
             ]
-            found.append([_mean_distance(thinned[i], thinned[j]), *shifted])
-    return tuple(np.mean(found, axis=0).tolist()) if found else (np.nan,) * (1 + len(shifts_m))
+            means.append([_mean_distance(thinned[i], thinned[j]), *shifted])
+    return tuple(np.mean(means, axis=0).tolist()) if means else (np.nan,) * (1 + len(shifts_m))
 
 
 def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:

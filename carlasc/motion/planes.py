@@ -172,7 +172,7 @@ def nearest_within(
                 before = middle
             else:
                 after = middle
-        best, found = squared, -1
+        best, closest = squared, -1
         behind = moved[axis] - model[before, axis] if before >= 0 else np.inf
         ahead = model[after, axis] - moved[axis] if after <= last else np.inf
         while behind * behind <= best or ahead * ahead <= best:
@@ -184,10 +184,10 @@ def nearest_within(
                 ahead = model[after, axis] - moved[axis] if after <= last else np.inf
             x, y, z = moved[0] - model[k, 0], moved[1] - model[k, 1], moved[2] - model[k, 2]
             distance = x * x + y * y + z * z
-            if distance < best or (distance == best and order[k] < found):
-                best, found = distance, order[k]
-        if found >= 0:
-            rows[count], nearest[count] = i, found
+            if distance < best or (distance == best and order[k] < closest):
+                best, closest = distance, order[k]
+        if closest >= 0:
+            rows[count], nearest[count] = i, closest
             count += 1
     return rows[:count], nearest[:count]
 
@@ -289,13 +289,13 @@ def _register(
         cos, sin = math.cos(state[3]), math.sin(state[3])
         pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1] = cos, -sin, sin, cos
         pose[:3, 3] = state[:3]
-        information, pull = np.diag(prior), prior * (predicted - state)
+        information, right = np.diag(prior), prior * (predicted - state)
         for shift in shifts:  # the ends of the visible part are measured too
             left = shift[3]
             for a in range(3):
                 left += shift[a] * (previous[a] - state[a])
             for a in range(3):
-                pull[a] += shift[a] * left / _ENDS_M**2
+                right[a] += shift[a] * left / _ENDS_M**2
                 for b in range(3):
                     information[a, b] += shift[a] * shift[b] / _ENDS_M**2
         rows, nearest = nearest_within(points, pose, ordered, order, axis, reach * reach)
@@ -320,8 +320,8 @@ def _register(
             off += (point[2] - state[2] - model[k, 2]) * slope[2]
             weight = share / _VARIANCE_M2 / (1 + (off / scale) ** 2)
             for a in range(4):
-                pull[a] += slope[a] * weight * off
+                right[a] += slope[a] * weight * off
                 for b in range(a + 1):  # the lower half is read
                     information[a, b] += slope[a] * weight * slope[b]
-        state += solve_positive(information, pull)
+        state += solve_positive(information, right)
     return state

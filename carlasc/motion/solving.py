@@ -26,6 +26,9 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
         values: (N, D).
     """
     count, columns, wide = design.shape[0], design.shape[1], values.shape[1]
+    # Gram-Schmidt: invariant of the loop over k is that the first k columns of `basis` are
+    # orthonormal or zero, and that design = basis @ upper. Loops, not `@`, add in the order that is
+    # written.
     basis, upper, fit = design.copy(), np.zeros((columns, columns)), np.zeros((columns, wide))
     left = values.copy()
     for k in range(columns):
@@ -43,6 +46,8 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
         length = 0.0
         for i in range(count):
             length += basis[i, k] * basis[i, k]
+        # 1e-13 of its length is left, squared: the rounding errors of a column that is a sum of
+        # others.
         if length <= 1e-26 * whole:
             for i in range(count):
                 basis[i, k] = 0.0
@@ -57,6 +62,7 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
             fit[k, d] = along
             for i in range(count):
                 left[i, d] -= along * basis[i, k]
+    # Back substitution: the last parameter is alone in its equation, the others follow.
     for d in range(wide):
         for k in range(columns - 1, -1, -1):
             rest = fit[k, d]
@@ -76,6 +82,8 @@ def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> N
     """
     count = len(right)
     solution, column = right.copy(), np.empty(count)
+    # Forward elimination with the lower factor, column by column; `matrix` becomes the factor. The
+    # systems are banded, since few scans see the same planes: rows of zeros are skipped.
     for k in range(count):
         root = np.sqrt(matrix[k, k])
         solution[k] /= root
@@ -88,6 +96,7 @@ def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> N
                 solution[i] -= lower * solution[k]
                 for j in range(k + 1, i + 1):
                     matrix[i, j] -= lower * column[j]
+    # Then the transposed factor, from the last unknown to the first.
     for k in range(count - 1, -1, -1):
         solution[k] /= matrix[k, k]
         for i in range(k):
@@ -111,6 +120,8 @@ def principal_axes(
     """
     values, vectors = np.empty((len(covariances), 3)), np.empty((len(covariances), 3, 3))
     for n in range(len(covariances)):
+        # Invariant: covariance = v @ a @ v.T. Each turn makes one element off the diagonal zero,
+        # and the sum of their squares falls, faster with each sweep (Golub and Van Loan, 8.5).
         a, v = covariances[n].copy(), np.eye(3)
         for _ in range(_SWEEPS):
             size = abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])
@@ -120,6 +131,8 @@ def principal_axes(
                 for q in range(p + 1, 3):
                     if a[p, q] == 0.0:
                         continue
+                    # The smaller of the two angles that make a[p, q] zero: with it, the method
+                    # converges.
                     ratio = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
                     tangent = (1.0 if ratio >= 0 else -1.0) / (
                         abs(ratio) + np.sqrt(ratio * ratio + 1.0)
@@ -141,6 +154,7 @@ def principal_axes(
                             cos * v[k, p] - sin * v[k, q],
                             sin * v[k, p] + cos * v[k, q],
                         )
+        # The diagonal has no order; the normal of a plane is the vector of the smallest value.
         order = np.argsort(np.array([a[0, 0], a[1, 1], a[2, 2]]))
         for k in range(3):
             values[n, k] = a[order[k], order[k]]

@@ -140,6 +140,7 @@ def make_track(
     """
     seconds = np.array([times[segment.frame] for segment in chain])
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
+    # Flow gives the path directly. Without it, the path is found by aligning the observations.
     keeps_shape = label not in deformable if rigid is None else rigid
     if any(segment.velocity is None for segment in chain):
         observations = [segment.points for segment in chain]
@@ -196,6 +197,8 @@ def with_surfaces(tracks: Sequence[Track]) -> list[Track]:
 
 def _with_body(track: Track, sizes: Sizes) -> Track:
     lower, upper = sizes.complete(track.label, track.extent)
+    # The origin of an actor is the centre of its body: where the body grows, poses, corners and
+    # surface move by the same vector, and nothing moves in the world.
     middle = (lower + upper) / 2
     poses = track.world_T_actor.copy()
     poses[:, :3, 3] += multiply(poses[:, :3, :3], middle[:, None])[..., 0]
@@ -220,6 +223,8 @@ def _integrate(
     """
     steps = (velocities[1:] + velocities[:-1]) / 2 * np.diff(seconds)[:, None]
     path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    # The integral is known up to a constant; the largest segment shows most of the actor, so its
+    # centre is nearest to the centre of the body.
     best = int(np.argmax([len(segment.members) for segment in chain]))
     return path - path[best] + chain[best].center
 
@@ -234,6 +239,8 @@ def _fit_box(
     overlap only with the correct offset, which moves the origin to their centre.
     """
     best = int(np.argmax([len(segment.members) for segment in chain]))
+    # Moving the origin changes which points overlap, and thus the extent: three rounds, of which
+    # the last one changes millimetres.
     for _ in range(3):
         body, sensors = [], []
         for segment, position, heading in zip(chain, positions, headings, strict=True):
@@ -264,6 +271,7 @@ def _frames_around(
     more = max(1, round(_EXTRAPOLATE_S / period))
     frames = np.arange(first - more, last + more + 1)
     inside = np.interp(frames, known, seconds)
+    # `np.interp` holds its ends, so the frames beyond them are continued by the mean period.
     before, after = np.minimum(frames - known[0], 0), np.maximum(frames - known[-1], 0)
     return frames, inside + (before + after) * period
 
@@ -310,6 +318,7 @@ class MovingActors:
         worker with each frame.
         """
         near = {number: track.between(first, last) for number, track in self.tracks.items()}
+        # A track may reach the frames by extrapolation only, with poses and without members.
         tracks = {
             number: track
             for number, track in near.items()
@@ -323,10 +332,10 @@ class MovingActors:
 
     def is_own(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return which of (N, 3) points, metres, sensor frame, are on the recording vehicle."""
-        found = np.zeros(len(points), np.bool_)
+        own = np.zeros(len(points), np.bool_)
         for corners in self.own:
-            found |= ((points >= corners[:3]) & (points <= corners[3:])).all(axis=1)
-        return found
+            own |= ((points >= corners[:3]) & (points <= corners[3:])).all(axis=1)
+        return own
 
     def to_bytes(self, key: str) -> bytes:
         """Return the content of a file with these actors. `key` is a digest of their source."""
@@ -355,6 +364,8 @@ class MovingActors:
             for frame, own in track.members.items():
                 members.append(own)
                 frames.append((number, frame, len(own)))
+        # Tables of numbers, one row per track or per scan of a track, and the values of all tracks
+        # one after the other: a file of ten arrays is read at once, whatever the number of tracks.
         arrays = {
             "table": np.array(table, np.int64).reshape(-1, 8),
             "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
