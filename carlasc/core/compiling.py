@@ -104,13 +104,14 @@ def cached(function: Any = None, /, *, error_model: str = "numpy", fastmath: boo
     """
     if function is None:
         return partial(cached, error_model=error_model, fastmath=fastmath)
-    if not config.DISABLE_JIT:
+    settings: Any = config  # without types
+    if not settings.DISABLE_JIT:
         with suppress(OSError):  # the source is in a zip, or the folder cannot be written to
             copy = str(_copy_of_source(function))
             function.__code__ = function.__code__.replace(co_filename=copy)
-    compile_: Any = numba.njit(nogil=True, cache=True, error_model=error_model, fastmath=fastmath)
-    loop = compile_(function)
-    if not config.DISABLE_JIT:
+    njit: Any = numba.njit
+    loop = njit(nogil=True, cache=True, error_model=error_model, fastmath=fastmath)(function)
+    if not settings.DISABLE_JIT:
         first_use.loop_folders.add(loop.stats.cache_path)
     return loop
 

@@ -19,7 +19,7 @@ NoteRequest = tuple[Callable[[], None], float]
 """A function, and the compile time after which it is called, seconds."""
 
 note_requests: list[NoteRequest] = []
-"""The requests of this process; `carlasc.core.compiling` passes them to Numba when it is imported."""
+"""The requests of this process. When `carlasc.core.compiling` is imported, Numba gets them."""
 
 loop_folders: set[str] = set()
 """The folders of the compiled code of the loops that this process has loaded."""

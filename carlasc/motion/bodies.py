@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+
+from carlasc.core.arrays import AnyIntArray, Float32Array, FloatArray, IntArray
 
 _TRIM = 0.01  # share of points that may be outside the body: outliers, points of a neighbour
 # a face is visible if scans with so many points, and this share, see it
@@ -66,14 +67,14 @@ class Extent:
         seen_from: x and y of the sensor, metres, actor frame: mean over the points.
     """
 
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    lower: FloatArray
+    upper: FloatArray
     faces: tuple[bool, bool, bool, bool]
     points: int
     seen_from: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def size(self) -> NDArray[np.float64]:
+    def size(self) -> FloatArray:
         """(3,) metres: length, width and height of the visible part."""
         return self.upper - self.lower
 
@@ -105,7 +106,7 @@ class Extent:
         return rear and front and (low or high) and all(self.plausible)
 
 
-def measure(observations: Sequence[NDArray[np.float64]], sensors: NDArray[np.float64]) -> Extent:
+def measure(observations: Sequence[FloatArray], sensors: FloatArray) -> Extent:
     """Return the size of an actor, as its observations show it.
 
     Args:
@@ -120,10 +121,10 @@ def measure(observations: Sequence[NDArray[np.float64]], sensors: NDArray[np.flo
 
 
 def seen_from(
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
-    counts: NDArray[np.integer],
-    sensors: NDArray[np.float64],
+    lower: FloatArray,
+    upper: FloatArray,
+    counts: AnyIntArray,
+    sensors: FloatArray,
 ) -> Extent:
     """Return the extent of a box, with the faces that sensors saw.
 
@@ -149,14 +150,12 @@ def seen_from(
 class Sizes:
     """The lengths, widths and shapes of actors with many visible faces, by class."""
 
-    def __init__(self, examples: Sequence[tuple[int, Extent, NDArray[np.float32]]]) -> None:
+    def __init__(self, examples: Sequence[tuple[int, Extent, Float32Array]]) -> None:
         """Learn from the classes of actors, their extents, and the (P, 3) points of their surfaces,
         metres, actor frame; P may be 0.
         """
-        self._known: dict[int, NDArray[np.float64]] = {}
-        self._shapes = {
-            label: list[tuple[Extent, NDArray[np.float32]]]() for label, _, _ in examples
-        }
+        self._known: dict[int, FloatArray] = {}
+        self._shapes = {label: list[tuple[Extent, Float32Array]]() for label, _, _ in examples}
         for label, shapes in self._shapes.items():
             own = [(e, surface) for other, e, surface in examples if other == label]
             self._known[label] = np.array(
@@ -164,9 +163,7 @@ class Sizes:
             ).reshape(-1, 3)
             shapes += [(e, surface) for e, surface in own if e.exemplary and len(surface)]
 
-    def complete(
-        self, label: int, extent: Extent
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def complete(self, label: int, extent: Extent) -> tuple[FloatArray, FloatArray]:
         """Return the corners of the whole body: unknown lengths and widths are taken from similar
         actors.
 
@@ -212,7 +209,7 @@ class Sizes:
                 return float(np.median(chosen[:, axis]))
         return _table(extent, axis)
 
-    def _height(self, label: int, size: NDArray[np.float64]) -> float:
+    def _height(self, label: int, size: FloatArray) -> float:
         """Return the height of actors that are as long and as wide as `size`, (3,) metres; without
         such actors, its own height.
         """
@@ -224,8 +221,8 @@ class Sizes:
         return float(np.median(alike[:, 2])) if len(alike) >= _EXAMPLES else float(size[2])
 
     def surface(
-        self, label: int, lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
-    ) -> NDArray[np.float32]:
+        self, label: int, lower: FloatArray, upper: FloatArray, extent: Extent
+    ) -> Float32Array:
         """Return points on the surface of a vehicle of this size: from the most similar actors,
         otherwise the usual shell.
 
@@ -248,7 +245,7 @@ class Sizes:
         if not chosen or not any(extent.known):
             return usual_shell(lower - BODY_MARGIN_M, upper + BODY_MARGIN_M, extent)
         fitted = [(own - other.lower) * (size / other.size) for other, own in chosen]
-        bins, points = list[NDArray[np.int64]](), list[NDArray[np.float64]]()
+        bins, points = list[IntArray](), list[FloatArray]()
         for own in fitted:
             # Vehicles are symmetric: what one side shows holds for the other.
             whole = np.concatenate([own, own * (1, -1, 1) + (0, size[1], 0)])
@@ -268,7 +265,7 @@ class Sizes:
         return (shared[shared[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
 
 
-def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:
+def surface_of(points: FloatArray) -> Float32Array:
     """Return the (P, 3) float32 centres of the cells that hold two or more of (M, 3) points,
     metres.
     """
@@ -308,9 +305,7 @@ def _table(extent: Extent, axis: int) -> float:
     return _TWO_WHEELS[axis]
 
 
-def usual_shell(
-    lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
-) -> NDArray[np.float32]:
+def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32Array:
     """Return points on the surface that a vehicle of this size usually has; none for vehicles with
     two wheels.
 
@@ -341,7 +336,7 @@ def usual_shell(
     return np.concatenate([body, cabin])
 
 
-def _box_surface(lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.float32]:
+def _box_surface(lower: FloatArray, upper: FloatArray) -> Float32Array:
     """Return points on the sides and the top of a box, `_SPACING_M` apart."""
     x, y, z = (
         np.linspace(a, b, max(2, round((b - a) / _SPACING_M) + 1))

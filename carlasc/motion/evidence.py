@@ -15,8 +15,8 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.core.cells import as_pose, distinct, numbered
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
@@ -59,13 +59,13 @@ class EvidenceScan:
     """
 
     frame: int
-    points: NDArray[np.float32]
+    points: Float32Array
     world_T_sensor: Transform
     seconds: float
-    ground: NDArray[np.bool_] | None = None
-    labels: NDArray[np.unsignedinteger] | None = None
-    explained: NDArray[np.bool_] | None = None
-    origins: NDArray[np.float32] | None = None
+    ground: BoolArray | None = None
+    labels: LabelArray | None = None
+    explained: BoolArray | None = None
+    origins: Float32Array | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -98,8 +98,8 @@ class FreeSpaceEvidence:
     frame: int
     seconds: float
     count: int
-    clusters: tuple[NDArray[np.int64], ...]
-    points: tuple[NDArray[np.float64], ...]
+    clusters: tuple[IntArray, ...]
+    points: tuple[FloatArray, ...]
     labels: tuple[int, ...]
     freed: tuple[int, ...]
     around: tuple[int, ...]
@@ -112,7 +112,7 @@ class FreeSpaceEvidence:
         return replace(self, points=tuple(thin(points, most) for points in self.points))
 
     @property
-    def moved(self) -> NDArray[np.bool_]:
+    def moved(self) -> BoolArray:
         """(N,) bool: which points of the scan are in a cluster."""
         flags = np.zeros(self.count, np.bool_)
         for members in self.clusters:
@@ -212,11 +212,11 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor)
 
 
-def _sensors(origins: NDArray[np.float32]) -> list[NDArray[np.int64]]:
+def _sensors(origins: Float32Array) -> list[IntArray]:
     """Return the points of each sensor, by the (N, 3) origins of their rays, metres: origins of one
     moving sensor are close to each other.
     """
-    sensors: list[tuple[list[NDArray[np.float32]], list[NDArray[np.int64]]]] = []
+    sensors: list[tuple[list[Float32Array], list[IntArray]]] = []
     for part, origin in runs_of_origins(origins, len(origins)):
         near = (
             own
@@ -232,7 +232,7 @@ def _sensors(origins: NDArray[np.float32]) -> list[NDArray[np.int64]]:
 
 
 def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
-    """Return the indices of the scans to look up, before and after the current one, nearest first."""
+    """Return the scans to look up, before and after the current one, the nearest first."""
     seconds = np.array([kept.seconds for kept in window]) - window[current].seconds
     sides: tuple[list[int], list[int]] = ([], [])
     for side, sign in zip(sides, (-1, 1), strict=True):
@@ -244,8 +244,8 @@ def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
 
 
 def _judge(
-    scan: EvidenceScan, candidates: NDArray[np.int64], before: list[_Kept], after: list[_Kept]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    scan: EvidenceScan, candidates: IntArray, before: list[_Kept], after: list[_Kept]
+) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Return which candidates are at places that were free most of the time, free on one side in
     time, and occupied (static).
     """
@@ -275,12 +275,12 @@ def _judge(
 
 
 def _clusters(
-    world: NDArray[np.float64],
-    kind: NDArray[np.int64],
-    moved: NDArray[np.bool_],
-    left: NDArray[np.bool_],
-    static: NDArray[np.bool_],
-) -> list[NDArray[np.int64]]:
+    world: FloatArray,
+    kind: IntArray,
+    moved: BoolArray,
+    left: BoolArray,
+    static: BoolArray,
+) -> list[IntArray]:
     """Group moved points by cells, seen from above, and add the points around them that are not
     static.
 
@@ -314,7 +314,7 @@ def _clusters(
     # were free on one side only are common behind edges, so a cell needs a large share of them.
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
     component = _join(keys, seeds, int(width))[flat]
-    groups: list[NDArray[np.int64]] = []
+    groups: list[IntArray] = []
     kept = np.flatnonzero(component >= 0)
     order = kept[np.argsort(component[kept], kind="stable")]
     for group in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
@@ -333,9 +333,7 @@ def _clusters(
     return groups
 
 
-def _count_around(
-    world: NDArray[np.float64], groups: list[NDArray[np.int64]], static: NDArray[np.bool_]
-) -> tuple[int, ...]:
+def _count_around(world: FloatArray, groups: list[IntArray], static: BoolArray) -> tuple[int, ...]:
     """Return the number of static points, of (N, 3) points in metres, around each group: in its
     cells or beside them, at its height.
     """
@@ -360,7 +358,7 @@ def _count_around(
 
 
 @cached
-def _join(keys: NDArray[np.int64], seeds: NDArray[np.bool_], width: int) -> NDArray[np.int64]:
+def _join(keys: IntArray, seeds: BoolArray, width: int) -> IntArray:
     """Return the component of each cell: seeds that touch are one component, and other cells belong
     to a seed beside them; -1 without one.
 

@@ -21,8 +21,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.compiling import cached, jit
 from carlasc.motion.solving import principal_axes, solve_positive
 
@@ -90,18 +90,18 @@ class Clusters(NamedTuple):
             the world.
     """
 
-    start: NDArray[np.int64]
-    scan: NDArray[np.int64]
-    sums: NDArray[np.float64]
+    start: IntArray
+    scan: IntArray
+    sums: FloatArray
 
 
 def align(
-    points: Sequence[NDArray[np.float32]],
-    start: NDArray[np.float64],
-    given: NDArray[np.float64],
+    points: Sequence[Float32Array],
+    start: FloatArray,
+    given: FloatArray,
     fixed: int = 0,
     prior: PosePrior = PosePrior(),  # noqa: B008 (a tuple)
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Return the poses under which scans agree best.
 
     Args:
@@ -143,9 +143,9 @@ def align(
 
 
 def blocks(
-    points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64], cell_m: float, shift: float
+    points: Sequence[Float32Array], poses: FloatArray, cell_m: float, shift: float
 ) -> list[Clusters]:
-    """Return the clusters of each block of scans; `shift` moves the cells by a share of their size."""
+    """Return the clusters of each block; `shift` moves the cells by a share of their size."""
     per_scan = [clusters(own, pose, cell_m, shift) for own, pose in zip(points, poses, strict=True)]
     grouped = []
     for first in range(0, max(len(points) - HALF_BLOCK, 1), HALF_BLOCK):
@@ -160,7 +160,7 @@ def blocks(
     return grouped
 
 
-def _choose(normals: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDArray[np.int64]:
+def _choose(normals: FloatArray, thickness: FloatArray) -> IntArray:
     """Return the planes that are used: about the same number for each of six directions, spread
     over the scene.
     """
@@ -177,10 +177,8 @@ def _choose(normals: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDA
     return np.concatenate(chosen)
 
 
-def _determined(
-    normals: NDArray[np.float64], thickness: NDArray[np.float64], chosen: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return the normals without their components along undetermined directions, as along a tunnel."""
+def _determined(normals: FloatArray, thickness: FloatArray, chosen: IntArray) -> FloatArray:
+    """Return normals without their components along undetermined directions, as of a tunnel."""
     own = normals[chosen]
     weights = 1.0 / (POINT_M**2 + thickness[chosen])
     # The eigenvectors of the sum of all normals' squares are the directions in which planes hold
@@ -203,8 +201,8 @@ def cell_key(x: float, y: float, z: float) -> int:
 
 @cached
 def clusters(
-    points: NDArray[np.float32], pose: NDArray[np.float64], cell_m: float, shift: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    points: Float32Array, pose: FloatArray, cell_m: float, shift: float
+) -> tuple[IntArray, FloatArray]:
     """Return the (C,) keys of the cells in which a scan has points, and the (C, 10) sums of these
     points.
     """
@@ -236,8 +234,8 @@ def clusters(
 
 
 def planes(
-    block: Clusters, poses: NDArray[np.float64], limits: AlignmentPass
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    block: Clusters, poses: FloatArray, limits: AlignmentPass
+) -> tuple[FloatArray, FloatArray]:
     """Return the (G, 3) normals of the planes in cells, and their (G,) variances along the normals,
     metres squared; -1 without a plane.
     """
@@ -249,9 +247,7 @@ def planes(
 
 
 @cached
-def spread_of(
-    block: Clusters, poses: NDArray[np.float64], scans: int
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def spread_of(block: Clusters, poses: FloatArray, scans: int) -> tuple[BoolArray, FloatArray]:
     """Return (G,) whether a cell has points of enough scans, and the (G, 3, 3) covariances of its
     points. The weight of a scan is limited.
     """
@@ -296,12 +292,12 @@ def spread_of(
 
 @jit
 def to_plane(
-    scan: NDArray[np.int64],
-    sums: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    normal: NDArray[np.float64],
+    scan: IntArray,
+    sums: FloatArray,
+    poses: FloatArray,
+    normal: FloatArray,
     variance: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Return the (C,) distances of clusters from their plane, along its normal, and their (C,)
     weights; outliers have less.
     """
@@ -327,14 +323,14 @@ def to_plane(
 @cached
 def add_planes(
     block: Clusters,
-    poses: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-    thickness: NDArray[np.float64],
-    chosen: NDArray[np.int64],
+    poses: FloatArray,
+    normals: FloatArray,
+    slopes: FloatArray,
+    thickness: FloatArray,
+    chosen: IntArray,
     fixed: int,
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
+    matrix: FloatArray,
+    right: FloatArray,
 ) -> None:
     """Add the chosen planes to the normal equations of the poses from `fixed` on: `right`, and the
     lower half of `matrix`.
@@ -379,7 +375,7 @@ def add_planes(
 
 
 @jit
-def _turn_between(one: NDArray[np.float64], other: NDArray[np.float64], axis: int) -> float:
+def _turn_between(one: FloatArray, other: FloatArray, axis: int) -> float:
     """Return one component of the small rotation vector between the rotations of two poses, on the
     axes of the world.
     """
@@ -392,12 +388,12 @@ def _turn_between(one: NDArray[np.float64], other: NDArray[np.float64], axis: in
 
 @cached
 def add_given(
-    poses: NDArray[np.float64],
-    given: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    poses: FloatArray,
+    given: FloatArray,
+    weights: FloatArray,
     fixed: int,
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
+    matrix: FloatArray,
+    right: FloatArray,
 ) -> None:
     """Add the prior to the normal equations: each pose is near the given one, and its change near
     the change of the previous one.
@@ -426,7 +422,7 @@ def add_given(
 
 
 @cached
-def move(poses: NDArray[np.float64], steps: NDArray[np.float64], fixed: int) -> None:
+def move(poses: FloatArray, steps: FloatArray, fixed: int) -> None:
     """Change the poses from `fixed` on by (F - fixed, 6) small translations and rotation vectors on
     the axes of the world.
     """

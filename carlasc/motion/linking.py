@@ -12,9 +12,10 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.motion.segments import LINKED_M_S, Segment, StaticPoints
+from carlasc.motion.solving import best_pairs
 
 _MAX_GAP_S = 1.55  # an actor may be hidden for this time
 _NUMBERED_GAP_S = 10.0  # a numbered actor is the same after this time
@@ -141,7 +142,7 @@ class Linker:
         costs = sorted((float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist())
         return [(i, j, bool(is_other[i, j])) for _, i, j in costs]
 
-    def _velocity(self, chain: Chain) -> NDArray[np.float64]:
+    def _velocity(self, chain: Chain) -> FloatArray:
         """Return the (3,) velocity, m/s, of an actor in its last segment; NaN if it is unknown."""
         last = chain[-1]
         if last.velocity is not None:
@@ -150,7 +151,7 @@ class Linker:
         for before in islice(reversed(chain), 1, None):
             elapsed = now - self._seconds.get(before.frame, now)
             if elapsed >= _HISTORY_S:
-                velocity: NDArray[np.float64] = (last.center - before.center) / elapsed
+                velocity: FloatArray = (last.center - before.center) / elapsed
                 return velocity
         return _UNKNOWN
 
@@ -203,27 +204,16 @@ class Linker:
         ]
 
 
-def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
-    """Pair first and second numbers by (cost, first, second), the lowest cost first, each number
-    once; return the second by the first.
-    """
-    taken: dict[int, int] = {}
-    for _, i, j in sorted(costs):
-        if i not in taken and j not in taken.values():
-            taken[i] = j
-    return taken
-
-
-def _velocities(segments: list[Segment]) -> NDArray[np.float64]:
+def _velocities(segments: list[Segment]) -> FloatArray:
     """Return the (S, 3) velocities of segments, m/s, world; NaN where the scan has no flow."""
     return np.stack(
         [_UNKNOWN if segment.velocity is None else segment.velocity for segment in segments]
     )
 
 
-def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lengths(vectors: FloatArray) -> FloatArray:
     # the same sum on every processor
-    lengths: NDArray[np.float64] = np.linalg.norm(vectors, axis=-1)
+    lengths: FloatArray = np.linalg.norm(vectors, axis=-1)
     return lengths
 
 
@@ -233,9 +223,7 @@ def _is_slow(segment: Segment) -> bool:
     )
 
 
-def _gaps(
-    segments: list[Segment], ends: list[Segment], shifts: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _gaps(segments: list[Segment], ends: list[Segment], shifts: FloatArray) -> FloatArray:
     """Return the (S, C) gaps, metres, between the bounding boxes of segments and of `ends` moved by
     (C, 3) or (S, C, 3); 0 if they overlap.
     """

@@ -19,8 +19,8 @@ from itertools import islice, pairwise
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.cells import first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, multiply, small_motions, transform_points
@@ -83,11 +83,11 @@ class ThinnedScan:
         measured: (M, 3) float32, metres, sensor frame: points in places that take no part.
     """
 
-    used: NDArray[np.float32]
-    measured: NDArray[np.float32]
+    used: Float32Array
+    measured: Float32Array
 
     @classmethod
-    def of(cls, points: NDArray[np.float32], world_T_sensor: NDArray[np.float64]) -> Self:
+    def of(cls, points: Float32Array, world_T_sensor: FloatArray) -> Self:
         """Choose from the (N, 3) points of a scan, metres, sensor frame, which should be static."""
         near = points[(np.abs(points) < _FAR_M).all(axis=1)]
         chosen = near[first_of_cells(np.floor(near / np.float32(_THIN_M)).astype(np.int64))]
@@ -111,14 +111,14 @@ class RefinedPoses:
             such poses belong to another drive or to other frames, and are not refined.
     """
 
-    given: NDArray[np.float64]
-    poses: NDArray[np.float64]
-    before_m: NDArray[np.float64]
-    after_m: NDArray[np.float64]
-    refined: NDArray[np.bool_]
-    fits: NDArray[np.bool_]
+    given: FloatArray
+    poses: FloatArray
+    before_m: FloatArray
+    after_m: FloatArray
+    refined: BoolArray
+    fits: BoolArray
 
-    def changes(self) -> NDArray[np.float64]:
+    def changes(self) -> FloatArray:
         """Return the (F - 1, 6) changes of the motions from each scan to the next one: metres, then
         radians, sensor frame.
         """
@@ -132,7 +132,7 @@ class RefinedPoses:
         )
         return before, after
 
-    def left(self, frames: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
+    def left(self, frames: IntArray) -> tuple[tuple[int, int], ...]:
         """Return the first and the last frame of each stretch that was not refined; `frames` are
         the (F,) numbers of the scans.
         """
@@ -170,7 +170,7 @@ class RefinedPoses:
 
 def refine_poses(
     scans: Iterable[ThinnedScan],
-    given: NDArray[np.float64],
+    given: FloatArray,
     *,
     always: bool = False,
     steps: Callable[[int], None] | None = None,
@@ -223,7 +223,7 @@ def refine_poses(
     return RefinedPoses(given, poses, before, after, refined, fits)
 
 
-def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
+def _is_better(before: FloatArray, after: FloatArray) -> bool:
     both = np.isfinite(before) & np.isfinite(after)
     if not both.any():
         return False
@@ -237,7 +237,7 @@ def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
     return sure or now < min(_BETTER * was, was - _NEARER_M)
 
 
-def _fit(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> bool:
+def _fit(points: Sequence[Float32Array], poses: FloatArray) -> bool:
     """Return whether enough walls of single scans are flat together with the other scans there;
     True if there are few walls.
     """
@@ -256,19 +256,17 @@ def _fit(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> b
     return walls < _FEW_WALLS * len(points) or common > _COMMON * walls
 
 
-def _is_flat(covariances: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_flat(covariances: FloatArray) -> BoolArray:
     values, _ = principal_axes(covariances)
     return np.asarray((values[:, 0] < 0.1 * values[:, 1]) & (values[:, 1] > _WIDE_M2))
 
 
-def _changes(
-    given: NDArray[np.float64], aligned: NDArray[np.float64], span: int = 1
-) -> NDArray[np.float64]:
+def _changes(given: FloatArray, aligned: FloatArray, span: int = 1) -> FloatArray:
     before, after = (multiply(invert(poses[:-span]), poses[span:]) for poses in (given, aligned))
     return small_motions(multiply(invert(before), after))
 
 
-def _is_near(held: NDArray[np.float64], aligned: NDArray[np.float64]) -> bool:
+def _is_near(held: FloatArray, aligned: FloatArray) -> bool:
     """Return whether no motion changed by more than the greatest error of the poses of a drive."""
     off = aligned[:, :3, 3] - held[:, :3, 3]
     for span, most_m, most_rad in ((1, _FARTHEST_M, _FARTHEST_RAD), (_SPAN, _OFF_M, _OFF_RAD)):
@@ -279,15 +277,13 @@ def _is_near(held: NDArray[np.float64], aligned: NDArray[np.float64]) -> bool:
     return True
 
 
-def finite_mean(values: NDArray[np.float64]) -> float:
+def finite_mean(values: FloatArray) -> float:
     """Return the mean of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else math.nan
 
 
-def disagreement(
-    points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def disagreement(points: Sequence[Float32Array], poses: FloatArray) -> FloatArray:
     """Return the (F,) root mean square distances of each scan from the planes of the others,
     metres; NaN where there are none.
 
@@ -306,10 +302,10 @@ def disagreement(
 @cached
 def _add_distances(
     block: Clusters,
-    poses: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    thickness: NDArray[np.float64],
-    result: NDArray[np.float64],
+    poses: FloatArray,
+    normals: FloatArray,
+    thickness: FloatArray,
+    result: FloatArray,
 ) -> None:
     """Add to `result`, (F, 2), the squared distances of the clusters of each scan from the planes
     of the others, and their number.

@@ -1,5 +1,5 @@
 """Small linear problems, solved with the same bits on every processor; smoothing and resampling
-over time; headings.
+over time; headings; pairs of least cost.
 
 `np.linalg` is not used: LAPACK rounds differently on different processors.
 """
@@ -7,8 +7,8 @@ over time; headings.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import multiply
 
@@ -17,7 +17,7 @@ _SWEEPS = 12  # greatest number for Jacobi's method, which takes about five
 
 
 @cached(error_model="python")
-def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def least_squares(design: FloatArray, values: FloatArray) -> FloatArray:
     """Return the (K, D) parameters x for which `design @ x` is nearest to the values; the columns
     are orthogonalised one after the other.
 
@@ -73,7 +73,7 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
 
 
 @cached
-def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return the (N,) solution of a positive definite system, by Cholesky's method.
 
     Args:
@@ -106,8 +106,8 @@ def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> N
 
 @cached(error_model="python")
 def principal_axes(
-    covariances: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    covariances: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
     """Return the eigenvalues of symmetric matrices, increasing, and their eigenvectors, by Jacobi's
     method.
 
@@ -163,7 +163,7 @@ def principal_axes(
     return values, vectors
 
 
-def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def nearest_rotation(matrix: FloatArray) -> FloatArray:
     """Return the (3, 3) rotation nearest to a (3, 3) mean of rotations; the identity if these have
     no mean direction.
     """
@@ -179,11 +179,11 @@ def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def smooth(
-    values: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    values: FloatArray,
+    seconds: FloatArray,
+    weights: FloatArray,
     half_s: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Fit a parabola around each time, robustly; a straight line if there are few values.
 
     Args:
@@ -203,11 +203,11 @@ def smooth(
 
 def smooth_at(
     index: int,
-    values: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    values: FloatArray,
+    seconds: FloatArray,
+    weights: FloatArray,
     half_s: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Return the (D,) value and the (D,) derivative of `smooth` at one index."""
     distance = np.abs(seconds - seconds[index])
     near = np.flatnonzero(distance <= half_s + 1e-9)
@@ -225,18 +225,18 @@ def smooth_at(
     return fit[0], fit[1] if degree else np.zeros_like(fit[0])
 
 
-def _median(values: NDArray[np.float64]) -> float:
-    """Return the median of (N,) values, N > 0; `np.median` takes five times as long for few values."""
+def _median(values: FloatArray) -> float:
+    """Return the median of (N,) values, N > 0; for few, `np.median` takes five times as long."""
     ranked, half = np.sort(values), len(values) // 2
     return float(ranked[half]) if len(values) % 2 else float((ranked[half - 1] + ranked[half]) / 2)
 
 
 def resample(
-    at: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    velocities: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    at: FloatArray,
+    seconds: FloatArray,
+    positions: FloatArray,
+    velocities: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
     """Return positions and velocities at other times: linear between the known times, at constant
     velocity beyond.
 
@@ -255,7 +255,7 @@ def resample(
     return path + speed * beyond[:, None], speed
 
 
-def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
+def headings_of(velocities: FloatArray) -> FloatArray:
     """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated
     while the actor is slow.
     """
@@ -267,6 +267,17 @@ def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.interp(np.arange(len(velocities)), fast, angles)
 
 
-def fast_rows(velocities: NDArray[np.float64]) -> NDArray[np.int64]:
+def fast_rows(velocities: FloatArray) -> IntArray:
     """Return at which of (F, 3) velocities an actor moves fast enough to show where it points."""
     return np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
+
+
+def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
+    """Pair first and second numbers by (cost, first, second), the lowest cost first, each number
+    once; return the second by the first.
+    """
+    taken: dict[int, int] = {}
+    for _, i, j in sorted(costs):
+        if i not in taken and j not in taken.values():
+            taken[i] = j
+    return taken

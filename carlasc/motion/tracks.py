@@ -13,6 +13,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 from carlasc.core.geometry import (
     Transform,
     invert,
@@ -71,15 +79,15 @@ class Track:
 
     label: int
     instance: int
-    members: Mapping[int, NDArray[np.integer]]
+    members: Mapping[int, AnyIntArray]
     first: int
-    world_T_actor: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    world_T_actor: FloatArray
+    velocity: FloatArray
+    lower: FloatArray
+    upper: FloatArray
     extent: Extent
     rigid: bool = True
-    surface: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    surface: Float32Array = field(default_factory=lambda: np.empty((0, 3), np.float32))
     confidence: float = 1.0
 
     def pose(self, frame: int) -> Transform | None:
@@ -87,7 +95,7 @@ class Track:
         row = frame - self.first
         return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
 
-    def velocity_at(self, frame: int) -> NDArray[np.float64] | None:
+    def velocity_at(self, frame: int) -> FloatArray | None:
         """Return (3,) m/s, world, at a frame; None if the track does not extend to it."""
         row = frame - self.first
         return self.velocity[row] if 0 <= row < len(self.velocity) else None
@@ -103,7 +111,7 @@ class Track:
         return replace(self, members=members, first=start, world_T_actor=poses, velocity=velocity)
 
     @property
-    def size(self) -> NDArray[np.float64]:
+    def size(self) -> FloatArray:
         """(3,) metres: length, width, height of the body."""
         return self.upper - self.lower
 
@@ -215,9 +223,7 @@ def _with_body(track: Track, sizes: Sizes) -> Track:
     )
 
 
-def _integrate(
-    velocities: NDArray[np.float64], seconds: NDArray[np.float64], chain: Sequence[Segment]
-) -> NDArray[np.float64]:
+def _integrate(velocities: FloatArray, seconds: FloatArray, chain: Sequence[Segment]) -> FloatArray:
     """Integrate velocities by the trapezoidal rule, through the centre of the segment with most
     points.
     """
@@ -230,8 +236,8 @@ def _integrate(
 
 
 def _fit_box(
-    chain: Sequence[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], Extent, NDArray[np.float64]]:
+    chain: Sequence[Segment], positions: FloatArray, headings: FloatArray
+) -> tuple[FloatArray, Extent, FloatArray]:
     """Move the path to the centre of the visible part of the actor; return it, the extent, and the
     points in the actor frame.
 
@@ -257,7 +263,7 @@ def _fit_box(
 
 def _frames_around(
     first: int, last: int, times: Mapping[int, float]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[IntArray, FloatArray]:
     """Return the frames from `_EXTRAPOLATE_S` before `first` to as long after `last`, and their
     times.
 
@@ -291,17 +297,17 @@ class MovingActors:
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
-    moving: Mapping[int, NDArray[np.integer]] = field(default_factory=dict)
+    moving: Mapping[int, AnyIntArray] = field(default_factory=dict)
     summary: tuple[Mapping[str, Any], ...] = ()
-    own: tuple[NDArray[np.float64], ...] = ()
+    own: tuple[FloatArray, ...] = ()
     numbers: Mapping[int, int] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls,
         tracks: list[Track],
-        moving: Mapping[int, NDArray[np.integer]] | None = None,
-        own: Sequence[NDArray[np.float64]] = (),
+        moving: Mapping[int, AnyIntArray] | None = None,
+        own: Sequence[FloatArray] = (),
     ) -> Self:
         """Return the actors of tracks: moving ones with their tracks, static ones in the summary
         only.
@@ -330,7 +336,7 @@ class MovingActors:
         numbers = {number: self.numbers[number] for number in tracks} if self.numbers else {}
         return MovingActors(tracks, moving, own=self.own, numbers=numbers)
 
-    def is_own(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def is_own(self, points: AnyFloatArray) -> BoolArray:
         """Return which of (N, 3) points, metres, sensor frame, are on the recording vehicle."""
         own = np.zeros(len(points), np.bool_)
         for corners in self.own:
@@ -366,7 +372,9 @@ class MovingActors:
                 frames.append((number, frame, len(own)))
         # Tables of numbers, one row per track or per scan of a track, and the values of all tracks
         # one after the other: a file of ten arrays is read at once, whatever the number of tracks.
+        about = json.dumps({"key": key, "summary": self.summary}).encode()
         arrays = {
+            "about": np.frombuffer(about, np.uint8),
             "table": np.array(table, np.int64).reshape(-1, 8),
             "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
             "velocities": np.concatenate([np.empty((0, 3)), *velocities]),
@@ -382,9 +390,8 @@ class MovingActors:
             ).reshape(-1, 2),
             "own": np.array(self.own, np.float64).reshape(-1, 6),
         }
-        about = json.dumps({"key": key, "summary": self.summary})
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, about=np.frombuffer(about.encode(), np.uint8), **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
         return buffer.getvalue()
 
     @classmethod
@@ -416,7 +423,7 @@ def is_doubtful(confidence: float) -> bool:
 
 
 def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
-    members: dict[int, dict[int, NDArray[np.integer]]] = {}
+    members: dict[int, dict[int, AnyIntArray]] = {}
     offset = 0
     for number, frame, count in arrays["frames"].tolist():
         members.setdefault(number, {})[frame] = arrays["members"][offset : offset + count]

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array
 from carlasc.core.cells import Pose, fast_azimuth, transform
 from carlasc.core.compiling import cached, inlined
 
@@ -49,14 +50,12 @@ class SortedReturns(NamedTuple):
     """
 
     start: NDArray[np.int32]
-    slope: NDArray[np.float32]
-    distance: NDArray[np.float32]
-    origin: NDArray[np.float32]
+    slope: Float32Array
+    distance: Float32Array
+    origin: Float32Array
 
     @classmethod
-    def of(
-        cls, points: NDArray[np.float32], origins: NDArray[np.float32] | None = None
-    ) -> SortedReturns:
+    def of(cls, points: Float32Array, origins: Float32Array | None = None) -> SortedReturns:
         """Sort the points of a scan by the directions of their rays.
 
         A column holds rays with one origin. Where the first and the last rays of a turn of a moving
@@ -76,8 +75,8 @@ class SortedReturns(NamedTuple):
 
 @cached
 def _directions(
-    points: NDArray[np.float32],
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+    points: Float32Array,
+) -> tuple[NDArray[np.int32], Float32Array, Float32Array]:
     """Return the column of each point, seen from (0, 0, 0), or -1 if it is too near; its slope; and
     its distance.
     """
@@ -102,8 +101,8 @@ def _directions(
 
 @cached
 def _by_column(
-    column: NDArray[np.int32], slope: NDArray[np.float32], began: NDArray[np.float32]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    column: NDArray[np.int32], slope: Float32Array, began: Float32Array
+) -> tuple[NDArray[np.int32], NDArray[np.int32], Float32Array]:
     """Return `start`, the indices of the points in the order of columns and slopes, and `origin`:
     see `SortedReturns`.
     """
@@ -152,7 +151,7 @@ def _column(azimuth: float) -> int:
 
 @cached
 def look_up(
-    points: NDArray[np.float32],
+    points: Float32Array,
     asked: NDArray[np.int32],
     pose: Pose,
     view: SortedReturns,
