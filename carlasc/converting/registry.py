@@ -123,7 +123,8 @@ def find_recordings(converter: Converter) -> list[Recording]:
             name for name in converter_names() if _finds(name, type(converter), converter.source)
         ]
         if others:
-            error.advice = f"use {' or '.join(f'`carlasc convert {name}`' for name in others)}, which can read this folder"
+            commands = " or ".join(f"`carlasc convert {name}`" for name in others)
+            error.advice = f"use {commands}, which can read this folder"
         elif _is_in_layout(converter.source):
             error.advice = (
                 "make grids with `carlasc regrid`, because this folder has CarlaSC's layout already"
@@ -145,7 +146,7 @@ def _finds(name: str, other_than: type[Converter], source: Path) -> bool:
         return kind is not other_than and any(
             recording.frames for recording in kind(source).sequences()
         )
-    except Exception:  # noqa: BLE001 (code of another distribution, which is not needed here, may fail in any way)
+    except Exception:  # noqa: BLE001 (another distribution, which may fail in any way)
         return False
 
 
@@ -253,8 +254,8 @@ def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDecl
         if part is not NoneType
     ]
     choices = get_args(types[0]) if get_origin(types[0]) is Literal else ()
-    found = None if len(types) > 1 else str if choices else types[0]
-    if found not in (str, int, float, bool) or not all(
+    option_type = None if len(types) > 1 else str if choices else types[0]
+    if option_type not in (str, int, float, bool) or not all(
         isinstance(choice, str) for choice in choices
     ):
         expected = "an option of the type str, int, float, bool or a Literal of texts"
@@ -265,7 +266,7 @@ def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDecl
         raise DependencyError(
             f"{kind.__name__}: {parameter.name}", expected="a default", found="none"
         )
-    return OptionDeclaration(parameter.name, found, parameter.default, text, choices)
+    return OptionDeclaration(parameter.name, option_type, parameter.default, text, choices)
 
 
 def _load(group: str, base: type, name: str) -> Any:
@@ -279,13 +280,13 @@ def _load(group: str, base: type, name: str) -> Any:
         )
     where = f"{base.__name__.lower()} {name} ({entries[name].value})"
     try:
-        found = entries[name].load()
+        loaded = entries[name].load()
     except Exception as error:  # code of another distribution may fail in any way
         raise DependencyError(where, problem=f"cannot be loaded: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, base)):
+    if not (isinstance(loaded, type) and issubclass(loaded, base)):
         expected = f"a class that inherits carlasc.converting.{base.__name__}"
-        raise DependencyError(where, expected=expected, found=repr(found))
-    return found
+        raise DependencyError(where, expected=expected, found=repr(loaded))
+    return loaded
 
 
 def _entries(group: str) -> dict[str, EntryPoint]:

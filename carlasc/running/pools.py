@@ -1,4 +1,4 @@
-"""A pool of worker processes that can be stopped immediately, and that are replaced when they die."""
+"""A pool of worker processes that can be stopped at once, and that are replaced when they die."""
 
 from __future__ import annotations
 
@@ -232,7 +232,8 @@ def inherited_by_workers() -> Iterator[None]:
     Processes that are started in it inherit both.
     """
     before = {name: os.environ.get(name) for name in ONE_THREAD}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    set_mask = getattr(signal, "pthread_sigmask", None)  # POSIX only
+    mask = set_mask and set_mask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
@@ -242,7 +243,8 @@ def inherited_by_workers() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if set_mask:
+            set_mask(signal.SIG_SETMASK, mask)
 
 
 def _prepare_worker(first: Semaphore, requests: list[NoteRequest]) -> None:
