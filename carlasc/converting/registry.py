@@ -53,8 +53,8 @@ def load_converter(name: str) -> type[Converter]:
         ArgumentError: no converter has that name.
         DependencyError: it cannot be loaded, or is not a converter.
     """
-    found: type[Converter] = _load(GROUP, Converter, name)
-    return found
+    kind: type[Converter] = _load(GROUP, Converter, name)
+    return kind
 
 
 def load_exporter(name: str) -> type[Exporter]:
@@ -64,8 +64,8 @@ def load_exporter(name: str) -> type[Exporter]:
         ArgumentError: no exporter has that name.
         DependencyError: it cannot be loaded, or is not an exporter.
     """
-    found: type[Exporter] = _load(EXPORTERS, Exporter, name)
-    return found
+    kind: type[Exporter] = _load(EXPORTERS, Exporter, name)
+    return kind
 
 
 def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
