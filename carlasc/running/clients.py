@@ -172,8 +172,10 @@ def run_on_cluster(
         tasks = _Tasks(client, function, distributed)
         waiting = iter(items)
         try:
-            # the first time, one worker compiles before the others start
-            tasks.submit(list(islice(waiting, 1 if is_first_use(function) else tasks.window)))
+            if is_first_use(function):  # one worker compiles before the others start
+                tasks.submit(list(islice(waiting, 1)))
+                tasks.pending[0][1].exception()  # waits for its end
+            tasks.submit(list(islice(waiting, tasks.window)))
             while tasks.pending:
                 yield from tasks.take(lost)
                 # several at once, because a call costs as much as a task

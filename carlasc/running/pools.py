@@ -159,6 +159,9 @@ class _RetriedTask(Future[Any]):
         except BrokenProcessPool as error:
             raise LostTaskError from error
 
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        return self._attempt.exception(timeout)
+
     def cancel(self) -> bool:
         self._owner.forget(self)
         return self._attempt.cancel()

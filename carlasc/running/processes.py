@@ -80,7 +80,7 @@ def _submit_all(
     lost: Callable[[Item, str], Result] | None,
 ) -> Iterator[Result]:
     pending: deque[tuple[Item, Future[Result]]] = deque()
-    compiles = is_first_use(function)
+    compiles = is_first_use(function)  # then the first item is done alone
 
     def take() -> Result:
         item, future = pending.popleft()
@@ -93,10 +93,12 @@ def _submit_all(
 
     try:
         for item in items:
-            if len(pending) == (1 if compiles else limit):
+            if len(pending) == limit:
                 yield take()
-                compiles = False
             pending.append((item, executor.submit(function, item)))
+            if compiles:
+                pending[0][1].exception()  # waits for its end
+                compiles = False
         while pending:
             yield take()
     except BrokenExecutor as error:

@@ -85,6 +85,8 @@ def test_a_note_is_given_once_where_compiling_takes_long_and_never_where_it_was_
 
 WORKERS = """
 import sys
+from carlasc.core import first_use
+from carlasc.running.pools import OwnProcesses
 
 def work(number):
     from carlasc.metrics.confusion import ConfusionMatrix
