@@ -14,8 +14,8 @@ import carlasc
 from carlasc import Run
 from carlasc.converting import Cloud, Sensor
 from carlasc.converting.assembling import Rig, assemble
+from carlasc.converting.frame_stages import make_fields
 from carlasc.converting.layout_options import AxesAndClasses
-from carlasc.converting.scan_stage import make_fields
 from carlasc.core.tables import CARLA
 from carlasc.errors import FormatError
 from carlasc.groundtruth import FromScans

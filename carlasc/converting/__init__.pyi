@@ -5,6 +5,7 @@ from .exporter import FrameExporter as FrameExporter
 from .exporter import SequenceExporter as SequenceExporter
 from .exporter import SequenceFile as SequenceFile
 from .exporting import export as export
+from .frame_stages import VOXEL_FILES as VOXEL_FILES
 from .layout_options import FlowSource as FlowSource
 from .layout_options import LayoutOptions as LayoutOptions
 from .plans import SplitName as SplitName
@@ -34,4 +35,3 @@ from .results import ConvertResult as ConvertResult
 from .results import ExportResult as ExportResult
 from .results import Failure as Failure
 from .run import convert as convert
-from .scan_stage import VOXEL_FILES as VOXEL_FILES

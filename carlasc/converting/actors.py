@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, LabelArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
 from carlasc.motion.paths import estimate_path, is_static
@@ -42,12 +43,12 @@ class ActorObservation:
 
     actor: int
     label: int
-    points: NDArray[np.float32]
+    points: Float32Array
 
 
 def find_actors(
-    points: NDArray[np.float32],
-    labels: NDArray[np.unsignedinteger],
+    points: Float32Array,
+    labels: LabelArray,
     instances: NDArray[np.uint32],
     classes: ClassTable,
 ) -> tuple[ActorObservation, ...]:
@@ -85,7 +86,7 @@ class _ObservationChain:
     frames: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     poses: list[Transform] = field(default_factory=list)
-    points: list[NDArray[np.float32]] = field(default_factory=list)
+    points: list[Float32Array] = field(default_factory=list)
 
     def size(self) -> int:
         """Return the number of points."""
@@ -127,7 +128,7 @@ class ActorMotion:
         run: how the work is spread.
     """
 
-    def __init__(self, classes: ClassTable, run: Run = Run(workers=1)) -> None:  # noqa: B008 (frozen)
+    def __init__(self, classes: ClassTable, run: Run) -> None:
         self._estimate, self._run_options = _VelocityEstimate(classes), run
         self._chains: dict[int, _ObservationChain] = {}
         self._ended: list[_ObservationChain] = []

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Cloud, FrameHandle, Sensor, Trajectory
+from carlasc.core.arrays import Float32Array, FloatArray, LabelArray
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.errors import CarlascError, FormatError, describe
 from carlasc.motion.odometry import move_each, ticks_of
@@ -62,8 +63,8 @@ class Assembled:
         fields: further fields of the layout by name.
     """
 
-    points: NDArray[np.float32]
-    labels: NDArray[np.unsignedinteger] | None
+    points: Float32Array
+    labels: LabelArray | None
     instances: NDArray[np.uint32] | None
     fields: dict[str, NDArray[Any]]
 
@@ -177,7 +178,7 @@ def _follows_motion(cloud: Cloud, rig: Rig, motion: VehicleMotion | None) -> boo
 
 def _place(
     cloud: Cloud, rig: Rig, motion: VehicleMotion | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Float32Array, Float32Array]:
     """Return the (N, 4) points and the (N, 3) origins of their rays, in the frame of the scan."""
     sensor = rig.sensors[cloud.sensor]
     scan_T_vehicle = invert(rig.vehicle_T_scan)
@@ -205,7 +206,7 @@ def _place(
     return points, origins
 
 
-def _origin(sensor: Sensor, scan_T_points: Transform) -> NDArray[np.float32]:
+def _origin(sensor: Sensor, scan_T_points: Transform) -> Float32Array:
     """Return the position of a sensor in the frame of the scan; exactly the origin if it differs by
     rounding only.
     """
@@ -214,9 +215,7 @@ def _origin(sensor: Sensor, scan_T_points: Transform) -> NDArray[np.float32]:
     return origin.astype(np.float32)
 
 
-def _thinned(
-    path: NDArray[np.float64], sensor: Sensor, scan_T_points: Transform
-) -> NDArray[np.float32]:
+def _thinned(path: FloatArray, sensor: Sensor, scan_T_points: Transform) -> Float32Array:
     """Return (T, 3) positions of a sensor over a sweep; neighbours within `_APART_M` are equal."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     if length[-1] < _APART_M:
@@ -230,7 +229,7 @@ def _thinned(
     return middle[part].astype(np.float32)
 
 
-def _moved(scan_T_points: Transform, points: NDArray[np.float32]) -> NDArray[np.float32]:
+def _moved(scan_T_points: Transform, points: Float32Array) -> Float32Array:
     """Return (N, 4) points in the frame of the scan; the same numbers where the frames are the
     same.
     """

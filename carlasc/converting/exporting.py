@@ -138,9 +138,9 @@ def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
         FormatError: two sequences have the same name, so that they would be written to the same
             place.
     """
-    found: dict[str, storage.Sequence] = {}
+    by_name: dict[str, storage.Sequence] = {}
     for sequence in source.sequences().values():
-        other = found.get(sequence.name)
+        other = by_name.get(sequence.name)
         if other is not None and (
             other.split != sequence.split or other.coordinates == sequence.coordinates
         ):
@@ -151,20 +151,20 @@ def _by_name(source: storage.Source) -> dict[str, storage.Sequence]:
                 advice="export them one after the other, each to a folder of its own",
             )
         if other is None or sequence.coordinates == "cartesian":
-            found[sequence.name] = sequence
-    return found
+            by_name[sequence.name] = sequence
+    return by_name
 
 
 def _choose(
-    found: Mapping[str, storage.Sequence], wanted: Collection[str] | None, location: str
+    by_name: Mapping[str, storage.Sequence], wanted: Collection[str] | None, location: str
 ) -> list[storage.Sequence]:
-    if wanted is not None and (unknown := [name for name in wanted if name not in found]):
+    if wanted is not None and (unknown := [name for name in wanted if name not in by_name]):
         raise MissingDataError(
             location,
             expected=f"the sequences {', '.join(unknown)}",
-            found=f"only {', '.join(found)}",
+            found=f"only {', '.join(by_name)}",
         )
-    return [sequence for name, sequence in found.items() if wanted is None or name in wanted]
+    return [sequence for name, sequence in by_name.items() if wanted is None or name in wanted]
 
 
 def _place(exporter: Exporter, exported: Exported) -> str:
@@ -386,22 +386,22 @@ class ExportRecord:
         """
         known, wanted = self._all.get(self._name, {}).get(self._product, {}), _plain(settings)
         for place, sequence in sequences.items():
-            found = known.get(place)
-            if found is None:
+            record = known.get(place)
+            if record is None:
                 continue
             where = self._path.parent / place
-            if found["sequence"] != sequence.path:
+            if record["sequence"] != sequence.path:
                 raise ConflictError(
                     where,
                     expected=f"the sequence {sequence.path or '.'}",
-                    found=f"{found['sequence'] or '.'}, which was exported earlier",
+                    found=f"{record['sequence'] or '.'}, which was exported earlier",
                     advice="write to another folder, or replace it with `overwrite=True`",
                 )
-            if found["settings"] != wanted:
+            if record["settings"] != wanted:
                 raise ConflictError(
                     where,
                     expected=f"frames that were exported with {_listed(wanted)}",
-                    found=_listed(found["settings"]),
+                    found=_listed(record["settings"]),
                     advice="write to another folder, or replace them with `overwrite=True`",
                 )
 

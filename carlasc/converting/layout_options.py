@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.converting.protocol import Converter
+from carlasc.core.arrays import LabelArray
 from carlasc.core.choices import FlowSource as FlowSource  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Images as Images  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Remap
@@ -96,7 +97,7 @@ class AxesAndClasses:
         """Table of the ids that are written."""
         return self.source if self.remap is None else self.remap.target
 
-    def map_labels(self, labels: NDArray[np.unsignedinteger], where: str) -> NDArray[np.uint32]:
+    def map_labels(self, labels: LabelArray, where: str) -> NDArray[np.uint32]:
         """Return the ids that are written for the ids that were read.
 
         Raises:
@@ -129,7 +130,7 @@ def _lookup_table(ids: tuple[int, ...], targets: tuple[int, ...]) -> NDArray[np.
     return lookup
 
 
-def _list_ids(labels: NDArray[np.unsignedinteger]) -> str:
+def _list_ids(labels: LabelArray) -> str:
     ids, counts = np.unique(labels, return_counts=True)
     named = [f"{i} ({n} times)" for i, n in zip(ids.tolist(), counts.tolist(), strict=True)]
     more = f" and {len(named) - _MAX_LISTED} more" if len(named) > _MAX_LISTED else ""

@@ -1,4 +1,4 @@
-"""The plan of a conversion: the requested recordings, the output of each, and its poses and times."""
+"""The plan of a conversion: the requested recordings, their outputs, their poses and times."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.assembling import Rig, VehicleMotion
 from carlasc.converting.layout_options import AxesAndClasses
@@ -24,6 +23,7 @@ from carlasc.converting.trajectory import (
     read_trajectory,
     scan_poses,
 )
+from carlasc.core.arrays import FloatArray
 from carlasc.core.axes import mirror_poses, mirror_spec
 from carlasc.core.boxes import Boxes
 from carlasc.core.choices import SplitName as SplitName  # noqa: PLC0414 (part of this module)
@@ -63,9 +63,9 @@ class RecordingPlan:
 
     recording: Recording
     writer: SequenceWriter
-    times: NDArray[np.float64]
+    times: FloatArray
     trajectory: Trajectory | None
-    poses: NDArray[np.float64] | None
+    poses: FloatArray | None
     pose_source: str
     boxes: dict[int, Boxes] | None
     flow: bool
@@ -74,7 +74,7 @@ class RecordingPlan:
     missing: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
 
-    def take_estimate(self, first_T_scan: NDArray[np.float64]) -> None:
+    def take_estimate(self, first_T_scan: FloatArray) -> None:
         """Take estimated poses, (F, 4, 4) by frame number."""
         self.poses = first_T_scan
         self.trajectory = at_frames(
@@ -257,14 +257,14 @@ def _read_boxes(recording: Recording) -> dict[int, Boxes] | None:
     last = recording.frames[-1].number
     scan_T_vehicle = invert(recording.vehicle_T_scan)
     moved = not np.array_equal(scan_T_vehicle, np.eye(4))
-    found = {}
+    moved_boxes = {}
     for number, own in boxes.items():
         if number <= last:  # also of frames without a scan, because they show the motion of objects
             try:
-                found[number] = own.transform(scan_T_vehicle) if moved else own
+                moved_boxes[number] = own.transform(scan_T_vehicle) if moved else own
             except FormatError as error:
                 raise error.within(f"{recording.location}: frame {number}") from error
-    return found
+    return moved_boxes
 
 
 def _check_voxels(recording: Recording, writer: SequenceWriter, target: AxesAndClasses) -> GridSpec:

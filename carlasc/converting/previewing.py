@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.assembling import Rig, read_scan
 from carlasc.converting.plans import SplitName, choose_recordings
 from carlasc.converting.protocol import Converter, Recording
 from carlasc.converting.registry import find_recordings, open_converter
 from carlasc.converting.trajectory import FILE, KISS_ICP, frame_times, read_trajectory
+from carlasc.core.arrays import Float32Array
 from carlasc.groundtruth.heights import find_ground
 from carlasc.motion.options import PoseOptions
 
@@ -132,7 +132,7 @@ def _preview(recording: Recording, poses: PoseOptions) -> RecordingPreview:
     )
 
 
-def _ground(points: NDArray[np.float32]) -> tuple[str | None, float | None]:
+def _ground(points: Float32Array) -> tuple[str | None, float | None]:
     """Return the direction away from the ground, and the height of the sensor above it, of (N, 3)
     points.
     """

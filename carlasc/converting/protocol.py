@@ -24,6 +24,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, LabelArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.cameras import CameraModel
 from carlasc.core.classes import ClassTable, Remap
@@ -67,7 +68,7 @@ class Sensor:
         return self.vehicle_T_sensor if self.points_in == "sensor" else np.eye(4)
 
     @property
-    def origin(self) -> NDArray[np.float64]:
+    def origin(self) -> FloatArray:
         """(3,) position of the sensor in the frame of the points, metres."""
         return np.zeros(3) if self.points_in == "sensor" else self.vehicle_T_sensor[:3, 3]
 
@@ -91,11 +92,11 @@ class Cloud:
         sensor: index of the sensor in `Recording.sensors`.
     """
 
-    points: NDArray[np.float32]
-    labels: NDArray[np.unsignedinteger] | None = None
+    points: Float32Array
+    labels: LabelArray | None = None
     instances: NDArray[np.uint32] | None = None
-    seconds: NDArray[np.floating] | None = None
-    origins: NDArray[np.float32] | None = None
+    seconds: AnyFloatArray | None = None
+    origins: Float32Array | None = None
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     sensor: int = 0
 
@@ -116,8 +117,8 @@ class VoxelContent:
             write them again.
     """
 
-    labels: NDArray[np.unsignedinteger]
-    known: NDArray[np.bool_]
+    labels: LabelArray
+    known: BoolArray
     files: Mapping[str, bytes] = field(default_factory=dict)
 
 
@@ -136,8 +137,8 @@ class Trajectory:
             not finite.
     """
 
-    world_T_vehicle: NDArray[np.float64]
-    seconds: NDArray[np.float64] | None = None
+    world_T_vehicle: FloatArray
+    seconds: FloatArray | None = None
     where: str = "poses"
 
     def __post_init__(self) -> None:
@@ -156,7 +157,7 @@ class Trajectory:
         if self.seconds is not None:
             check_seconds(self.seconds, self.where)
 
-    def at(self, seconds: NDArray[np.floating]) -> NDArray[np.float64]:
+    def at(self, seconds: AnyFloatArray) -> FloatArray:
         """Return (..., 4, 4) world_T_vehicle at some times (...,), by the clock of `seconds`, which
         must be known.
 
@@ -236,7 +237,7 @@ class Recording(ABC):
         """
         return None
 
-    def times(self) -> NDArray[np.float64] | None:
+    def times(self) -> FloatArray | None:
         """Return (F,) seconds by frame number; None if the recording has no times.
 
         Missing frames may have any time.

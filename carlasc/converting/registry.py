@@ -53,8 +53,8 @@ def load_converter(name: str) -> type[Converter]:
         ArgumentError: no converter has that name.
         DependencyError: it cannot be loaded, or is not a converter.
     """
-    found: type[Converter] = load_plugin(GROUP, name, Converter)
-    return found
+    kind: type[Converter] = load_plugin(GROUP, name, Converter)
+    return kind
 
 
 def load_exporter(name: str) -> type[Exporter]:
@@ -64,8 +64,8 @@ def load_exporter(name: str) -> type[Exporter]:
         ArgumentError: no exporter has that name.
         DependencyError: it cannot be loaded, or is not an exporter.
     """
-    found: type[Exporter] = load_plugin(EXPORTERS, name, Exporter)
-    return found
+    kind: type[Exporter] = load_plugin(EXPORTERS, name, Exporter)
+    return kind
 
 
 def remaps_to_carla(table: ClassTable) -> tuple[Remap, ...] | None:
@@ -123,7 +123,8 @@ def find_recordings(converter: Converter) -> list[Recording]:
             name for name in converter_names() if _finds(name, type(converter), converter.source)
         ]
         if others:
-            error.advice = f"use {' or '.join(f'`carlasc convert {name}`' for name in others)}, which can read this folder"
+            commands = " or ".join(f"`carlasc convert {name}`" for name in others)
+            error.advice = f"use {commands}, which can read this folder"
         elif _is_in_layout(converter.source):
             error.advice = (
                 "make grids with `carlasc regrid`, because this folder has CarlaSC's layout already"
@@ -145,7 +146,7 @@ def _finds(name: str, other_than: type[Converter], source: Path) -> bool:
         return kind is not other_than and any(
             recording.frames for recording in kind(source).sequences()
         )
-    except Exception:  # noqa: BLE001 (code of another distribution, which is not needed here, may fail in any way)
+    except Exception:  # noqa: BLE001 (another distribution, which may fail in any way)
         return False
 
 
@@ -253,8 +254,8 @@ def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDecl
         if part is not NoneType
     ]
     choices = get_args(types[0]) if get_origin(types[0]) is Literal else ()
-    found = None if len(types) > 1 else str if choices else types[0]
-    if found not in (str, int, float, bool) or not all(
+    option_type = None if len(types) > 1 else str if choices else types[0]
+    if option_type not in (str, int, float, bool) or not all(
         isinstance(choice, str) for choice in choices
     ):
         expected = "an option of the type str, int, float, bool or a Literal of texts"
@@ -265,4 +266,4 @@ def _declared(kind: type, parameter: inspect.Parameter, hint: Any) -> OptionDecl
         raise DependencyError(
             f"{kind.__name__}: {parameter.name}", expected="a default", found="none"
         )
-    return OptionDeclaration(parameter.name, found, parameter.default, text, choices)
+    return OptionDeclaration(parameter.name, option_type, parameter.default, text, choices)

@@ -10,6 +10,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, IntArray, LabelArray
 from carlasc.core.axes import mirror_grid, mirror_spec
 from carlasc.core.grids import GridSpec, most_frequent
 from carlasc.storage.metadata import Axes
@@ -76,11 +77,11 @@ def is_same(one: GridSpec, other: GridSpec) -> bool:
 
 
 def resample_to(
-    labels: NDArray[np.unsignedinteger],
-    known: NDArray[np.bool_],
+    labels: LabelArray,
+    known: BoolArray,
     source: GridSpec,
     target: GridSpec,
-) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_]]:
+) -> tuple[LabelArray, BoolArray]:
     """Express a Cartesian grid in the voxels of another one, in the same frame.
 
     Along an axis on which the target is not finer, a voxel of the source belongs to the voxel of
@@ -108,13 +109,13 @@ def resample_to(
     pairs = [_pair_axis(source, target, axis) for axis in range(3)]
     cells = np.nonzero((labels != 0) & known)
     rows = np.arange(len(cells[0]))
-    places: list[NDArray[np.int64]] = []
+    places: list[IntArray] = []
     for axis, pair in enumerate(pairs):  # a cell may go to several voxels of the target
         kept, place = _targets_of(cells[axis][rows], pair, source.size[axis])
         rows, places = rows[kept], [earlier[kept] for earlier in places] + [place]
-    found = labels[tuple(cell[rows] for cell in cells)]
+    classes = labels[tuple(cell[rows] for cell in cells)]
     resampled = np.zeros(target.num_voxels, labels.dtype)
-    voxels, winners = most_frequent(np.ravel_multi_index(tuple(places), target.size), found)
+    voxels, winners = most_frequent(np.ravel_multi_index(tuple(places), target.size), classes)
     resampled[voxels] = winners.astype(labels.dtype)
     seen = known
     # largest reduction first
@@ -123,9 +124,7 @@ def resample_to(
     return resampled.reshape(target.size), seen
 
 
-def _pair_axis(
-    source: GridSpec, target: GridSpec, axis: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _pair_axis(source: GridSpec, target: GridSpec, axis: int) -> tuple[IntArray, IntArray]:
     """Return which cells of the source go to which cells of the target along an axis: two arrays,
     which do not decrease.
     """
@@ -142,8 +141,8 @@ def _pair_axis(
 
 
 def _targets_of(
-    cells: NDArray[np.int64], pair: tuple[NDArray[np.int64], NDArray[np.int64]], size: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    cells: IntArray, pair: tuple[IntArray, IntArray], size: int
+) -> tuple[IntArray, IntArray]:
     """Return the cells of the target that cells of the source go to along an axis.
 
     Args:
@@ -164,11 +163,11 @@ def _targets_of(
 
 
 def _any_by_target(
-    values: NDArray[np.bool_],
-    pair: tuple[NDArray[np.int64], NDArray[np.int64]],
+    values: BoolArray,
+    pair: tuple[IntArray, IntArray],
     size: int,
     axis: int,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Return `values` with the cells of the target along an axis: each is true if any of its cells
     of the source is true.
     """
@@ -197,9 +196,8 @@ def resampling_notes(source: GridSpec, target: GridSpec, name: str) -> list[str]
     if (source.voxel_size > target.voxel_size * (1 + _SAME)).any():
         sizes = (" x ".join(f"{size:.3g}" for size in spec.voxel_size) for spec in (source, target))
         notes.append(
-            "the voxels of the grid {} are larger than those that are written: {} m, not {} m".format(
-                name, *sizes
-            )
+            "the voxels of the grid {} are larger than those that are written: {} m, not "
+            "{} m".format(name, *sizes)
         )
     slack = source.voxel_size / 2
     if (np.array(source.lower) > target.lower + slack).any() or (

@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from carlasc.converting.camera_stage import write_cameras
 from carlasc.converting.layout_options import LayoutOptions
 from carlasc.converting.plans import SplitName, choose_recordings, plan_recording, sequence_path
 from carlasc.converting.protocol import Converter, Recording
@@ -127,12 +126,13 @@ def convert(
 
     steps = StepCounter(run.progress, sum(len(plan.recording.frames) for plan in plans))
     with one_pool(run) as pooled:
-        conversions = [Conversion(plan, converter, target, pooled, steps) for plan in plans]
+        conversions = [
+            Conversion(plan, converter, target, layout.images, pooled, steps) for plan in plans
+        ]
         with ExitStack() as writers:
             for conversion in conversions:
                 writers.enter_context(conversion.plan.writer)
                 conversion.run(metadata)
-                conversion.notes += write_cameras(conversion.plan, target, layout.images)
         if sink is not out:
             sink.finish(incomplete=True)  # missing frames could not be read, and are reported
         made = None

@@ -1,5 +1,5 @@
 """The stages of the conversion of one recording: its scans are read once and written, then labels,
-boxes and flow from the motion of actors are added.
+boxes and flow from the motion of actors are added, and its cameras are written.
 """
 
 from __future__ import annotations
@@ -14,28 +14,33 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.actors import ActorMotion, Velocity
-from carlasc.converting.layout_options import AxesAndClasses
-from carlasc.converting.motion_stage import MotionBlock, MotionJob
-from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
-from carlasc.converting.protocol import Converter, FrameHandle
-from carlasc.converting.results import Failure
-from carlasc.converting.scan_stage import (
+from carlasc.converting.frame_stages import (
     ConvertedFrame,
+    MotionBlock,
+    MotionJob,
     ScanBlock,
     ScanJob,
     StageBlock,
     in_blocks,
     write_frames,
 )
+from carlasc.converting.layout_options import AxesAndClasses, Images
+from carlasc.converting.plans import RecordingPlan, begin, write_heights, write_poses
+from carlasc.converting.protocol import Converter, FrameHandle
+from carlasc.converting.results import Failure
 from carlasc.converting.trajectory import estimate_poses, fill_gaps, odometry_range
+from carlasc.core.arrays import Float32Array, FloatArray
 from carlasc.core.boxes import Boxes
+from carlasc.core.cameras import CameraModel
+from carlasc.core.geometry import invert
 from carlasc.groundtruth.heights import Ground, find_ground
 from carlasc.motion import Track, tracks_from_boxes
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
+from carlasc.storage import layout
+from carlasc.storage.camera_files import cameras_to_json
 from carlasc.storage.metadata import Metadata
 
 _GROUND_FRAMES = 5  # scans in which the ground is looked for
@@ -50,6 +55,7 @@ class Conversion:
         plan: what is read, and where it is written.
         converter: what reads the data set.
         target: how frames are written.
+        images: "copy", "link" or "none": the images of cameras.
         run_options: how the work is spread.
         steps: called after each frame of each stage.
         failures: frames that failed.
@@ -61,6 +67,7 @@ class Conversion:
     plan: RecordingPlan
     converter: Converter
     target: AxesAndClasses
+    images: Images
     run_options: Run
     steps: StepCounter
     failures: list[Failure] = field(default_factory=list)
@@ -91,6 +98,7 @@ class Conversion:
             Failure(plan.recording.location, *problem) for problem in plan.recording.problems()
         ]
         self.notes += self._remarks()
+        self.notes += _write_cameras(plan, self.target, self.images)
 
     @property
     def made(self) -> int:
@@ -129,24 +137,24 @@ class Conversion:
             )
             for part in in_blocks(jobs, lambda job: job.handle.number, plan.writer)
         ]
-        actors = ActorMotion(self.converter.classes, self.run_options)
-        found: dict[int, NDArray[np.float64]] = {}
+        actors = ActorMotion(self.converter.classes, self.run_options) if follow else None
+        poses: dict[int, FloatArray] = {}
         for result, pose in self._placed(self._work(blocks)):
             if estimate:
-                found[result.number] = pose
-            if follow:
+                poses[result.number] = pose
+            if actors is not None:
                 actors.add(result.number, float(plan.times[result.number]), pose, result.actors)
                 self._unnumbered += result.unnumbered
         # otherwise, the failures are reported
         if estimate and len(self._failed) < len(plan.recording.frames):
             plan.take_estimate(
-                fill_gaps(list(found), np.array(list(found.values())), plan.recording)
+                fill_gaps(list(poses), np.array(list(poses.values())), plan.recording)
             )
-        return actors.finish()
+        return {} if actors is None else actors.finish()
 
     def _placed(
         self, results: Iterator[ConvertedFrame]
-    ) -> Iterator[tuple[ConvertedFrame, NDArray[np.float64]]]:
+    ) -> Iterator[tuple[ConvertedFrame, FloatArray]]:
         """Yield the frames that were read with their poses, which are estimated if they are not
         known.
         """
@@ -160,7 +168,7 @@ class Conversion:
         waiting: deque[ConvertedFrame] = deque()
         read_at: list[float] = []
 
-        def scans() -> Iterator[tuple[NDArray[np.float32], None]]:
+        def scans() -> Iterator[tuple[Float32Array, None]]:
             for result in usable:
                 if result.points is not None and len(result.points) >= MIN_POINTS:
                     points, result.points = result.points, None
@@ -323,7 +331,7 @@ class Conversion:
 
 
 def _near(
-    tracks: list[Track], handles: Sequence[FrameHandle], poses: NDArray[np.float64]
+    tracks: list[Track], handles: Sequence[FrameHandle], poses: FloatArray
 ) -> tuple[Track, ...]:
     """Return the tracks near the sensor in some frames, cut to these frames, so that little is sent
     to a worker.
@@ -336,3 +344,59 @@ def _near(
         if len(places) and float(np.square(places - here).sum(axis=1).min()) < _NEAR_M**2:
             near.append(part)
     return tuple(near)
+
+
+def _write_cameras(plan: RecordingPlan, target: AxesAndClasses, images: Images) -> list[str]:
+    """Write the cameras of a recording, and their images if they are copied; return notes."""
+    cameras = plan.recording.cameras()
+    if not cameras:
+        return []
+    target_T_scan = np.diag([1.0, -1.0 if target.mirrored else 1.0, 1.0, 1.0])
+    scan_T_vehicle = target_T_scan @ invert(plan.rig.vehicle_T_scan)
+    written = [
+        camera.replaced(
+            sensor_T_camera=scan_T_vehicle @ camera.sensor_T_camera,
+            times=None if camera.times is None else camera.times - plan.times[0],
+            images=camera.images if images == "link" else None,
+        )
+        for camera in cameras
+    ]
+    content = cameras_to_json(written)
+    if plan.writer.read_document(layout.CAMERAS) != content:
+        plan.writer.write_document(layout.CAMERAS, content)
+    if images == "link" and not any(camera.images for camera in cameras):
+        return [
+            "no camera has images in separate files to link to: --images copy writes the images"
+        ]
+    return _copy_images(plan, cameras) if images == "copy" else []
+
+
+def _copy_images(plan: RecordingPlan, cameras: Sequence[CameraModel]) -> list[str]:
+    """Copy the images of all frames, those that are stored together at once; return the number of
+    missing images.
+    """
+    missing, blocks = 0, dict[int, list[int]]()
+    for handle in plan.recording.frames:
+        blocks.setdefault(handle.number // plan.writer.block, []).append(handle.number)
+    for numbers in blocks.values():
+        by_frame: dict[int, dict[str, np.ndarray]] = {}
+        for number in numbers:
+            for camera in cameras:
+                if any(
+                    plan.writer.has(f"images.{camera.name}.{suffix}", number)
+                    for suffix in layout.IMAGE_SUFFIXES
+                ):
+                    continue
+                if (image := plan.recording.image(camera, number)) is None:
+                    missing += 1
+                    continue
+                by_frame.setdefault(number, {})[f"images.{camera.name}.{image[0]}"] = np.frombuffer(
+                    image[1], np.uint8
+                )
+        if by_frame:
+            plan.writer.write_frames(by_frame)
+    return (
+        [f"{missing} images of cameras do not exist, or are neither .jpg nor .png"]
+        if missing
+        else []
+    )

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from carlasc.converting.assembling import Rig, read_scan
 from carlasc.converting.protocol import Converter, FrameHandle, Recording, Trajectory
+from carlasc.core.arrays import FloatArray
 from carlasc.core.frames import check_seconds
 from carlasc.core.geometry import relative_to
 from carlasc.errors import CarlascError, FormatError, MissingDataError
@@ -36,7 +36,7 @@ _SMOOTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 _JITTER_M = 0.05
 
 
-def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def frame_times(recording: Recording, times: FloatArray | None) -> FloatArray:
     """Return (F,) seconds by frame number, by the clock of the recording; without times, 10 Hz from
     0.
 
@@ -57,7 +57,7 @@ def frame_times(recording: Recording, times: NDArray[np.float64] | None) -> NDAr
 
 
 def read_trajectory(
-    recording: Recording, times: NDArray[np.float64], options: PoseOptions
+    recording: Recording, times: FloatArray, options: PoseOptions
 ) -> Trajectory | None:
     """Return the poses of the vehicle at their own times, from the recording's files; None if they
     must be estimated.
@@ -103,7 +103,7 @@ def read_trajectory(
     return trajectory
 
 
-def at_frames(world_T_vehicle: NDArray[np.float64], times: NDArray[np.float64]) -> Trajectory:
+def at_frames(world_T_vehicle: FloatArray, times: FloatArray) -> Trajectory:
     """Return the trajectory of (F, 4, 4) poses of frames.
 
     If times do not increase, 0.1 s between frames is assumed.
@@ -113,9 +113,7 @@ def at_frames(world_T_vehicle: NDArray[np.float64], times: NDArray[np.float64]) 
     return Trajectory(world_T_vehicle, times)
 
 
-def scan_poses(
-    trajectory: Trajectory, recording: Recording, times: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def scan_poses(trajectory: Trajectory, recording: Recording, times: FloatArray) -> FloatArray:
     """Return (F, 4, 4) first_T_scan by frame number.
 
     Poses with the times of frames are not changed, others are interpolated.
@@ -131,7 +129,7 @@ def scan_poses(
     return relative_to(poses[0], poses)
 
 
-def jitter(poses: NDArray[np.float64]) -> float:
+def jitter(poses: FloatArray) -> float:
     """Return the noise of (F, 4, 4) poses of frames about a smooth path, metres: such as that of an
     unfiltered receiver.
     """
@@ -144,11 +142,14 @@ def jitter(poses: NDArray[np.float64]) -> float:
     return float(np.median(np.linalg.norm(jumps, axis=1)) / np.linalg.norm(_SMOOTH))
 
 
-def jitter_note(poses: NDArray[np.float64]) -> str | None:
+def jitter_note(poses: FloatArray) -> str | None:
     """Return a note if poses jump; None if they do not."""
-    if (found := jitter(poses)) < _JITTER_M:
+    if (error_m := jitter(poses)) < _JITTER_M:
         return None
-    return f"poses jump by about {100 * found:.0f} cm from one to the next, which blurs grids: {_ESTIMATE}"
+    return (
+        f"poses jump by about {100 * error_m:.0f} cm from one to the next, which blurs grids: "
+        f"{_ESTIMATE}"
+    )
 
 
 @dataclass(frozen=True)
@@ -173,10 +174,10 @@ class _ReadUsable:
 def estimate_poses(
     recording: Recording,
     converter: Converter,
-    times: NDArray[np.float64],
+    times: FloatArray,
     step: Callable[[], object],
     run: Run,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Estimate the pose of each scan with KISS-ICP.
 
     A frame without a scan gets the pose of the scan before it.
@@ -203,7 +204,7 @@ def estimate_poses(
     from carlasc.motion import odometry
 
     rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
-    found: list[int] = []
+    numbers: list[int] = []
     read_at: list[float] = []  # times of the frames that were read
     errors: list[CarlascError | OSError] = []
 
@@ -214,7 +215,7 @@ def estimate_poses(
                 if isinstance(scan, Exception):
                     errors.append(scan)
                 elif len(scan[0]) >= odometry.MIN_POINTS:
-                    found.append(handle.number)
+                    numbers.append(handle.number)
                     read_at.append(float(times[handle.number]))
                     yield scan
 
@@ -224,7 +225,7 @@ def estimate_poses(
     )
     if len(errors) == len(recording.frames):
         raise errors[0]
-    return fill_gaps(found, np.array(poses), recording)
+    return fill_gaps(numbers, np.array(poses), recording)
 
 
 def odometry_range(converter: Converter) -> tuple[float, float]:
@@ -232,9 +233,7 @@ def odometry_range(converter: Converter) -> tuple[float, float]:
     return converter.min_range_m or 0.0, converter.max_range_m or 100.0
 
 
-def fill_gaps(
-    frames: list[int], poses: NDArray[np.float64], recording: Recording
-) -> NDArray[np.float64]:
+def fill_gaps(frames: list[int], poses: FloatArray, recording: Recording) -> FloatArray:
     """Return (F, 4, 4) poses by frame number from those of some frames: others have the pose of the
     frame before.
 
@@ -257,9 +256,7 @@ def fill_gaps(
     return poses[np.clip(lines, 0, None)]
 
 
-def check_poses(
-    recording: Recording, converter: Converter, poses: NDArray[np.float64]
-) -> str | None:
+def check_poses(recording: Recording, converter: Converter, poses: FloatArray) -> str | None:
     """Check that the scans overlap under their poses, which reads some scans.
 
     Poses of another point of the vehicle, or some frames late, are accepted with a note, which is
@@ -275,7 +272,7 @@ def check_poses(
     """
     rig = Rig(tuple(recording.sensors), recording.vehicle_T_scan)
 
-    def structure(index: int) -> NDArray[np.float64]:
+    def structure(index: int) -> FloatArray:
         try:
             scan = read_scan(recording.frames[index], rig, None)
         except (CarlascError, OSError):

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array, FloatArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
@@ -25,7 +26,7 @@ _SIGNS = np.array([1, -1, 1, 1], np.float32)
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
-def choices_of_axes() -> Iterator[tuple[str, NDArray[np.float64]]]:
+def choices_of_axes() -> Iterator[tuple[str, FloatArray]]:
     """Yield the 48 signed permutations of axes, the identity first: the new axes in terms of the
     old ones, such as "-y, x, z", and the (3, 3) matrix.
     """
@@ -42,12 +43,12 @@ def choices_of_axes() -> Iterator[tuple[str, NDArray[np.float64]]]:
             )
 
 
-def mirror_points(points: NDArray[np.float32]) -> NDArray[np.float32]:
+def mirror_points(points: Float32Array) -> Float32Array:
     """Mirror (N, 3) or (N, 4) points or vectors. A fourth column is unchanged."""
     return points * _SIGNS[: points.shape[1]]
 
 
-def mirror_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def mirror_poses(poses: FloatArray) -> FloatArray:
     """Mirror (..., 4, 4) poses, in both the source and the destination frame."""
     return _MIRROR @ poses @ _MIRROR
 

@@ -7,6 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    LabelArray,
+)
 from carlasc.core.geometry import (
     Transform,
     invert,
@@ -62,10 +70,10 @@ class Boxes:
 
     tracks: NDArray[np.uint32]
     labels: NDArray[np.uint32]
-    centers: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
-    sizes: NDArray[np.float64]
-    annotated: NDArray[np.bool_]
+    centers: FloatArray
+    quaternions: FloatArray
+    sizes: FloatArray
+    annotated: BoolArray
 
     def __post_init__(self) -> None:
         count = len(self.tracks)
@@ -106,7 +114,7 @@ class Boxes:
         first[np.unique(self.tracks, return_index=True)[1]] = True
         self._check("tracks", first, "one box per track in a frame")
 
-    def _check(self, name: str, valid: NDArray[np.bool_] | np.bool_, expected: str) -> None:
+    def _check(self, name: str, valid: BoolArray | np.bool_, expected: str) -> None:
         """Raise a FormatError for the first box that is not valid."""
         if not valid.all():
             row = int(np.argmin(valid))
@@ -116,11 +124,11 @@ class Boxes:
     @classmethod
     def from_poses(
         cls,
-        tracks: NDArray[np.unsignedinteger],
-        labels: NDArray[np.unsignedinteger],
-        sensor_T_box: NDArray[np.float64],
-        sizes: NDArray[np.floating],
-        annotated: NDArray[np.bool_] | None = None,
+        tracks: LabelArray,
+        labels: LabelArray,
+        sensor_T_box: FloatArray,
+        sizes: AnyFloatArray,
+        annotated: BoolArray | None = None,
     ) -> Boxes:
         """Return boxes with given poses.
 
@@ -152,7 +160,7 @@ class Boxes:
             FormatError: as for the constructor.
         """
 
-        def columns(names: tuple[str, ...]) -> NDArray[np.float64]:
+        def columns(names: tuple[str, ...]) -> FloatArray:
             return np.stack([table[name] for name in names], axis=1)
 
         try:
@@ -184,11 +192,11 @@ class Boxes:
         return len(self.tracks)
 
     @property
-    def sensor_T_box(self) -> NDArray[np.float64]:
+    def sensor_T_box(self) -> FloatArray:
         """(N, 4, 4) float64 pose of each box."""
         return poses_from(self.quaternions, self.centers)
 
-    def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Boxes:
+    def select(self, keep: BoolArray | AnyIntArray) -> Boxes:
         """Return the boxes that a mask of shape (N,) or indices of shape (M,) select."""
         return Boxes(
             self.tracks[keep],
@@ -218,7 +226,7 @@ class Boxes:
             self.tracks, self.labels, dst_T_sensor @ self.sensor_T_box, self.sizes, self.annotated
         )
 
-    def contains(self, points: NDArray[np.floating], margin_m: float = 0.0) -> NDArray[np.bool_]:
+    def contains(self, points: AnyFloatArray, margin_m: float = 0.0) -> BoolArray:
         """Return whether each point is in each box.
 
         Args:
@@ -240,7 +248,7 @@ class Boxes:
             inside[row, near] = (np.abs(body) <= half).all(axis=1)
         return inside
 
-    def owners(self, points: NDArray[np.floating], margin_m: float = 0.0) -> NDArray[np.int64]:
+    def owners(self, points: AnyFloatArray, margin_m: float = 0.0) -> IntArray:
         """Return (M,) int64, the row of the box that contains each of (M, 3) points: the smallest
         of several boxes, -1 for no box.
         """

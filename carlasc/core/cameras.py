@@ -14,8 +14,9 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray
 from carlasc.core.geometry import Transform, check_rigid
 from carlasc.errors import FormatError
 
@@ -78,11 +79,11 @@ class CameraModel:
     name: str
     width: int
     height: int
-    matrix: NDArray[np.float64]
+    matrix: FloatArray
     sensor_T_camera: Transform
     model: Lens = "pinhole"
     distortion: tuple[float, ...] = ()
-    times: NDArray[np.float64] | None = None
+    times: FloatArray | None = None
     images: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -133,7 +134,7 @@ class CameraModel:
             object.__setattr__(self, name, None if value is None else np.asarray(value, np.float64))
         object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
 
-    def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    def project(self, points: AnyFloatArray) -> FloatArray:
         """Return (N, 2) float64 pixel column and row of (N, 3) points in the camera frame, metres.
 
         NaN for points behind the camera, or too far from its axis for the model. Pixels may be
@@ -153,7 +154,7 @@ class CameraModel:
         pixels[outside] = np.nan
         return pixels
 
-    def unproject(self, pixels: ArrayLike) -> NDArray[np.float64]:
+    def unproject(self, pixels: ArrayLike) -> FloatArray:
         """Return (N, 3) unit vectors in the camera frame, the viewing directions of (N, 2) pixels;
         NaN where the model is not valid.
         """
@@ -181,7 +182,7 @@ class CameraModel:
         rays[~(radius <= self._widest)] = np.nan
         return rays
 
-    def contains(self, pixels: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def contains(self, pixels: AnyFloatArray) -> BoolArray:
         """Return whether each of (N, 2) pixels is in the image."""
         u, v = pixels.T
         return (u >= -0.5) & (u < self.width - 0.5) & (v >= -0.5) & (v < self.height - 0.5)
@@ -247,7 +248,7 @@ class CameraModel:
         falls = np.flatnonzero(np.diff(radii * self._radial(radii * radii)) <= 0)
         return float(radii[falls[0]] if len(falls) else radii[-1])
 
-    def _radial(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _radial(self, squared: FloatArray) -> FloatArray:
         """Return the radial scale factor for squared radii in the plane."""
         if not self.distortion:
             return np.ones_like(squared)
@@ -257,7 +258,7 @@ class CameraModel:
         above = np.polynomial.polynomial.polyval(squared, (1.0, k1, k2, k3))
         return np.asarray(above / np.polynomial.polynomial.polyval(squared, (1.0, *rest)))
 
-    def _distort(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _distort(self, plane: FloatArray) -> FloatArray:
         if not self.distortion:
             return plane
         squared = np.square(plane).sum(axis=1)
@@ -268,9 +269,7 @@ class CameraModel:
             bent[:, 1] += p1 * (squared + 2 * y * y) + 2 * p2 * x * y
         return bent
 
-    def _newton_step(
-        self, plane: NDArray[np.float64], wanted: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _newton_step(self, plane: FloatArray, wanted: FloatArray) -> FloatArray:
         """Return one step of Newton's method towards the undistorted points of the `wanted`
         distorted points.
         """

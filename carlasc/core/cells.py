@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, IntArray
 from carlasc.core.compiling import cached, fused, inlined, jit
 from carlasc.core.geometry import Transform
 from carlasc.core.grids import GridSpec
@@ -45,7 +46,8 @@ class Cells(NamedTuple):
 
 def as_pose(dst_T_src: Transform) -> Pose:
     """Return a (4, 4) transform as scalars."""
-    pose: Pose = tuple(np.asarray(dst_T_src, np.float64)[:3].ravel().tolist())  # type: ignore[assignment]
+    rows = np.asarray(dst_T_src, np.float64)[:3].ravel()
+    pose: Pose = tuple(rows.tolist())  # type: ignore[assignment]
     return pose
 
 
@@ -127,14 +129,14 @@ def fast_azimuth(x: float, y: float) -> float:
     return -angle if y < 0.0 else angle
 
 
-def first_of_cells(cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+def first_of_cells(cells: IntArray) -> BoolArray:
     """Return (N,) bool: whether each of (N, 3) cells is the first occurrence of this cell."""
     first = np.zeros(len(cells), np.bool_)
     first[numbered(cells)[0]] = True
     return first
 
 
-def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def distinct(keys: IntArray) -> tuple[IntArray, IntArray]:
     """Return the (K,) sorted unique keys, and the (N,) index of each key among them.
 
     Like `np.unique`, without sorting all keys.
@@ -147,7 +149,7 @@ def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int
 
 
 @cached(error_model="python")
-def numbered(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def numbered(cells: IntArray) -> tuple[IntArray, IntArray]:
     """Number unique (N, K) cells in order of first occurrence, without sorting.
 
     Returns:
@@ -182,7 +184,7 @@ def numbered(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
 
 
 def count_points(
-    points: NDArray[np.floating],
+    points: AnyFloatArray,
     grid_T_points: Transform,
     spec: GridSpec,
     counts: NDArray[np.int32] | None = None,
@@ -204,9 +206,7 @@ def count_points(
 
 
 @cached
-def _count(
-    points: NDArray[np.floating], pose: Pose, cells: Cells, counts: NDArray[np.int32]
-) -> None:
+def _count(points: AnyFloatArray, pose: Pose, cells: Cells, counts: NDArray[np.int32]) -> None:
     for i in range(len(points)):
         point = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         x, y, z = transform(pose, point[0], point[1], point[2])

@@ -15,6 +15,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyIntArray, FloatArray, LabelArray
 from carlasc.errors import ArgumentError, FormatError
 
 Color = tuple[int, int, int]
@@ -204,7 +205,7 @@ class ClassTable:
             found="none of them",
         )
 
-    def check(self, labels: NDArray[np.integer], where: str) -> None:
+    def check(self, labels: AnyIntArray, where: str) -> None:
         """Raise a FormatError if an id in `labels`, of any shape, is not in [0, `num_channels`).
 
         `where` is the file named in the message.
@@ -253,14 +254,14 @@ class Remap:
         return table
 
     @cached_property
-    def _lookup(self) -> NDArray[np.unsignedinteger]:
+    def _lookup(self) -> LabelArray:
         """The lookup table in the dtype of the target, with 0 for unknown ids.
 
         It is used only after the ids have been checked.
         """
         return np.where(self.table < 0, 0, self.table).astype(self.target.dtype)
 
-    def unknown(self, labels: NDArray[np.integer]) -> dict[int, int]:
+    def unknown(self, labels: AnyIntArray) -> dict[int, int]:
         """Return the ids in `labels`, of any shape, that are not in the mapping, with their number
         of occurrences.
         """
@@ -269,9 +270,7 @@ class Remap:
             int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in self.mapping
         }
 
-    def __call__(
-        self, labels: NDArray[np.integer], where: str = "labels"
-    ) -> NDArray[np.unsignedinteger]:
+    def __call__(self, labels: AnyIntArray, where: str = "labels") -> LabelArray:
         """Return the remapped labels in the dtype of the target. The input is not changed.
 
         Args:
@@ -302,9 +301,7 @@ class Remap:
         return bool((self.table >= 0).all())
 
 
-def class_weights(
-    voxel_counts: NDArray[np.integer], remap: Remap | None = None
-) -> NDArray[np.float64]:
+def class_weights(voxel_counts: AnyIntArray, remap: Remap | None = None) -> FloatArray:
     """Return the loss weight of each class: `1 / ln(count + 0.001)`.
 
     The formula is used for counts above 1,000, because it is not valid for small counts. Classes
@@ -319,7 +316,7 @@ def class_weights(
     Returns:
         (K,) float64 weights, by id of the target.
     """
-    counts: NDArray[np.float64] = np.asarray(voxel_counts, np.float64)
+    counts: FloatArray = np.asarray(voxel_counts, np.float64)
     if remap is not None:
         counts = np.zeros(max(remap.target.names) + 1)
         for old, new in remap.mapping.items():

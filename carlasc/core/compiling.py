@@ -1,15 +1,16 @@
 """Compiling loops with Numba once per machine, with one cache folder for all environments.
 
-The cache of Numba is beside the source file, so each new environment compiles again. It checks the
-time of one file only, so it misses changes in other files whose functions are compiled into a loop.
-The key of this cache is the text of all these files, and the versions of Numba and NumPy. If
-several processes need the same function, one compiles it. Importing this module loads Numba.
+Numba keeps compiled code beside the source, so each new environment would compile again. It looks
+at the text of one file only, so it would miss changes in other files whose functions are compiled
+into a loop. Therefore each loop is compiled as if its file lay in a folder of the user's caches,
+which is named by the text of all these files and by the versions of Numba and NumPy; a copy of the
+file is put there. Importing this module loads Numba.
 """
 
 from __future__ import annotations
 
-import fcntl
 import os
+import shutil
 import sys
 import time
 import zlib
@@ -18,19 +19,16 @@ from contextlib import suppress
 from functools import cache, partial
 from inspect import getfile
 from pathlib import Path
-from tempfile import TemporaryFile
+from threading import Timer
 from types import FunctionType
-from typing import IO, Any, ClassVar, overload
+from typing import Any, overload
 
 import numba
 import numpy as np
-from numba.core import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
-from numba.core.dispatcher import Dispatcher
+from numba import config
+from numba.core import event
 
 from carlasc.core import first_use
-
-first_use.connect()
 
 jit = numba.njit(nogil=True, error_model="numpy")
 # inlined, because a loop with function calls is not vectorised
@@ -38,8 +36,50 @@ inlined = numba.njit(nogil=True, error_model="numpy", forceinline=True)
 # Allows fused multiply-add. For code with margins that cover the different rounding.
 fused = numba.njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"contract"})
 
+
+class CompilingNote(event.Listener):
+    """Calls a function once, after this process has compiled for a given time.
+
+    Loading compiled code from the cache does not count.
+    """
+
+    def __init__(self, tell: Callable[[], None], after_s: float) -> None:
+        """Create a note.
+
+        Args:
+            tell: the function. It is called in another thread during the compilation.
+            after_s: compile time after which it is called, seconds.
+        """
+        self._tell, self._left_s, self._told = tell, after_s, False
+        self._depth, self._started_s = 0, 0.0
+        self._timer: Timer | None = None
+
+    def on_start(self, _: Any) -> None:
+        """Count the time from here on, unless a loop is compiled for another loop that calls it."""
+        self._depth += 1
+        if self._depth == 1 and not self._told:
+            self._started_s = time.perf_counter()
+            self._timer = Timer(max(self._left_s, 0.0), self._finish)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def on_end(self, _: Any) -> None:
+        """Stop counting when the outermost loop is compiled."""
+        self._depth -= 1
+        if self._depth == 0 and self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+            self._left_s -= time.perf_counter() - self._started_s
+
+    def _finish(self) -> None:
+        self._told = True
+        self._tell()
+
+
+for _request in first_use.note_requests:
+    event.register("numba:compile", CompilingNote(*_request))  # type: ignore[no-untyped-call]
+
 _KEPT_S = 90 * 86400  # how long compiled code of earlier versions of a function is kept
-_WAITED_S = 60.0  # longest wait for another process that compiles the same function
 
 
 @overload
@@ -63,17 +103,17 @@ def cached(function: Any = None, /, *, error_model: str = "numpy", fastmath: boo
         fastmath: whether sums may be reordered.
     """
     if function is None:
-        return partial(_compile, error_model=error_model, fastmath=fastmath)
-    return _compile(function, error_model=error_model, fastmath=fastmath)
-
-
-def _compile(function: FunctionType, **options: Any) -> Any:
-    dispatcher: Any = numba.njit(nogil=True, **options)(function)
-    try:
-        dispatcher._cache = _SharedCache(function)
-    except OSError:  # the source is in a zip, or the folder cannot be written to
-        dispatcher.enable_caching()
-    return dispatcher
+        return partial(cached, error_model=error_model, fastmath=fastmath)
+    settings: Any = config  # without types
+    if not settings.DISABLE_JIT:
+        with suppress(OSError):  # the source is in a zip, or the folder cannot be written to
+            copy = str(_copy_of_source(function))
+            function.__code__ = function.__code__.replace(co_filename=copy)
+    njit: Any = numba.njit
+    loop = njit(nogil=True, cache=True, error_model=error_model, fastmath=fastmath)(function)
+    if not settings.DISABLE_JIT:
+        first_use.loop_folders.add(loop.stats.cache_path)
+    return loop
 
 
 def cache_folder() -> Path:
@@ -94,13 +134,32 @@ def cache_folder() -> Path:
     )
 
 
-def fingerprint(function: FunctionType) -> int:
+def _copy_of_source(function: FunctionType) -> Path:
+    """Return a copy of the file of a function, in a folder for this version of the function.
+
+    Raises:
+        OSError: the file cannot be read, or the folder cannot be written to.
+    """
+    versions = cache_folder() / f"{function.__module__}.{function.__name__}"
+    copy = versions / f"{_fingerprint(function):08x}" / Path(getfile(function)).name
+    if copy.exists():
+        return copy
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    for old in versions.iterdir():
+        if time.time() - old.stat().st_mtime > _KEPT_S:
+            shutil.rmtree(old, ignore_errors=True)  # another process removes it too
+    whole = copy.with_name(f"{copy.name}.{os.getpid()}")  # no other process reads half a file
+    shutil.copyfile(getfile(function), whole)
+    return whole.replace(copy)
+
+
+def _fingerprint(function: FunctionType) -> int:
     """Return a hash of the files of a function and of the compiled functions that it calls, and of
     the constants that they use.
     """
     files, constants = set(), []
     for part in _parts(function, set()):
-        files.add(getfile(part))
+        files.add(part.__globals__.get("__file__", part.__code__.co_filename))
         for name, value in _names(part):
             if isinstance(value, int | float | str | bytes | tuple):
                 constants.append(f"{part.__qualname__}.{name}={value!r}")
@@ -119,7 +178,7 @@ def _parts(function: FunctionType, seen: set[FunctionType]) -> Iterator[Function
     seen.add(function)
     yield function
     for _, value in _names(function):
-        if isinstance(value, Dispatcher):
+        if hasattr(value, "py_func"):  # compiled by Numba
             yield from _parts(value.py_func, seen)
 
 
@@ -132,93 +191,3 @@ def _names(function: FunctionType) -> Iterator[tuple[str, Any]]:
     for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
         with suppress(ValueError):  # not assigned yet
             yield name, cell.cell_contents
-
-
-class _SourceLocator:
-    """The locator of Numba for a function: its cache folder, and a name for each of its versions."""
-
-    def __init__(self, function: FunctionType, file: str) -> None:
-        self._py_file = file  # for Numba's warnings
-        self._folder = cache_folder() / function.__module__
-        self._stamp = fingerprint(function)
-        self.ensure_cache_path()
-
-    @classmethod
-    def from_function(cls, py_func: FunctionType, py_file: str) -> _SourceLocator:
-        return cls(py_func, py_file)
-
-    def ensure_cache_path(self) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=self._folder).close()  # raises OSError if the folder is not writable
-
-    def get_cache_path(self) -> str:
-        return str(self._folder)
-
-    def get_source_stamp(self) -> int:
-        return self._stamp
-
-    def get_disambiguator(self) -> str:
-        return f"{self._stamp:08x}"
-
-
-class _CompiledFiles(CompileResultCacheImpl):
-    _locator_classes: ClassVar[list[Any]] = [_SourceLocator]  # type: ignore[misc]
-
-
-class _SharedCache(FunctionCache):
-    """The cache of a function.
-
-    If several processes need it at the same time, one compiles it and the others wait.
-    """
-
-    _impl_class = _CompiledFiles
-
-    def __init__(self, function: FunctionType) -> None:
-        super().__init__(function)  # type: ignore[no-untyped-call]
-        name = (
-            f"{Path(getfile(function)).stem}.{function.__name__}-{fingerprint(function):08x}.lock"
-        )
-        self._versions = f"*.{function.__name__}-*"  # files
-        self._lock_path = Path(self.cache_path, name)
-        self._lock: IO[bytes] | None = None
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        if found is not None:
-            return found
-        self._acquire()
-        found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        if found is not None:
-            self._release()
-        return found
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        try:
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-            for old in Path(self.cache_path).glob(self._versions):
-                with suppress(OSError):  # another process removes them too
-                    if time.time() - old.stat().st_mtime > _KEPT_S:
-                        old.unlink()
-        finally:
-            self._release()
-
-    def _acquire(self) -> None:
-        """Wait until no other process compiles the function, up to a limit: the other process may
-        be stopped, or may have failed.
-        """
-        self._release()  # left by an interrupted compilation
-        try:
-            self._lock = self._lock_path.open("ab")
-            until = time.monotonic() + _WAITED_S
-            while time.monotonic() < until:
-                with suppress(BlockingIOError):
-                    fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    return
-                time.sleep(0.02)
-        except OSError:  # no locks, or no write permission: this process compiles itself
-            self._release()
-
-    def _release(self) -> None:
-        lock, self._lock = self._lock, None
-        if lock is not None:
-            lock.close()

@@ -1,66 +1,28 @@
-"""Notification that Numba is compiling.
+"""The first use of loops on a machine: compiling takes several seconds. The user is told, and one
+worker compiles before the others start.
 
-On the first use on a machine, compiling loops takes several seconds.
-
-Importing this module loads nothing heavy, so a program can request the notification before it
-imports Numba. `carlasc.core.compiling` connects the requests with Numba.
+Importing this module loads nothing heavy, so a program can ask to be told before it imports Numba.
 """
 
 from __future__ import annotations
 
 import sys
-import time
+import zlib
 from collections.abc import Callable
-from threading import Timer
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from multiprocessing.synchronize import Semaphore
 
-_asked: list[CompilingNote] = []
-_wishes: list[tuple[Callable[[], None], float]] = []  # passed on to worker processes
+NoteRequest = tuple[Callable[[], None], float]
+"""A function, and the compile time after which it is called, seconds."""
 
+note_requests: list[NoteRequest] = []
+"""The requests of this process. When `carlasc.core.compiling` is imported, Numba gets them."""
 
-class CompilingNote:
-    """Calls a function once, after this process has compiled for a given time.
-
-    Loading compiled code from the cache does not count.
-    """
-
-    def __init__(self, tell: Callable[[], None], after_s: float) -> None:
-        """Create a note.
-
-        Args:
-            tell: the function. It is called in another thread during the compilation.
-            after_s: compile time after which it is called, seconds.
-        """
-        self._tell, self._left_s, self._told = tell, after_s, False
-        self._depth, self._started_s = 0, 0.0
-        self._timer: Timer | None = None
-
-    def start(self) -> None:
-        """Record that the compiler starts.
-
-        Calls may be nested, for a loop that another loop calls.
-        """
-        self._depth += 1
-        if self._depth == 1 and not self._told:
-            self._started_s = time.perf_counter()
-            self._timer = Timer(max(self._left_s, 0.0), self._finish)
-            self._timer.daemon = True
-            self._timer.start()
-
-    def end(self) -> None:
-        """Record that the compiler ends."""
-        self._depth -= 1
-        if self._depth == 0 and self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-            self._left_s -= time.perf_counter() - self._started_s
-
-    def _finish(self) -> None:
-        self._told = True
-        self._tell()
+loop_folders: set[str] = set()
+"""The folders of the compiled code of the loops that this process has loaded."""
 
 
 def note_compiling(tell: Callable[[], None], after_s: float = 1.0) -> None:
@@ -71,8 +33,7 @@ def note_compiling(tell: Callable[[], None], after_s: float = 1.0) -> None:
         tell: the function. It must be picklable by name, for worker processes.
         after_s: compile time after which it is called, seconds.
     """
-    _wishes.append((tell, after_s))
-    _asked.append(CompilingNote(tell, after_s))
+    note_requests.append((tell, after_s))
 
 
 def say_compiling() -> None:
@@ -81,17 +42,12 @@ def say_compiling() -> None:
     sys.stderr.flush()
 
 
-def wishes() -> tuple[tuple[Callable[[], None], float], ...]:
-    """Return the (function, time) pairs given to `note_compiling` in this process."""
-    return tuple(_wishes)
-
-
-def note_in_workers(wishes: tuple[tuple[Callable[[], None], float], ...], first: Semaphore) -> None:
+def note_in_workers(requests: list[NoteRequest], first: Semaphore) -> None:
     """Repeat the requests of the parent in a worker process.
 
     `first` is a semaphore by which only one worker calls the function.
     """
-    for tell, after_s in wishes:
+    for tell, after_s in requests:
 
         def once(tell: Callable[[], None] = tell) -> None:
             if first.acquire(block=False):
@@ -100,19 +56,18 @@ def note_in_workers(wishes: tuple[tuple[Callable[[], None], float], ...], first:
         note_compiling(once, after_s)
 
 
-def connect() -> None:
-    """Connect the requested notes with Numba, which must be imported."""
-    from numba.core import event
+def is_first_use(function: Callable[..., Any]) -> bool:
+    """Return whether workers run a function with the loaded loops for the first time on this
+    machine, and remember that they do.
 
-    class Compiling(event.Listener):
-        def __init__(self, note: CompilingNote) -> None:
-            self._note = note
-
-        def on_start(self, event: Any) -> None:
-            self._note.start()
-
-        def on_end(self, event: Any) -> None:
-            self._note.end()
-
-    while _asked:
-        event.register("numba:compile", Compiling(_asked.pop()))  # type: ignore[no-untyped-call]
+    The loops are then probably not compiled yet.
+    """
+    if not loop_folders:
+        return False
+    name = getattr(function, "__qualname__", type(function).__qualname__)
+    key = zlib.crc32("\n".join([name, *sorted(loop_folders)]).encode())
+    try:
+        Path(min(loop_folders), f"used-{key:08x}").touch(exist_ok=False)
+    except OSError:  # it exists, or nothing can be kept
+        return False
+    return True

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyIntArray, FloatArray, IntArray
 from carlasc.errors import ArgumentError, FormatError
 
 
@@ -66,7 +67,7 @@ class FrameRange:
         raise ArgumentError("frames", expected=expected, found=repr(frames))
 
     @classmethod
-    def _listed(cls, frames: range | list[int] | NDArray[np.integer]) -> FrameRange:
+    def _listed(cls, frames: range | list[int] | AnyIntArray) -> FrameRange:
         """Return the range of some frame numbers, in any order."""
         try:
             chosen = sorted({operator.index(frame) for frame in frames})
@@ -120,7 +121,7 @@ class FrameRange:
         return ":".join("" if bound is None else str(bound) for bound in (self.start, self.stop))
 
 
-def compact(frames: NDArray[np.int64]) -> range | NDArray[np.int64]:
+def compact(frames: IntArray) -> range | IntArray:
     """Return ascending frame numbers as a range if they are consecutive, because a range is pickled
     in a few bytes.
     """
@@ -128,7 +129,7 @@ def compact(frames: NDArray[np.int64]) -> range | NDArray[np.int64]:
     return range(first, last + 1) if last - first == len(frames) - 1 else frames
 
 
-def expand(frames: range | NDArray[np.int64]) -> NDArray[np.int64]:
+def expand(frames: range | IntArray) -> IntArray:
     """Return the array of frame numbers from the result of `compact`."""
     return (
         np.arange(frames.start, frames.stop, dtype=np.int64)
@@ -149,7 +150,7 @@ Frames = (
     | range
     | str
     | list[int]
-    | NDArray[np.integer]
+    | AnyIntArray
     | None
 )
 """What a `frames` argument takes: a range, a slice, "A:B", a list of frame numbers, a FrameRange, a
@@ -160,7 +161,7 @@ tuple of its bounds, or None for all frames.
 _LATEST_S = 1e11  # larger than any time in seconds; milliseconds since 1970 are larger
 
 
-def check_seconds(seconds: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+def check_seconds(seconds: FloatArray, where: str) -> FloatArray:
     """Check that (N,) times are finite and plausible as seconds, not milliseconds or nanoseconds
     since 1970, and return them.
 
@@ -178,6 +179,7 @@ def check_seconds(seconds: NDArray[np.float64], where: str) -> NDArray[np.float6
             where,
             expected=f"times in seconds, below {_LATEST_S:.0e}",
             found=f"{seconds[wrong[0]]:g}{place}",
-            advice="convert milliseconds or nanoseconds to seconds, or copy the file of times again",
+            advice="convert milliseconds or nanoseconds to seconds, or copy the file of times "
+            "again",
         )
     return seconds

@@ -10,11 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from carlasc.core.arrays import AnyFloatArray, FloatArray
 from carlasc.errors import FormatError
 
 Floating = TypeVar("Floating", bound=np.floating[Any])
 
-Transform = NDArray[np.float64]
+Transform = FloatArray
 """(4, 4) float64, last row 0 0 0 1."""
 
 _FARTHEST_M = 1e9  # larger than any distance on Earth
@@ -35,7 +36,7 @@ def translation(xyz: ArrayLike) -> Transform:
     return transform
 
 
-def multiply(*matrices: NDArray[np.floating]) -> NDArray[np.float64]:
+def multiply(*matrices: AnyFloatArray) -> FloatArray:
     """Return the product of (..., N, K) and (..., K, M) small matrices, from left to right, bit for
     bit equal on every CPU.
 
@@ -49,7 +50,7 @@ def multiply(*matrices: NDArray[np.floating]) -> NDArray[np.float64]:
     return product
 
 
-def transform_points(dst_T_src: Transform, points: NDArray[np.floating]) -> NDArray[np.float64]:
+def transform_points(dst_T_src: Transform, points: AnyFloatArray) -> FloatArray:
     """Transform points from frame `src` to frame `dst`.
 
     Args:
@@ -67,7 +68,7 @@ def thin(points: NDArray[Floating], most: int) -> NDArray[Floating]:
     return points[:: max(1, -(-len(points) // most))]
 
 
-def rotate_vectors(dst_T_src: Transform, vectors: NDArray[np.floating]) -> NDArray[np.float64]:
+def rotate_vectors(dst_T_src: Transform, vectors: AnyFloatArray) -> FloatArray:
     """Rotate (..., 3) vectors, such as velocities and normals, from frame `src` to frame `dst`,
     without translation.
     """
@@ -91,7 +92,7 @@ def invert(dst_T_src: Transform) -> Transform:
     return src_T_dst
 
 
-def rotations_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
+def rotations_of(quaternions: AnyFloatArray) -> FloatArray:
     """Return the (N, 3, 3) rotations of (N, 4) quaternions w, x, y, z of any non-zero length."""
     w, x, y, z = (
         np.asarray(quaternions, np.float64) / np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -104,9 +105,7 @@ def rotations_of(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def poses_from(
-    quaternions: NDArray[np.floating], translations: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def poses_from(quaternions: AnyFloatArray, translations: AnyFloatArray) -> FloatArray:
     """Return (N, 4, 4) transforms from (N, 4) quaternions w, x, y, z of any non-zero length, and
     (N, 3) translations.
     """
@@ -116,7 +115,7 @@ def poses_from(
     return poses
 
 
-def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
+def quaternions_of(rotations: AnyFloatArray) -> FloatArray:
     """Return the (N, 4) unit quaternions w, x, y, z of (N, 3, 3) rotations.
 
     The first non-zero number is positive.
@@ -141,7 +140,7 @@ def quaternions_of(rotations: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.where(leading < 0, -1.0, 1.0)[:, None] * unit
 
 
-def small_motions(motions: NDArray[np.float64]) -> NDArray[np.float64]:
+def small_motions(motions: FloatArray) -> FloatArray:
     """Return (N, 6) translations and rotation vectors of (N, 4, 4) motions.
 
     Valid for rotations of a few degrees at most.
@@ -151,9 +150,7 @@ def small_motions(motions: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([m[:, :3, 3], np.stack(turns, axis=1) / 2], axis=1)
 
 
-def slerp(
-    poses: NDArray[np.float64], seconds: NDArray[np.floating], at: NDArray[np.floating]
-) -> NDArray[np.float64]:
+def slerp(poses: FloatArray, seconds: AnyFloatArray, at: AnyFloatArray) -> FloatArray:
     """Interpolate poses in time: positions linearly, rotations by slerp.
 
     Outside of the poses, the motion is extrapolated.
@@ -188,8 +185,8 @@ def slerp(
     return between.reshape(*np.shape(at), 4, 4)
 
 
-def relative_to(first: Transform, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Express world poses (..., 4, 4) in the frame `first`: `inv(first) @ pose`, as in poses.txt."""
+def relative_to(first: Transform, poses: FloatArray) -> FloatArray:
+    """Express world poses (..., 4, 4) in the frame `first`, as in poses.txt: inv(first) @ pose."""
     return multiply(inverse_of(first), poses)
 
 
@@ -205,9 +202,7 @@ def inverse_of(transform: Transform) -> Transform:
     return inverse
 
 
-def check_rigid(
-    transforms: NDArray[np.floating], name: str, tolerance: float = 1e-3
-) -> NDArray[np.float64]:
+def check_rigid(transforms: AnyFloatArray, name: str, tolerance: float = 1e-3) -> FloatArray:
     """Check that transforms are finite, rigid and proper, and that their positions are plausible.
 
     Args:
@@ -259,7 +254,7 @@ def check_rigid(
     return poses
 
 
-def _are_rigid(poses: NDArray[np.float64], tolerance: float) -> bool:
+def _are_rigid(poses: FloatArray, tolerance: float) -> bool:
     """Return whether all of (F, 4, 4) transforms are finite, rigid and proper."""
     if not np.isfinite(poses).all() or np.abs(poses[:, :3, 3]).max(initial=0.0) > _FARTHEST_M:
         return False

@@ -16,6 +16,14 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    LabelArray,
+)
 from carlasc.core.choices import Coordinates as Coordinates  # noqa: PLC0414 (part of this module)
 from carlasc.core.choices import Preset
 from carlasc.core.notebook import describe
@@ -223,7 +231,7 @@ class GridSpec:
         return math.prod(self.size)
 
     @property
-    def voxel_size(self) -> NDArray[np.float64]:
+    def voxel_size(self) -> FloatArray:
         """(3,) size of a cell per axis: the float32 difference of the bounds divided by the size;
         see `docs/format.md#cells`.
 
@@ -234,7 +242,7 @@ class GridSpec:
         exact = (lower != lower.astype(np.float32)) | (upper != upper.astype(np.float32))
         return np.where(exact, upper - lower, rounded) / np.array(self.size, np.float64)
 
-    def to_axes(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+    def to_axes(self, points: AnyFloatArray) -> AnyFloatArray:
         """Convert Cartesian points to the axes of the grid: unchanged in a Cartesian grid,
         otherwise radius, azimuth, z.
 
@@ -263,14 +271,14 @@ class GridSpec:
             axis=1,
         )
 
-    def from_axes(self, axes: NDArray[np.floating]) -> NDArray[np.floating]:
+    def from_axes(self, axes: AnyFloatArray) -> AnyFloatArray:
         """Convert (..., 3) coordinates on the axes of the grid to Cartesian points."""
         if self.coordinates == "cartesian":
             return axes
         radius, azimuth, z = np.moveaxis(axes, -1, 0)
         return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
 
-    def index(self, axes: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    def index(self, axes: AnyFloatArray) -> tuple[NDArray[np.int32], BoolArray]:
         """Return the cells of points on the axes of the grid: half-open, floor, clip; see
         `docs/format.md#cells`.
 
@@ -282,11 +290,11 @@ class GridSpec:
             is outside.
         """
         lower, upper = np.array(self.lower), np.array(self.upper)
-        inside: NDArray[np.bool_] = np.all((axes >= lower) & (axes < upper), axis=1)
+        inside: BoolArray = np.all((axes >= lower) & (axes < upper), axis=1)
         cells = np.floor((np.where(inside[:, None], axes, lower) - lower) / self.voxel_size)
         return np.clip(cells, 0, np.array(self.size) - 1).astype(np.int32), inside
 
-    def flat_index(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+    def flat_index(self, points: AnyFloatArray) -> IntArray:
         """Return (N,) C-order voxel indices of (N, 3) Cartesian points, -1 outside.
 
         The steps are `to_axes`, `index`, ravel.
@@ -296,7 +304,7 @@ class GridSpec:
 
     def seen_from_above(
         self,
-        labels: NDArray[np.integer],
+        labels: AnyIntArray,
         palette: NDArray[np.uint8] | None = None,
         *,
         left_handed: bool = True,
@@ -336,11 +344,11 @@ class GridSpec:
         picture = np.where(inside[:, None], colors[cells[:, 0], cells[:, 1]], 255)
         return picture.astype(np.uint8).reshape(_PIXELS, _PIXELS, 3)
 
-    def edges(self, axis: int) -> NDArray[np.float64]:
+    def edges(self, axis: int) -> FloatArray:
         """Return the (n + 1,) cell edges along an axis."""
         return self.lower[axis] + np.arange(self.size[axis] + 1) * self.voxel_size[axis]
 
-    def centers(self) -> NDArray[np.float64]:
+    def centers(self) -> FloatArray:
         """Return the (X, Y, Z, 3) centres of the cells, on the axes of the grid."""
         lines = [
             self.lower[a] + (np.arange(self.size[a]) + 0.5) * self.voxel_size[a] for a in range(3)
@@ -366,7 +374,7 @@ class Grid:
     """
 
     spec: GridSpec
-    labels: NDArray[np.unsignedinteger]
+    labels: LabelArray
     counts: NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
@@ -377,7 +385,7 @@ class Grid:
                 )
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> BoolArray:
         """(X, Y, Z) bool: voxels with at least one vote; all voxels if the grid has no counts."""
         return np.ones(self.spec.size, np.bool_) if self.counts is None else self.counts > 0
 
@@ -413,9 +421,7 @@ def _cells(width: float, step: float) -> int:
     return max(1, round(ratio) if abs(ratio - round(ratio)) <= 1e-4 else math.ceil(ratio))
 
 
-def most_frequent(
-    cells: NDArray[np.integer], labels: NDArray[np.integer]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def most_frequent(cells: AnyIntArray, labels: AnyIntArray) -> tuple[IntArray, IntArray]:
     """Return the most frequent label in each cell; for a tie, the lowest of them.
 
     Args:
@@ -452,7 +458,7 @@ class VoxelFlag(IntFlag):
     IN_ACTOR = 8
 
 
-def is_confident(occupied: NDArray[np.floating], min_confidence: float) -> NDArray[np.bool_]:
+def is_confident(occupied: AnyFloatArray, min_confidence: float) -> BoolArray:
     """Return which voxels are free or occupied with a minimum probability.
 
     Args:
@@ -464,5 +470,5 @@ def is_confident(occupied: NDArray[np.floating], min_confidence: float) -> NDArr
         bool array of the same shape; False where the probability is NaN.
     """
     p = np.asarray(occupied, np.float16)
-    confident: NDArray[np.bool_] = np.maximum(p, 1 - p) >= np.float16(min_confidence)
+    confident: BoolArray = np.maximum(p, 1 - p) >= np.float16(min_confidence)
     return confident

@@ -9,6 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    LabelArray,
+)
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, transform_points, translation
 from carlasc.core.grids import GridSpec
@@ -37,11 +46,11 @@ class Scan:
         FormatError: the shapes of the arrays do not match.
     """
 
-    points: NDArray[np.float32]
-    labels: NDArray[np.unsignedinteger] | None = None
-    flow: NDArray[np.float32] | None = None
+    points: Float32Array
+    labels: LabelArray | None = None
+    flow: Float32Array | None = None
     instances: NDArray[np.uint32] | None = None
-    remission: NDArray[np.float32] | None = None
+    remission: Float32Array | None = None
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     boxes: Boxes | None = None
 
@@ -85,7 +94,8 @@ class Scan:
 
     def __repr__(self) -> str:
         boxes = "" if self.boxes is None else f"; {count(len(self.boxes.tracks), 'box', 'boxes')}"
-        return f"<Scan of {count(len(self), 'point')}: {', '.join(self.fields()) or 'no other field'}{boxes}>"
+        fields = ", ".join(self.fields()) or "no other field"
+        return f"<Scan of {count(len(self), 'point')}: {fields}{boxes}>"
 
     def _repr_html_(self) -> str:
         """Return the HTML for notebooks: the fields, and the heights of the points from above."""
@@ -100,7 +110,7 @@ class Scan:
         rows = {"fields": ", ".join(self.fields()), "drawn": f"{reach:.0f} m in x and y"}
         return describe(repr(self), rows, spec.seen_from_above(labels.reshape(spec.size)))
 
-    def select(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Scan:
+    def select(self, keep: BoolArray | AnyIntArray) -> Scan:
         """Return a scan with the points selected by an (N,) mask or (M,) indices, with all their
         fields. Boxes are kept.
         """
@@ -119,16 +129,14 @@ class Scan:
         )
 
 
-def sorted_by_origin(origins: NDArray[np.floating]) -> NDArray[np.int64]:
+def sorted_by_origin(origins: AnyFloatArray) -> IntArray:
     """Return (N,) indices that sort points by their (N, 3) origins. The sort is stable."""
     starts = _starts(origins)
     group = np.unique(origins[starts], axis=0, return_inverse=True)[1].reshape(-1)
     return np.argsort(np.repeat(group, np.diff([*starts, len(origins)])), kind="stable")
 
 
-def runs_of_origins(
-    origins: NDArray[np.floating] | None, count: int
-) -> list[tuple[slice, NDArray[np.floating]]]:
+def runs_of_origins(origins: AnyFloatArray | None, count: int) -> list[tuple[slice, AnyFloatArray]]:
     """Return the runs of consecutive points with equal origins, and the (3,) origin of each run.
 
     Args:
@@ -141,7 +149,7 @@ def runs_of_origins(
     return [(slice(a, b), origins[a]) for a, b in zip(starts, [*starts[1:], count], strict=True)]
 
 
-def _starts(origins: NDArray[np.floating]) -> NDArray[np.int64]:
+def _starts(origins: AnyFloatArray) -> IntArray:
     """Return where each run of equal rows begins."""
     # five times as fast column by column as row by row
     x, y, z = (axis[1:] != axis[:-1] for axis in origins.T)
@@ -164,14 +172,12 @@ class RaysFromPlace:
 
     part: slice
     sensor_T_place: Transform
-    points: NDArray[np.float32]
+    points: Float32Array
     order: NDArray[np.int32]
     azimuth: NDArray[np.uint16]
 
     @classmethod
-    def of(
-        cls, points: NDArray[np.float32], part: slice, origin: NDArray[np.floating]
-    ) -> RaysFromPlace:
+    def of(cls, points: Float32Array, part: slice, origin: AnyFloatArray) -> RaysFromPlace:
         """Return the rays from `origin`, (3,) metres, to a part of the (N, 3) points of a scan,
         given relative to the origin.
         """
@@ -182,7 +188,7 @@ class RaysFromPlace:
         return cls(part, translation(origin), own, order, azimuth[order])
 
     def through(
-        self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
+        self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray
     ) -> NDArray[np.int32]:
         """Return the indices of the points whose rays, from the origin to the point, intersect a
         box.
@@ -204,7 +210,7 @@ class RaysFromPlace:
         return candidates[(enter <= leave) & (leave >= 0) & (enter <= 1)]
 
     def _in_view_of(
-        self, box_T_sensor: Transform, lower: NDArray[np.float64], upper: NDArray[np.float64]
+        self, box_T_sensor: Transform, lower: FloatArray, upper: FloatArray
     ) -> NDArray[np.int32]:
         """Return the indices of the points in the range of azimuths that a box covers."""
         origin = box_T_sensor[:3, 3]
@@ -239,19 +245,19 @@ def _steps(azimuth_rad: Any) -> Any:
     return (azimuth_rad + np.pi) * (_TURN / (2 * np.pi))
 
 
-def lengths(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+def lengths(vectors: Float32Array) -> Float32Array:
     """Return the (N,) lengths of (N, 3) vectors, in the same dtype."""
     x, y, z = vectors.T
     return np.sqrt(x * x + y * y + z * z)
 
 
-def finite(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+def finite(points: AnyFloatArray) -> BoolArray:
     """Return (N,) bool: whether each of (N, 3) points has three finite coordinates."""
     x, y, z = (np.isfinite(axis) for axis in points.T)
     return x & y & z
 
 
-def check_finite(points: NDArray[np.floating], name: str) -> None:
+def check_finite(points: AnyFloatArray, name: str) -> None:
     """Raise a FormatError for the first of (N, 3) points that is NaN or infinite.
 
     `name` is the file named in the message.

@@ -7,37 +7,52 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import LabelArray
 from carlasc.core.classes import ClassTable, Color, Remap
 from carlasc.errors import ArgumentError, FormatError, check_choice
 
+
+def lines_of(table: str) -> list[list[str]]:
+    """Return the words of each line of a table."""
+    return [line.split() for line in table.strip().splitlines()]
+
+
+def color_of(rgb: list[str]) -> Color:
+    """Return a colour from the texts of its red, green and blue."""
+    red, green, blue = map(int, rgb)
+    return red, green, blue
+
+
 # name, colour, 11-class id; ids in order: docs/format.md#classes
-_CARLA: tuple[tuple[str, Color, int], ...] = (
-    ("Free", (255, 255, 255), 0),
-    ("Building", (70, 70, 70), 1),
-    ("Fence", (100, 40, 40), 2),
-    ("Other", (55, 90, 80), 3),
-    ("Pedestrian", (220, 20, 60), 4),
-    ("Pole", (153, 153, 153), 5),
-    ("RoadLine", (157, 234, 50), 6),
-    ("Road", (128, 64, 128), 6),
-    ("Sidewalk", (244, 35, 232), 8),
-    ("Vegetation", (107, 142, 35), 9),
-    ("Vehicle", (0, 0, 142), 10),
-    ("Wall", (102, 102, 156), 2),
-    ("TrafficSign", (220, 220, 0), 5),
-    ("Sky", (70, 130, 180), 3),
-    ("Ground", (81, 0, 81), 7),
-    ("Bridge", (150, 100, 100), 3),
-    ("RailTrack", (230, 150, 140), 3),
-    ("GuardRail", (180, 165, 180), 2),
-    ("TrafficLight", (250, 170, 30), 5),
-    ("Static", (110, 190, 160), 3),
-    ("Dynamic", (170, 120, 50), 3),
-    ("Water", (45, 60, 150), 3),
-    ("Terrain", (145, 170, 100), 7),
-)
+_CARLA = [
+    (name, color_of(rgb), int(merged))
+    for name, *rgb, merged in lines_of("""
+    Free 255 255 255 0
+    Building 70 70 70 1
+    Fence 100 40 40 2
+    Other 55 90 80 3
+    Pedestrian 220 20 60 4
+    Pole 153 153 153 5
+    RoadLine 157 234 50 6
+    Road 128 64 128 6
+    Sidewalk 244 35 232 8
+    Vegetation 107 142 35 9
+    Vehicle 0 0 142 10
+    Wall 102 102 156 2
+    TrafficSign 220 220 0 5
+    Sky 70 130 180 3
+    Ground 81 0 81 7
+    Bridge 150 100 100 3
+    RailTrack 230 150 140 3
+    GuardRail 180 165 180 2
+    TrafficLight 250 170 30 5
+    Static 110 190 160 3
+    Dynamic 170 120 50 3
+    Water 45 60 150 3
+    Terrain 145 170 100 7
+""")
+]
 CARLA = ClassTable(
     "carla",
     {i: name for i, (name, _, _) in enumerate(_CARLA)},
@@ -49,26 +64,23 @@ CARLA = ClassTable(
     ground_only=14,  # Ground
     num_channels=25,  # as in every published params.json, although only 23 classes exist
 )
+_CARLASC11 = lines_of("""
+    Free 245 150 100
+    Building 245 230 100
+    Barrier 150 60 30
+    Other 180 30 80
+    Pedestrian 255 80 100
+    Pole 30 30 255
+    Road 200 40 255
+    Ground 90 30 150
+    Sidewalk 255 0 255
+    Vegetation 255 150 255
+    Vehicles 75 0 75
+""")
 CARLASC11 = ClassTable(
     "carlasc11",
-    dict(
-        enumerate(
-            "Free Building Barrier Other Pedestrian Pole Road Ground Sidewalk Vegetation Vehicles".split()
-        )
-    ),
-    dict(
-        enumerate(
-            [
-                (245, 150, 100),
-                (245, 230, 100),
-                (150, 60, 30),
-                (180, 30, 80),
-                (255, 80, 100),
-                (30, 30, 255),
-            ]
-            + [(200, 40, 255), (90, 30, 150), (255, 0, 255), (255, 150, 255), (75, 0, 75)]
-        )
-    ),
+    {i: name for i, (name, *_) in enumerate(_CARLASC11)},
+    {i: color_of(rgb) for i, (_, *rgb) in enumerate(_CARLASC11)},
     movable=frozenset({4, 10}),
     deformable=frozenset({4}),
     ground=frozenset({6, 7, 8}),
@@ -77,42 +89,45 @@ CARLASC11 = ClassTable(
 )
 
 # raw id, name, colour, class of the benchmark (0: ignored)
-_KITTI: tuple[tuple[int, str, Color, int], ...] = (
-    (0, "unlabeled", (255, 255, 255), 0),
-    (1, "outlier", (90, 90, 90), 0),
-    (10, "car", (80, 130, 240), 1),
-    (11, "bicycle", (90, 215, 235), 2),
-    (13, "bus", (60, 90, 200), 5),
-    (15, "motorcycle", (40, 70, 150), 3),
-    (16, "on-rails", (30, 50, 110), 5),
-    (18, "truck", (100, 50, 180), 4),
-    (20, "other-vehicle", (60, 90, 230), 5),
-    (30, "person", (230, 40, 40), 6),
-    (31, "bicyclist", (240, 70, 190), 7),
-    (32, "motorcyclist", (150, 40, 100), 8),
-    (40, "road", (128, 64, 128), 9),
-    (44, "parking", (240, 160, 240), 10),
-    (48, "sidewalk", (90, 20, 90), 11),
-    (49, "other-ground", (160, 20, 80), 12),
-    (50, "building", (230, 190, 40), 13),
-    (51, "fence", (240, 130, 60), 14),
-    (52, "other-structure", (220, 150, 30), 0),
-    (60, "lane-marking", (160, 230, 170), 9),
-    (70, "vegetation", (30, 160, 40), 15),
-    (71, "trunk", (130, 70, 30), 16),
-    (72, "terrain", (150, 220, 90), 17),
-    (80, "pole", (230, 220, 150), 18),
-    (81, "traffic-sign", (240, 30, 20), 19),
-    (99, "other-object", (80, 220, 210), 0),
-    (252, "moving-car", (80, 130, 240), 1),
-    (253, "moving-bicyclist", (240, 70, 190), 7),
-    (254, "moving-person", (230, 40, 40), 6),
-    (255, "moving-motorcyclist", (150, 40, 100), 8),
-    (256, "moving-on-rails", (30, 50, 110), 5),
-    (257, "moving-bus", (60, 90, 200), 5),
-    (258, "moving-truck", (100, 50, 180), 4),
-    (259, "moving-other-vehicle", (60, 90, 230), 5),
-)
+_KITTI = [
+    (int(raw), name, color_of(rgb), int(trained))
+    for raw, name, *rgb, trained in lines_of("""
+    0 unlabeled 255 255 255 0
+    1 outlier 90 90 90 0
+    10 car 80 130 240 1
+    11 bicycle 90 215 235 2
+    13 bus 60 90 200 5
+    15 motorcycle 40 70 150 3
+    16 on-rails 30 50 110 5
+    18 truck 100 50 180 4
+    20 other-vehicle 60 90 230 5
+    30 person 230 40 40 6
+    31 bicyclist 240 70 190 7
+    32 motorcyclist 150 40 100 8
+    40 road 128 64 128 9
+    44 parking 240 160 240 10
+    48 sidewalk 90 20 90 11
+    49 other-ground 160 20 80 12
+    50 building 230 190 40 13
+    51 fence 240 130 60 14
+    52 other-structure 220 150 30 0
+    60 lane-marking 160 230 170 9
+    70 vegetation 30 160 40 15
+    71 trunk 130 70 30 16
+    72 terrain 150 220 90 17
+    80 pole 230 220 150 18
+    81 traffic-sign 240 30 20 19
+    99 other-object 80 220 210 0
+    252 moving-car 80 130 240 1
+    253 moving-bicyclist 240 70 190 7
+    254 moving-person 230 40 40 6
+    255 moving-motorcyclist 150 40 100 8
+    256 moving-on-rails 30 50 110 5
+    257 moving-bus 60 90 200 5
+    258 moving-truck 100 50 180 4
+    259 moving-other-vehicle 60 90 230 5
+""")
+]
 SEMANTICKITTI = ClassTable(
     "semantickitti",
     {i: name for i, name, _, _ in _KITTI},
@@ -139,8 +154,8 @@ SEMANTICKITTI19 = ClassTable(
 )
 
 
-def _ranges(table: str) -> dict[int, int]:
-    """Return the mapping for a text such as "1->7 14..19->10 12,13->4"."""
+def id_map(table: str) -> dict[int, int]:
+    """Return the map of ids that a text such as "1->7 14..19->10 12,13->4" says."""
     mapping: dict[int, int] = {}
     for entry in table.split():
         left, right = entry.split("->")
@@ -150,27 +165,10 @@ def _ranges(table: str) -> dict[int, int]:
     return mapping
 
 
-_POSS_NAMES = {
-    0: "unlabeled",
-    4: "person",
-    5: "people",
-    6: "rider",
-    7: "car",
-    8: "trunk",
-    9: "plants",
-    10: "sign 1",
-} | {
-    11: "sign 2",
-    12: "sign 3",
-    13: "pole",
-    14: "trashcan",
-    15: "building",
-    16: "cone/stone",
-    17: "fence",
-    21: "bike",
-    22: "ground",
-}
-_POSS_TO_CARLA = {0: 0} | _ranges(
+_POSS_NAMES = {0: "unlabeled", 4: "person", 5: "people", 6: "rider", 7: "car", 8: "trunk"}
+_POSS_NAMES |= {9: "plants", 10: "sign 1", 11: "sign 2", 12: "sign 3", 13: "pole", 14: "trashcan"}
+_POSS_NAMES |= {15: "building", 16: "cone/stone", 17: "fence", 21: "bike", 22: "ground"}
+_POSS_TO_CARLA = {0: 0} | id_map(
     "4..6->4 7,21->10 8,9->9 10..12->12 13->5 14->20 15->1 16->19 17->2 22->14 1..3,18..20->0"
 )
 SEMANTICPOSS = ClassTable(
@@ -197,7 +195,7 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
                 "semantickitti_to_carla",
                 SEMANTICKITTI,
                 CARLA,
-                _ranges(
+                id_map(
                     "10,11,13,15,16,18,20,252,256..259->10 30..32,253..255->4 40->7 60->6 "
                     "44,49->14 48->8 50->1 51->2 52->19 70,71->9 72->22 80->5 81->12 99->3 0,1->0"
                 ),
@@ -206,7 +204,7 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
                 "carla_to_semantickitti",
                 CARLA,
                 SEMANTICKITTI,
-                _ranges(
+                id_map(
                     "0->0 1->50 2->51 3->99 4->30 5->80 6->60 7->40 8->48 9->70 10->10 11->52 "
                     "12->81 13->0 14->49 15->52 16->49 17->51 18->80 19->52 20->99 21->0 22->72"
                 ),
@@ -222,7 +220,7 @@ REMAPS: Mapping[str, Remap] = MappingProxyType(
                     dict.fromkeys(range(29), (128, 128, 128)),
                 ),
                 CARLA,
-                _ranges(
+                id_map(
                     "0->0 1->7 2->8 3->1 4->11 5->2 6->5 7->18 8->12 9->9 10->22 11->13 12,13->4 "
                     "14..19->10 20->19 21->20 22->3 23->21 24->6 25->14 26->15 27->16 28->17"
                 ),
@@ -236,8 +234,9 @@ TABLES: Mapping[str, ClassTable] = MappingProxyType(
 
 TRAIN_VOXEL_COUNTS = np.array(
     [
-        4166593275, 42309744, 8550180, 478193, 905663, 2801091, 6452733, 229316930, 112863867, 29816894, 13839655, 15581458,
-        221821, 0, 7931550, 467989, 3354, 9201043, 61011, 3796746, 3217865, 215372, 79669695,
+        4166593275, 42309744, 8550180, 478193, 905663, 2801091, 6452733, 229316930, 112863867,
+        29816894, 13839655, 15581458, 221821, 0, 7931550, 467989, 3354, 9201043, 61011, 3796746,
+        3217865, 215372, 79669695,
     ],
     np.int64,
 )  # fmt: skip
@@ -341,9 +340,7 @@ def remaps_between(source: ClassTable, target: ClassTable) -> tuple[Remap, ...]:
     return first, second
 
 
-def to_table(
-    labels: NDArray[np.unsignedinteger], source: ClassTable, target: ClassTable, where: str
-) -> NDArray[np.unsignedinteger]:
+def to_table(labels: LabelArray, source: ClassTable, target: ClassTable, where: str) -> LabelArray:
     """Convert labels of one table to ids of another.
 
     Args:

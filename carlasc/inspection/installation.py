@@ -411,14 +411,15 @@ def _look_at_compiled_code() -> CompiledCode:
     """
     import numba
 
-    from carlasc.core.compiling import cached
+    from carlasc.core.compiling import cache_folder, cached
 
     loop: Any = cached(_next)
     start = time.perf_counter()
     numba.njit(_next)(1)  # type: ignore[type-var]
     compile_s = time.perf_counter() - start
     folder = Path(loop.stats.cache_path)
-    root = _PACKAGE if folder.name == "__pycache__" else folder.parent
+    kept = cache_folder() if folder.is_relative_to(cache_folder()) else _PACKAGE
+    root = kept if folder.name == "__pycache__" else folder.parent
     sizes = [path.stat().st_size for path in root.rglob("*.nb[ic]")]
     nearest = next(parent for parent in (folder, *folder.parents) if parent.exists())
     return CompiledCode(

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+
+from carlasc.core.arrays import AnyIntArray, Float32Array, FloatArray, IntArray
 
 _TRIM = 0.01  # share of points that may be outside the body: outliers, points of a neighbour
 # a face is visible if scans with so many points, and this share, see it
@@ -66,14 +67,14 @@ class Extent:
         seen_from: x and y of the sensor, metres, actor frame: mean over the points.
     """
 
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    lower: FloatArray
+    upper: FloatArray
     faces: tuple[bool, bool, bool, bool]
     points: int
     seen_from: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def size(self) -> NDArray[np.float64]:
+    def size(self) -> FloatArray:
         """(3,) metres: length, width and height of the visible part."""
         return self.upper - self.lower
 
@@ -105,7 +106,7 @@ class Extent:
         return rear and front and (low or high) and all(self.plausible)
 
 
-def measure(observations: Sequence[NDArray[np.float64]], sensors: NDArray[np.float64]) -> Extent:
+def measure(observations: Sequence[FloatArray], sensors: FloatArray) -> Extent:
     """Return the size of an actor, as its observations show it.
 
     Args:
@@ -120,10 +121,10 @@ def measure(observations: Sequence[NDArray[np.float64]], sensors: NDArray[np.flo
 
 
 def seen_from(
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
-    counts: NDArray[np.integer],
-    sensors: NDArray[np.float64],
+    lower: FloatArray,
+    upper: FloatArray,
+    counts: AnyIntArray,
+    sensors: FloatArray,
 ) -> Extent:
     """Return the extent of a box, with the faces that sensors saw.
 
@@ -133,6 +134,8 @@ def seen_from(
         counts: (F,) number of points of the actor in each scan.
         sensors: (F, 3) position of the sensor in each scan, metres, actor frame.
     """
+    # A face is seen from beyond its plane. Height over distance is the sine of the angle between
+    # the rays and the face; flatter rays give points of its edges only.
     distance = np.maximum(np.linalg.norm(sensors[:, :2], axis=1), 1e-6)
     total = int(counts.sum())
     rear, front, low, high = (
@@ -147,14 +150,12 @@ def seen_from(
 class Sizes:
     """The lengths, widths and shapes of actors with many visible faces, by class."""
 
-    def __init__(self, examples: Sequence[tuple[int, Extent, NDArray[np.float32]]]) -> None:
+    def __init__(self, examples: Sequence[tuple[int, Extent, Float32Array]]) -> None:
         """Learn from the classes of actors, their extents, and the (P, 3) points of their surfaces,
         metres, actor frame; P may be 0.
         """
-        self._known: dict[int, NDArray[np.float64]] = {}
-        self._shapes = {
-            label: list[tuple[Extent, NDArray[np.float32]]]() for label, _, _ in examples
-        }
+        self._known: dict[int, FloatArray] = {}
+        self._shapes = {label: list[tuple[Extent, Float32Array]]() for label, _, _ in examples}
         for label, shapes in self._shapes.items():
             own = [(e, surface) for other, e, surface in examples if other == label]
             self._known[label] = np.array(
@@ -162,9 +163,7 @@ class Sizes:
             ).reshape(-1, 3)
             shapes += [(e, surface) for e, surface in own if e.exemplary and len(surface)]
 
-    def complete(
-        self, label: int, extent: Extent
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def complete(self, label: int, extent: Extent) -> tuple[FloatArray, FloatArray]:
         """Return the corners of the whole body: unknown lengths and widths are taken from similar
         actors.
 
@@ -182,6 +181,7 @@ class Sizes:
             if known[axis] and plausible[axis]:
                 continue
             missing = max(self._expected(label, extent, axis) - (upper[axis] - lower[axis]), 0.0)
+            # What is missing is behind the actor, as the sensor sees it: the near end was seen.
             if extent.seen_from[axis] < 0:
                 upper[axis] += missing
             else:
@@ -202,12 +202,14 @@ class Sizes:
         sizes = self._known.get(label, np.empty((0, 3)))
         far = (sizes - extent.size) / np.maximum(extent.size, _CELL_M)
         alike, as_high = np.abs(far[:, other]) < _ALIKE, far[:, 2] > -_ALIKE
+        # Cars and vans are alike in one size, so the height decides between them, if there are
+        # enough of the same height; the visible height is a lower limit in any case.
         for chosen in (sizes[alike & as_high & (far[:, 2] < _ALIKE)], sizes[alike & as_high]):
             if len(chosen) >= _EXAMPLES:
                 return float(np.median(chosen[:, axis]))
         return _table(extent, axis)
 
-    def _height(self, label: int, size: NDArray[np.float64]) -> float:
+    def _height(self, label: int, size: FloatArray) -> float:
         """Return the height of actors that are as long and as wide as `size`, (3,) metres; without
         such actors, its own height.
         """
@@ -219,8 +221,8 @@ class Sizes:
         return float(np.median(alike[:, 2])) if len(alike) >= _EXAMPLES else float(size[2])
 
     def surface(
-        self, label: int, lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
-    ) -> NDArray[np.float32]:
+        self, label: int, lower: FloatArray, upper: FloatArray, extent: Extent
+    ) -> Float32Array:
         """Return points on the surface of a vehicle of this size: from the most similar actors,
         otherwise the usual shell.
 
@@ -243,8 +245,9 @@ class Sizes:
         if not chosen or not any(extent.known):
             return usual_shell(lower - BODY_MARGIN_M, upper + BODY_MARGIN_M, extent)
         fitted = [(own - other.lower) * (size / other.size) for other, own in chosen]
-        bins, points = list[NDArray[np.int64]](), list[NDArray[np.float64]]()
+        bins, points = list[IntArray](), list[FloatArray]()
         for own in fitted:
+            # Vehicles are symmetric: what one side shows holds for the other.
             whole = np.concatenate([own, own * (1, -1, 1) + (0, size[1], 0)])
             cells, place = np.unique(
                 np.floor(whole / _BIN_M).astype(np.int64), axis=0, return_inverse=True
@@ -256,11 +259,13 @@ class Sizes:
         _, place, count = np.unique(
             np.concatenate(bins), axis=0, return_inverse=True, return_counts=True
         )
-        found = np.concatenate(points)[2 * count[place.reshape(-1)] > len(chosen)]
-        return (found[found[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
+        # Cells that more than half of the actors share are of the usual shape, not of a load or a
+        # neighbour.
+        shared = np.concatenate(points)[2 * count[place.reshape(-1)] > len(chosen)]
+        return (shared[shared[:, 2] > _CLEARANCE_M] + lower).astype(np.float32)
 
 
-def surface_of(points: NDArray[np.float64]) -> NDArray[np.float32]:
+def surface_of(points: FloatArray) -> Float32Array:
     """Return the (P, 3) float32 centres of the cells that hold two or more of (M, 3) points,
     metres.
     """
@@ -300,9 +305,7 @@ def _table(extent: Extent, axis: int) -> float:
     return _TWO_WHEELS[axis]
 
 
-def usual_shell(
-    lower: NDArray[np.float64], upper: NDArray[np.float64], extent: Extent
-) -> NDArray[np.float32]:
+def usual_shell(lower: FloatArray, upper: FloatArray, extent: Extent) -> Float32Array:
     """Return points on the surface that a vehicle of this size usually has; none for vehicles with
     two wheels.
 
@@ -333,7 +336,7 @@ def usual_shell(
     return np.concatenate([body, cabin])
 
 
-def _box_surface(lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.float32]:
+def _box_surface(lower: FloatArray, upper: FloatArray) -> Float32Array:
     """Return points on the sides and the top of a box, `_SPACING_M` apart."""
     x, y, z = (
         np.linspace(a, b, max(2, round((b - a) / _SPACING_M) + 1))

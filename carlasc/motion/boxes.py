@@ -13,8 +13,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray, LabelArray
 from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import Transform, invert, multiply, rotation_z, transform_points
 from carlasc.core.scans import Scan, finite
@@ -55,14 +55,14 @@ class _ObjectBoxes:
         weights: (F,) weight of each box.
     """
 
-    frames: NDArray[np.int64]
-    seconds: NDArray[np.float64]
-    poses: NDArray[np.float64]
-    sizes: NDArray[np.float64]
-    labels: NDArray[np.int64]
-    weights: NDArray[np.float64]
+    frames: IntArray
+    seconds: FloatArray
+    poses: FloatArray
+    sizes: FloatArray
+    labels: IntArray
+    weights: FloatArray
 
-    def part(self, rows: NDArray[np.int64]) -> _ObjectBoxes:
+    def part(self, rows: IntArray) -> _ObjectBoxes:
         return _ObjectBoxes(*(values[rows] for values in vars(self).values()))
 
 
@@ -90,18 +90,18 @@ def tracks_from_boxes(
         The tracks in order of their numbers, without members: `segment_by_boxes` finds the members
         in a scan. An object whose boxes jump has several tracks with the same number.
     """
-    found: dict[int, list[tuple[int, int]]] = {}  # frames and rows by track
+    places: dict[int, list[tuple[int, int]]] = {}  # frames and rows by track
     for frame in sorted(boxes):
         for row, track in enumerate(boxes[frame].tracks.tolist()):
-            found.setdefault(track, []).append((frame, row))
+            places.setdefault(track, []).append((frame, row))
     world = {frame: boxes[frame].transform(poses[frame]) for frame in boxes}
     known = np.array(sorted(times), np.int64)
     seconds = np.array([times[frame] for frame in known.tolist()])
     return [
         _make_track(track, part, known, seconds, deformable)
-        for track in sorted(found)
+        for track in sorted(places)
         for part in _split_at_jumps(
-            _boxes_of([(frame, world[frame], row) for frame, row in found[track]], times)
+            _boxes_of([(frame, world[frame], row) for frame, row in places[track]], times)
         )
     ]
 
@@ -171,10 +171,10 @@ def segment_by_boxes(
 def _inside(
     track: Track,
     pose: Transform,
-    points: NDArray[np.float64],
-    labels: NDArray[np.unsignedinteger] | None,
+    points: FloatArray,
+    labels: LabelArray | None,
     floor_m: float,
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Return the indices of the (M, 3) points, world, that are in a track's box at a pose and above
     its ground.
     """
@@ -188,10 +188,10 @@ def _inside(
     return near[inside & above]
 
 
-def _boxes_of(found: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
-    """Return the boxes of one object, given as (frame, boxes of the frame in the world frame, row)."""
-    chosen = [boxes.select(np.array([row])) for _, boxes, row in found]
-    frames = np.array([frame for frame, _, _ in found], np.int64)
+def _boxes_of(places: list[tuple[int, Boxes, int]], times: Mapping[int, float]) -> _ObjectBoxes:
+    """Return the boxes of one object: (frame, boxes of the frame in the world, row)."""
+    chosen = [boxes.select(np.array([row])) for _, boxes, row in places]
+    frames = np.array([frame for frame, _, _ in places], np.int64)
     return _ObjectBoxes(
         frames,
         np.array([times[frame] for frame in frames.tolist()]),
@@ -212,8 +212,8 @@ def _split_at_jumps(boxes: _ObjectBoxes) -> list[_ObjectBoxes]:
 def _make_track(
     instance: int,
     boxes: _ObjectBoxes,
-    known: NDArray[np.int64],
-    known_seconds: NDArray[np.float64],
+    known: IntArray,
+    known_seconds: FloatArray,
     deformable: Collection[int],
 ) -> Track:
     """Return the track of the boxes of one object; `known` are (K,) the frames of the sequence,
@@ -262,7 +262,7 @@ def _make_track(
     )
 
 
-def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float64], Transform]:
+def _headings_and_tilt(rotations: FloatArray) -> tuple[FloatArray, Transform]:
     """Return the (F,) headings of boxes, radians, unwrapped, and the mean of their (F, 3, 3)
     rotations without the headings.
 
@@ -279,9 +279,7 @@ def _headings_and_tilt(rotations: NDArray[np.float64]) -> tuple[NDArray[np.float
     return headings, tilt
 
 
-def _is_static(
-    path: NDArray[np.float64], centers: NDArray[np.float64], seconds: NDArray[np.float64]
-) -> bool:
+def _is_static(path: FloatArray, centers: FloatArray, seconds: FloatArray) -> bool:
     """Return whether an object is static, from its (F, 3) smoothed path and the (F, 3) centres of
     its boxes, metres, world.
     """
@@ -302,7 +300,7 @@ def _is_static(
     return extent < _STATIC_M or slow
 
 
-def _fastest(path: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
+def _fastest(path: FloatArray, seconds: FloatArray) -> float:
     """Return the greatest mean speed over `_HOLD_S` along a path, in m/s; over the whole path if it
     is shorter.
     """

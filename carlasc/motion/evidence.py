@@ -15,8 +15,8 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray, LabelArray
 from carlasc.core.cells import as_pose, distinct, numbered
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, multiply, thin, transform_points
@@ -59,13 +59,13 @@ class EvidenceScan:
     """
 
     frame: int
-    points: NDArray[np.float32]
+    points: Float32Array
     world_T_sensor: Transform
     seconds: float
-    ground: NDArray[np.bool_] | None = None
-    labels: NDArray[np.unsignedinteger] | None = None
-    explained: NDArray[np.bool_] | None = None
-    origins: NDArray[np.float32] | None = None
+    ground: BoolArray | None = None
+    labels: LabelArray | None = None
+    explained: BoolArray | None = None
+    origins: Float32Array | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -98,8 +98,8 @@ class FreeSpaceEvidence:
     frame: int
     seconds: float
     count: int
-    clusters: tuple[NDArray[np.int64], ...]
-    points: tuple[NDArray[np.float64], ...]
+    clusters: tuple[IntArray, ...]
+    points: tuple[FloatArray, ...]
     labels: tuple[int, ...]
     freed: tuple[int, ...]
     around: tuple[int, ...]
@@ -112,7 +112,7 @@ class FreeSpaceEvidence:
         return replace(self, points=tuple(thin(points, most) for points in self.points))
 
     @property
-    def moved(self) -> NDArray[np.bool_]:
+    def moved(self) -> BoolArray:
         """(N,) bool: which points of the scan are in a cluster."""
         flags = np.zeros(self.count, np.bool_)
         for members in self.clusters:
@@ -164,6 +164,8 @@ def find_evidence(
             else (last + _PERIOD_S if np.isfinite(last) else 0.0)
         )
         last = seconds
+        # Invariant: `window` holds the scans within the horizon of the current one, which is the
+        # first whose evidence is not given yet. It is complete when a scan lies beyond its horizon.
         window.append(_Kept.of(scan, seconds))
         while window[-1].seconds - window[current].seconds > HORIZON_S:
             yield _evidence(window, current, movable)
@@ -183,6 +185,8 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
     candidates = np.flatnonzero(asked & finite(scan.points))
     before, after = _others(window, current)
     world = transform_points(scan.world_T_sensor, scan.points[candidates].astype(np.float64))
+    # One point per small cell is looked up: the others of the cell are of the same surface, and
+    # looking up costs most of the time.
     asked_first, same = numbered(np.floor(world / _JUDGED_CELL_M).astype(np.int64))
     verdict = _judge(
         scan, candidates[asked_first], [window[i] for i in before], [window[i] for i in after]
@@ -204,31 +208,31 @@ def _evidence(window: deque[_Kept], current: int, movable: Collection[int]) -> F
         for own in clusters
     ]
     around = _count_around(world, groups, static)
-    found = (tuple(clusters), tuple(points), tuple(classes), freed, around)
-    return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *found, scan.world_T_sensor)
+    parts = (tuple(clusters), tuple(points), tuple(classes), freed, around)
+    return FreeSpaceEvidence(scan.frame, own.seconds, len(scan.points), *parts, scan.world_T_sensor)
 
 
-def _sensors(origins: NDArray[np.float32]) -> list[NDArray[np.int64]]:
+def _sensors(origins: Float32Array) -> list[IntArray]:
     """Return the points of each sensor, by the (N, 3) origins of their rays, metres: origins of one
     moving sensor are close to each other.
     """
-    found: list[tuple[list[NDArray[np.float32]], list[NDArray[np.int64]]]] = []
+    sensors: list[tuple[list[Float32Array], list[IntArray]]] = []
     for part, origin in runs_of_origins(origins, len(origins)):
         near = (
             own
-            for own in found
+            for own in sensors
             if np.linalg.norm(np.array(own[0]) - origin, axis=1).min() < SAME_PLACE_M
         )
         places, members = next(near, ([], []))
         if not places:
-            found.append((places, members))
+            sensors.append((places, members))
         places.append(origin)
         members.append(np.arange(part.start, part.stop))
-    return [np.concatenate(members) for _, members in found]
+    return [np.concatenate(members) for _, members in sensors]
 
 
 def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
-    """Return the indices of the scans to look up, before and after the current one, nearest first."""
+    """Return the scans to look up, before and after the current one, the nearest first."""
     seconds = np.array([kept.seconds for kept in window]) - window[current].seconds
     sides: tuple[list[int], list[int]] = ([], [])
     for side, sign in zip(sides, (-1, 1), strict=True):
@@ -240,8 +244,8 @@ def _others(window: deque[_Kept], current: int) -> tuple[list[int], list[int]]:
 
 
 def _judge(
-    scan: EvidenceScan, candidates: NDArray[np.int64], before: list[_Kept], after: list[_Kept]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    scan: EvidenceScan, candidates: IntArray, before: list[_Kept], after: list[_Kept]
+) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Return which candidates are at places that were free most of the time, free on one side in
     time, and occupied (static).
     """
@@ -260,6 +264,7 @@ def _judge(
     seen_through = np.bitwise_count(free).sum(axis=0, dtype=np.int64)
     occupied = np.bitwise_count(hit).sum(axis=0, dtype=np.int64)
     # Bits above the highest hit belong to scans that are farther in time than all hits.
+    # `smeared` has all bits below the highest hit too.
     smeared = hit.copy()
     for shift in (1, 2, 4, 8, 16):
         smeared |= smeared >> np.uint32(shift)
@@ -270,12 +275,12 @@ def _judge(
 
 
 def _clusters(
-    world: NDArray[np.float64],
-    kind: NDArray[np.int64],
-    moved: NDArray[np.bool_],
-    left: NDArray[np.bool_],
-    static: NDArray[np.bool_],
-) -> list[NDArray[np.int64]]:
+    world: FloatArray,
+    kind: IntArray,
+    moved: BoolArray,
+    left: BoolArray,
+    static: BoolArray,
+) -> list[IntArray]:
     """Group moved points by cells, seen from above, and add the points around them that are not
     static.
 
@@ -305,9 +310,11 @@ def _clusters(
     share = np.bincount(flat, either[inside], minlength=len(keys)) / np.bincount(
         flat, minlength=len(keys)
     )
+    # One point that moved makes a cell a seed: such points are rare on static things. Points that
+    # were free on one side only are common behind edges, so a cell needs a large share of them.
     seeds = (np.bincount(flat, moved[inside], minlength=len(keys)) > 0) | (share >= _FLAGGED_SHARE)
     component = _join(keys, seeds, int(width))[flat]
-    groups: list[NDArray[np.int64]] = []
+    groups: list[IntArray] = []
     kept = np.flatnonzero(component >= 0)
     order = kept[np.argsort(component[kept], kind="stable")]
     for group in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
@@ -316,6 +323,8 @@ def _clusters(
         count = int(either[members].sum())
         if count < _MIN_POINTS:
             continue
+        # Of an object that moved as a whole, static points belong to it too: its sides often pass
+        # the places of its own earlier surface. Otherwise static points are of something behind it.
         if count < _FLAGGED_SHARE * len(core):
             members = members[~static[members]]
         else:
@@ -324,12 +333,11 @@ def _clusters(
     return groups
 
 
-def _count_around(
-    world: NDArray[np.float64], groups: list[NDArray[np.int64]], static: NDArray[np.bool_]
-) -> tuple[int, ...]:
+def _count_around(world: FloatArray, groups: list[IntArray], static: BoolArray) -> tuple[int, ...]:
     """Return the number of static points, of (N, 3) points in metres, around each group: in its
     cells or beside them, at its height.
     """
+    # Row and column in one number, so that neighbours are at fixed steps: 2^20 cells are 367 km.
     cell = np.floor(world[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
     key = (cell[:, 0] << 21) | cell[:, 1]
     rows = np.flatnonzero(static)
@@ -350,7 +358,7 @@ def _count_around(
 
 
 @cached
-def _join(keys: NDArray[np.int64], seeds: NDArray[np.bool_], width: int) -> NDArray[np.int64]:
+def _join(keys: IntArray, seeds: BoolArray, width: int) -> IntArray:
     """Return the component of each cell: seeds that touch are one component, and other cells belong
     to a seed beside them; -1 without one.
 
@@ -359,6 +367,9 @@ def _join(keys: NDArray[np.int64], seeds: NDArray[np.bool_], width: int) -> NDAr
         seeds: (C,) which cells hold moved points.
         width: columns per row.
     """
+    # Union-find: every cell points towards the lowest cell of its component, so components have the
+    # same numbers whatever the order of joins. Half of the neighbours is enough: joins go both
+    # ways.
     parent = np.arange(len(keys))
     for i in range(len(keys)):
         if not seeds[i]:

@@ -9,14 +9,14 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.geometry import Transform, invert, thin, transform_points
 from carlasc.motion.evidence import FreeSpaceEvidence
-from carlasc.motion.linking import best_pairs
 from carlasc.motion.paths import estimate_path, is_static, middles_of, misalignment
 from carlasc.motion.planes import nearest_points
 from carlasc.motion.segments import Segment
+from carlasc.motion.solving import best_pairs
 
 _MAX_GAP_S = 1.0  # an actor may be hidden for this long
 # maximum gap to the prediction, and maximum speed where there is no prediction
@@ -66,12 +66,12 @@ class FoundActor:
 
 def follow_actors(
     evidence: Iterable[FreeSpaceEvidence],
-    moved: dict[int, NDArray[np.int64]],
+    moved: dict[int, IntArray],
     *,
     deformable: Collection[int] = (),
     first_instance: int = 1,
     default_label: int = 0,
-    own: list[NDArray[np.float64]] | None = None,
+    own: list[FloatArray] | None = None,
 ) -> Iterator[FoundActor]:
     """Follow what moved from scan to scan, and yield each actor that has enough evidence, after its
     last observation.
@@ -92,14 +92,14 @@ def follow_actors(
     own = [] if own is None else own
     alive: list[_ActorChain] = []
     number = first_instance
-    for found in evidence:
-        moved[found.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *found.clusters]))
-        ended = [chain for chain in alive if found.seconds - chain.last.seconds > _MAX_GAP_S]
+    for scan in evidence:
+        moved[scan.frame] = np.unique(np.concatenate([np.empty(0, np.int64), *scan.clusters]))
+        ended = [chain for chain in alive if scan.seconds - chain.last.seconds > _MAX_GAP_S]
         for actor in _tracked(ended, deformable, number, default_label, own):
             yield actor
             number += 1
-        alive = [chain for chain in alive if found.seconds - chain.last.seconds <= _MAX_GAP_S]
-        _link(found, alive, deformable)
+        alive = [chain for chain in alive if scan.seconds - chain.last.seconds <= _MAX_GAP_S]
+        _link(scan, alive, deformable)
     yield from _tracked(alive, deformable, number, default_label, own)
 
 
@@ -108,7 +108,7 @@ def _tracked(
     deformable: Collection[int],
     number: int,
     default_label: int,
-    own: list[NDArray[np.float64]],
+    own: list[FloatArray],
 ) -> Iterator[FoundActor]:
     """Yield the actors of the chains with enough evidence, numbered from `number`, and add parts of
     the recording vehicle to `own`.
@@ -130,8 +130,8 @@ class _Link:
 
     seconds: float
     segment: Segment
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    lower: FloatArray
+    upper: FloatArray
     freed: int  # points at places that were free at other times
     around: int  # static points around it
     world_T_sensor: Transform
@@ -147,7 +147,7 @@ class _Link:
         )
 
     @property
-    def middle(self) -> NDArray[np.float64]:
+    def middle(self) -> FloatArray:
         return (self.lower + self.upper) / 2
 
     @property
@@ -172,7 +172,7 @@ class _ActorChain:
 
     def __init__(self, first: _Link) -> None:
         self.links = [first]
-        self.velocity: NDArray[np.float64] | None = (
+        self.velocity: FloatArray | None = (
             None  # (3,) m/s over the last observations; None for a single one
         )
 
@@ -185,7 +185,7 @@ class _ActorChain:
     def last(self) -> _Link:
         return self.links[-1]
 
-    def _velocity(self) -> NDArray[np.float64]:
+    def _velocity(self) -> FloatArray:
         recent = self.links[-_HISTORY:]
         seconds = np.array([link.seconds for link in recent])
         # The visible faces change: the velocities of the lower corner, the middle and the upper
@@ -222,7 +222,7 @@ class _ActorChain:
         )
 
     def covers(self, link: _Link) -> bool:
-        """Return whether an observation is inside the place where the chain's next one is expected."""
+        """Return whether an observation is inside the place that is expected of the next one."""
         velocity = self.velocity
         shift = np.zeros(3) if velocity is None else velocity * (link.seconds - self.last.seconds)
         lower, upper = self.last.lower + shift - 0.3, self.last.upper + shift + 0.3
@@ -262,18 +262,18 @@ class _ActorChain:
         confidence = self._confidence(samples, positions, headings, seconds)
         if confidence < _LEAST_CONFIDENCE:
             return None
-        found = [
+        parts = [
             replace(segment, label=label, velocity=velocity, instance=instance)
             for segment, velocity in zip(segments, velocities, strict=True)
         ]
-        return FoundActor(tuple(found), rigid, confidence)
+        return FoundActor(tuple(parts), rigid, confidence)
 
     def _confidence(
         self,
-        samples: list[NDArray[np.float64]],
-        positions: NDArray[np.float64],
-        headings: NDArray[np.float64],
-        seconds: NDArray[np.float64],
+        samples: list[FloatArray],
+        positions: FloatArray,
+        headings: FloatArray,
+        seconds: FloatArray,
     ) -> float:
         """Return the probability that the actor is real, from 0 to 1; the arguments are those of
         `misalignment`.
@@ -308,7 +308,7 @@ class _ActorChain:
             )
         )
 
-    def _in_sensor(self) -> list[NDArray[np.float64]] | None:
+    def _in_sensor(self) -> list[FloatArray] | None:
         """Return the (M, 3) points of each observation, metres, sensor frame; None unless they stay
         in place there while the sensor moves.
         """
@@ -323,7 +323,7 @@ class _ActorChain:
             local if stays and driven > _SENSOR_PATH_M and len(local) >= _MIN_OBSERVATIONS else None
         )
 
-    def own_vehicle(self) -> NDArray[np.float64] | None:
+    def own_vehicle(self) -> FloatArray | None:
         """Return the (6,) lower and upper corner, metres, sensor frame, of a part of the recording
         vehicle; None if it is none.
         """
@@ -352,7 +352,7 @@ class _ActorChain:
         )
 
 
-def _is_small(size: NDArray[np.float64]) -> bool:
+def _is_small(size: FloatArray) -> bool:
     return float(np.hypot(size[0], size[1])) < _PERSON_M[0] and float(size[2]) < _PERSON_M[1]
 
 

@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.cells import fast_azimuth
 from carlasc.core.compiling import cached
 from carlasc.core.scans import finite
@@ -33,7 +34,7 @@ _NEAR_M = 6.0  # farther points have less weight
 _MIN_CELLS, _MIN_SHARE = 20, 0.2  # least number of cells on the plane, and their least share
 
 
-def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+def ground_points(points: AnyFloatArray) -> BoolArray:
     """Return which points of a scan lie on the ground.
 
     Points more than half a metre below the ground (returns of mirror images) and points that are
@@ -60,7 +61,7 @@ def ground_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     return _ground(own, sector, ring, lowest, plane)
 
 
-def ground_height(points: NDArray[np.floating]) -> float:
+def ground_height(points: AnyFloatArray) -> float:
     """Return z of the ground below the sensor: minus the height of the sensor, in the sensor's own
     frame.
 
@@ -82,8 +83,8 @@ def ground_height(points: NDArray[np.floating]) -> float:
 
 @cached
 def _lowest(
-    points: NDArray[np.float32],
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+    points: Float32Array,
+) -> tuple[NDArray[np.int32], NDArray[np.int32], IntArray]:
     """Return the (N,) sector and the (N,) ring of each point, and the (S, R) index of the lowest
     point of each cell, -1 without one.
     """
@@ -105,7 +106,7 @@ def _lowest(
     return sector, ring, lowest
 
 
-def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np.float64] | None:
+def _plane(points: Float32Array, lowest: IntArray) -> FloatArray | None:
     """Return (slope along x, slope along y, z at the sensor) of the plane through most of the
     lowest points nearby; None without one.
     """
@@ -136,16 +137,14 @@ def _plane(points: NDArray[np.float32], lowest: NDArray[np.int64]) -> NDArray[np
     )
     if on.sum() < max(_MIN_CELLS, _MIN_SHARE * len(chosen)):
         return None
-    found: NDArray[np.float64] = least_squares(
+    plane: FloatArray = least_squares(
         rows[on] * weight[on, None], (chosen[on, 2] * weight[on])[:, None]
     )[:, 0]
-    return found
+    return plane
 
 
 @cached
-def _support(
-    planes: NDArray[np.float64], points: NDArray[np.float64], weight: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _support(planes: FloatArray, points: FloatArray, weight: FloatArray) -> FloatArray:
     """Return, for each of (P, 3) planes, the sum of the (N,) weights of the (N, 3) points that are
     on it.
     """
@@ -160,12 +159,12 @@ def _support(
 
 @cached
 def _ground(
-    points: NDArray[np.float32],
+    points: Float32Array,
     sector: NDArray[np.int32],
     ring: NDArray[np.int32],
-    lowest: NDArray[np.int64],
-    plane: NDArray[np.float64],
-) -> NDArray[np.bool_]:
+    lowest: IntArray,
+    plane: FloatArray,
+) -> BoolArray:
     heights = np.empty((_SECTORS, _RINGS))  # above the plane
     least = np.empty(_RINGS)
     for s in range(_SECTORS):
@@ -188,13 +187,13 @@ def _ground(
 
 
 @cached
-def _above(point: NDArray[np.float32], plane: NDArray[np.float64]) -> float:
+def _above(point: Float32Array, plane: FloatArray) -> float:
     """Return the height of a point above a plane, metres along z."""
     return float(point[2] - (plane[0] * point[0] + plane[1] * point[1] + plane[2]))
 
 
 @cached
-def _follow(lowest: NDArray[np.float64], heights: NDArray[np.float64]) -> None:
+def _follow(lowest: FloatArray, heights: FloatArray) -> None:
     """Fill the (R,) heights of the ground in the rings of one sector, from (R,) lowest points, both
     above the plane below the sensor.
     """

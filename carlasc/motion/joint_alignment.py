@@ -21,8 +21,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.compiling import cached, jit
 from carlasc.motion.solving import principal_axes, solve_positive
 
@@ -48,7 +48,7 @@ _MIX = np.int64(-7046029254386353131)  # spreads the keys of cells over a hash t
 _BITS = 21  # of the index of a cell along an axis; indices that differ by 2^21 share a key
 
 
-class Pull(NamedTuple):
+class PosePrior(NamedTuple):
     """The prior of poses: standard deviations of a position, metres, and of a rotation, radians.
 
     Attributes:
@@ -60,7 +60,7 @@ class Pull(NamedTuple):
     to_neighbour: tuple[float, float] = (0.1, math.radians(0.5))
 
 
-class Pass(NamedTuple):
+class AlignmentPass(NamedTuple):
     """One pass over the cells.
 
     Attributes:
@@ -77,7 +77,7 @@ class Pass(NamedTuple):
     flat: float
 
 
-PASSES = (Pass(2.0, 5, 0.35, 0.1), Pass(1.0, 6, 0.12, 0.03))
+PASSES = (AlignmentPass(2.0, 5, 0.35, 0.1), AlignmentPass(1.0, 6, 0.12, 0.03))
 
 
 class Clusters(NamedTuple):
@@ -90,18 +90,18 @@ class Clusters(NamedTuple):
             the world.
     """
 
-    start: NDArray[np.int64]
-    scan: NDArray[np.int64]
-    sums: NDArray[np.float64]
+    start: IntArray
+    scan: IntArray
+    sums: FloatArray
 
 
 def align(
-    points: Sequence[NDArray[np.float32]],
-    start: NDArray[np.float64],
-    given: NDArray[np.float64],
+    points: Sequence[Float32Array],
+    start: FloatArray,
+    given: FloatArray,
     fixed: int = 0,
-    pull: Pull = Pull(),  # noqa: B008 (a tuple)
-) -> NDArray[np.float64]:
+    prior: PosePrior = PosePrior(),  # noqa: B008 (a tuple)
+) -> FloatArray:
     """Return the poses under which scans agree best.
 
     Args:
@@ -110,7 +110,7 @@ def align(
             most some decimetres.
         given: (F, 4, 4) poses of the prior, which hold where the scans do not determine a pose.
         fixed: number of scans at the beginning whose poses stay.
-        pull: the standard deviations of the prior.
+        prior: the standard deviations of the prior.
 
     Returns:
         (F, 4, 4) world_T_sensor.
@@ -118,18 +118,22 @@ def align(
     poses, free = start.copy(), len(points) - fixed
     if free < 1:
         return poses
+    # Large cells first: they still hold the same surface in all scans while poses are wrong by
+    # decimetres. Small cells are flat where large ones are not, and decide the last centimetres.
     for one in PASSES:
         for repeat in range(one.repeats):
             matrix, right = np.zeros((6 * free, 6 * free)), np.zeros(6 * free)
-            for found in blocks(points, poses, one.cell_m, shift=0.5 * (repeat % 2)):
-                normals, thickness = planes(found, poses, one)
+            # Every other step moves the cells by half, so that no surface is cut at the same places
+            # in all steps. Normals are found anew in each step, and are fixed within it.
+            for block in blocks(points, poses, one.cell_m, shift=0.5 * (repeat % 2)):
+                normals, thickness = planes(block, poses, one)
                 chosen = _choose(normals, thickness)
                 slopes = _determined(normals, thickness, chosen)
-                add_planes(found, poses, normals, slopes, thickness, chosen, fixed, matrix, right)
+                add_planes(block, poses, normals, slopes, thickness, chosen, fixed, matrix, right)
             add_given(
                 poses,
                 given,
-                np.array([*pull.to_given, *pull.to_neighbour]) ** -2.0,
+                np.array([*prior.to_given, *prior.to_neighbour]) ** -2.0,
                 fixed,
                 matrix,
                 right,
@@ -139,43 +143,46 @@ def align(
 
 
 def blocks(
-    points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64], cell_m: float, shift: float
+    points: Sequence[Float32Array], poses: FloatArray, cell_m: float, shift: float
 ) -> list[Clusters]:
-    """Return the clusters of each block of scans; `shift` moves the cells by a share of their size."""
+    """Return the clusters of each block; `shift` moves the cells by a share of their size."""
     per_scan = [clusters(own, pose, cell_m, shift) for own, pose in zip(points, poses, strict=True)]
-    found = []
+    grouped = []
     for first in range(0, max(len(points) - HALF_BLOCK, 1), HALF_BLOCK):
         block = per_scan[first : first + 2 * HALF_BLOCK]
         keys = np.concatenate([keys for keys, _ in block])
+        # A stable sort keeps the scans of a cell in order, so sums are rounded the same everywhere.
         order = np.argsort(keys, kind="stable")
         begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
         scan = np.repeat(np.arange(first, first + len(block)), [len(keys) for keys, _ in block])
         sums = np.concatenate([sums for _, sums in block])
-        found.append(Clusters(np.append(begins, len(keys)), scan[order], sums[order]))
-    return found
+        grouped.append(Clusters(np.append(begins, len(keys)), scan[order], sums[order]))
+    return grouped
 
 
-def _choose(normals: NDArray[np.float64], thickness: NDArray[np.float64]) -> NDArray[np.int64]:
+def _choose(normals: FloatArray, thickness: FloatArray) -> IntArray:
     """Return the planes that are used: about the same number for each of six directions, spread
     over the scene.
     """
-    found = np.flatnonzero(thickness >= 0)
-    x, y, upright = normals[found, 0], normals[found, 1], np.abs(normals[found, 2])
+    rows = np.flatnonzero(thickness >= 0)
+    x, y, upright = normals[rows, 0], normals[rows, 1], np.abs(normals[rows, 2])
+    # Four quarters of the compass for walls, by which axis is greater and by the sign of x y: a
+    # normal and its opposite are in the same quarter. Without limits, ground would outvote walls.
     wall = 2 + 2 * (np.abs(x) > np.abs(y)) + (x * y > 0)
     direction = np.where(upright > _STEEP, 0, np.where(upright > _SLANTED, 1, wall))
-    chosen = [found[:0]]
+    chosen = [rows[:0]]
     for number in range(6):
-        own = found[direction == number]
+        own = rows[direction == number]
         chosen.append(own[:: max(1, -(-len(own) // _PER_DIRECTION))])
     return np.concatenate(chosen)
 
 
-def _determined(
-    normals: NDArray[np.float64], thickness: NDArray[np.float64], chosen: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return the normals without their components along undetermined directions, as along a tunnel."""
+def _determined(normals: FloatArray, thickness: FloatArray, chosen: IntArray) -> FloatArray:
+    """Return normals without their components along undetermined directions, as of a tunnel."""
     own = normals[chosen]
     weights = 1.0 / (POINT_M**2 + thickness[chosen])
+    # The eigenvectors of the sum of all normals' squares are the directions in which planes hold
+    # the poses. Where the sum is small, noise would move the poses: the prior holds them there.
     spread = (weights[:, None, None] * own[:, :, None] * own[:, None, :]).sum(axis=0)
     values, vectors = principal_axes(spread[None])
     slopes = normals.copy()
@@ -194,11 +201,13 @@ def cell_key(x: float, y: float, z: float) -> int:
 
 @cached
 def clusters(
-    points: NDArray[np.float32], pose: NDArray[np.float64], cell_m: float, shift: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    points: Float32Array, pose: FloatArray, cell_m: float, shift: float
+) -> tuple[IntArray, FloatArray]:
     """Return the (C,) keys of the cells in which a scan has points, and the (C, 10) sums of these
     points.
     """
+    # A hash table of a power of two, at most half full: a search ends after a few places. Rows are
+    # given in the order of the points, so that sums do not depend on the table.
     size = 16
     while size < 2 * len(points):
         size *= 2
@@ -225,26 +234,24 @@ def clusters(
 
 
 def planes(
-    found: Clusters, poses: NDArray[np.float64], how: Pass
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    block: Clusters, poses: FloatArray, limits: AlignmentPass
+) -> tuple[FloatArray, FloatArray]:
     """Return the (G, 3) normals of the planes in cells, and their (G,) variances along the normals,
     metres squared; -1 without a plane.
     """
-    enough, covariances = spread_of(found, poses, _MIN_SCANS)
+    enough, covariances = spread_of(block, poses, _MIN_SCANS)
     values, vectors = principal_axes(covariances)
-    flat = enough & (values[:, 0] < how.thick_m**2) & (values[:, 0] < how.flat * values[:, 1])
+    flat = enough & (values[:, 0] < limits.thick_m**2) & (values[:, 0] < limits.flat * values[:, 1])
     flat &= values[:, 1] > _WIDE_M2
     return vectors[:, :, 0], np.where(flat, np.maximum(values[:, 0], 0.0), -1.0)
 
 
 @cached
-def spread_of(
-    found: Clusters, poses: NDArray[np.float64], scans: int
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def spread_of(block: Clusters, poses: FloatArray, scans: int) -> tuple[BoolArray, FloatArray]:
     """Return (G,) whether a cell has points of enough scans, and the (G, 3, 3) covariances of its
     points. The weight of a scan is limited.
     """
-    start, scan, sums = found
+    start, scan, sums = block
     cells = len(start) - 1
     enough, covariances = np.zeros(cells, np.bool_), np.zeros((cells, 3, 3))
     total, to, center = np.empty(_SUMS), np.empty(3), np.empty(3)
@@ -256,6 +263,8 @@ def spread_of(
             center[a] = poses[scan[first], a, 3] + sums[first, 1 + a] / sums[first, 0]
         total[:] = 0.0
         for r in range(first, start[g + 1]):
+            # A near scan has hundreds of points in a cell and a far one has three: beyond `_EQUAL`,
+            # points repeat what the others say, so that no scan alone gives the plane.
             weight = min(sums[r, 0], _EQUAL) / sums[r, 0]
             for a in range(3):
                 to[a] = poses[scan[r], a, 3] - center[a]
@@ -264,6 +273,8 @@ def spread_of(
                 total[1 + a] += weight * (sums[r, 1 + a] + sums[r, 0] * to[a])
                 for b in range(a, 3):
                     k = _SQUARES[a, b]
+                    # The sums of squares about the new centre, by the theorem of parallel axes:
+                    # clusters are summed once per step, and the points are not read again.
                     moved = (
                         sums[r, k]
                         + to[a] * sums[r, 1 + b]
@@ -281,12 +292,12 @@ def spread_of(
 
 @jit
 def to_plane(
-    scan: NDArray[np.int64],
-    sums: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    normal: NDArray[np.float64],
+    scan: IntArray,
+    sums: FloatArray,
+    poses: FloatArray,
+    normal: FloatArray,
     variance: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Return the (C,) distances of clusters from their plane, along its normal, and their (C,)
     weights; outliers have less.
     """
@@ -296,6 +307,8 @@ def to_plane(
         for a in range(3):
             off[i] += normal[a] * (sums[i, 1 + a] / sums[i, 0] + poses[scan[i], a, 3])
         weight[i] = min(sums[i, 0], _EQUAL) / variance
+    # The position of a plane is the weighted mean of its clusters, so it is eliminated: distances
+    # are relative to it. Weights and mean depend on each other, and settle within four rounds.
     for repeat in range(4):
         total = level = 0.0
         for i in range(len(scan)):
@@ -309,15 +322,15 @@ def to_plane(
 
 @cached
 def add_planes(
-    found: Clusters,
-    poses: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-    thickness: NDArray[np.float64],
-    chosen: NDArray[np.int64],
+    block: Clusters,
+    poses: FloatArray,
+    normals: FloatArray,
+    slopes: FloatArray,
+    thickness: FloatArray,
+    chosen: IntArray,
     fixed: int,
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
+    matrix: FloatArray,
+    right: FloatArray,
 ) -> None:
     """Add the chosen planes to the normal equations of the poses from `fixed` on: `right`, and the
     lower half of `matrix`.
@@ -325,18 +338,23 @@ def add_planes(
     `slopes` are the normals without their undetermined components: see `_determined`.
     """
     for g in chosen:
-        first, last, normal = found.start[g], found.start[g + 1], slopes[g]
-        scan, sums = found.scan[first:last], found.sums[first:last]
+        first, last, normal = block.start[g], block.start[g + 1], slopes[g]
+        scan, sums = block.scan[first:last], block.sums[first:last]
         off, weight = to_plane(scan, sums, poses, normals[g], POINT_M * POINT_M + thickness[g])
         slope = np.empty((len(scan), 6))
         for i in range(len(scan)):
             x, y, z = sums[i, 1] / sums[i, 0], sums[i, 2] / sums[i, 0], sums[i, 3] / sums[i, 0]
+            # The derivative of a distance by the step of its pose: the normal, and for the rotation
+            # the cross product of the point, from the sensor, and the normal. See `move`.
             slope[i, :3] = normal
             slope[i, 3] = y * normal[2] - z * normal[1]
             slope[i, 4] = z * normal[0] - x * normal[2]
             slope[i, 5] = x * normal[1] - y * normal[0]
         total = weight.sum()
         for i in range(len(scan)):
+            # Points of one cluster share the errors of their surface and of their scan: only a
+            # share of their weight is counted as independent. Scans before `fixed` only hold the
+            # plane.
             own, share = 6 * (scan[i] - fixed), _INDEPENDENT * weight[i]
             if own < 0:
                 continue
@@ -344,6 +362,9 @@ def add_planes(
                 right[own + k] -= share * off[i] * slope[i, k]
                 for m in range(6):
                     matrix[own + k, own + m] += share * slope[i, k] * slope[i, m]
+            # The plane's own position is eliminated (the Schur complement): what remains couples
+            # each pair of scans that see it. Only the lower half is filled, because the matrix is
+            # symmetric.
             for j in range(len(scan)):
                 other = 6 * (scan[j] - fixed)
                 if 0 <= other <= own:
@@ -354,7 +375,7 @@ def add_planes(
 
 
 @jit
-def _turn_between(one: NDArray[np.float64], other: NDArray[np.float64], axis: int) -> float:
+def _turn_between(one: FloatArray, other: FloatArray, axis: int) -> float:
     """Return one component of the small rotation vector between the rotations of two poses, on the
     axes of the world.
     """
@@ -367,12 +388,12 @@ def _turn_between(one: NDArray[np.float64], other: NDArray[np.float64], axis: in
 
 @cached
 def add_given(
-    poses: NDArray[np.float64],
-    given: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    poses: FloatArray,
+    given: FloatArray,
+    weights: FloatArray,
     fixed: int,
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
+    matrix: FloatArray,
+    right: FloatArray,
 ) -> None:
     """Add the prior to the normal equations: each pose is near the given one, and its change near
     the change of the previous one.
@@ -394,13 +415,14 @@ def add_given(
             matrix[own + k, own + k] += near
             right[own + k] -= near * (change[i, k] - change[i - 1, k])
             if i > fixed:
+                # The change between two free poses pulls both, with opposite signs.
                 matrix[own + k - 6, own + k - 6] += near
                 matrix[own + k, own + k - 6] -= near
                 right[own + k - 6] += near * (change[i, k] - change[i - 1, k])
 
 
 @cached
-def move(poses: NDArray[np.float64], steps: NDArray[np.float64], fixed: int) -> None:
+def move(poses: FloatArray, steps: FloatArray, fixed: int) -> None:
     """Change the poses from `fixed` on by (F - fixed, 6) small translations and rotation vectors on
     the axes of the world.
     """
@@ -409,6 +431,8 @@ def move(poses: NDArray[np.float64], steps: NDArray[np.float64], fixed: int) -> 
         for a in range(3):
             pose[a, 3] += steps[i, a]
         half = math.sqrt(x * x + y * y + z * z) / 2.0
+        # The quaternion of the rotation vector. For tiny angles, the quotient is its limit, 1/2.
+        # Unlike I + [w]x, the rotation stays exact, so that poses need no repair after the steps.
         scale = 0.5 if half < 1e-9 else math.sin(half) / (2.0 * half)
         w, x, y, z = math.cos(half), scale * x, scale * y, scale * z
         turn = np.array(

@@ -12,9 +12,10 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.motion.segments import LINKED_M_S, Segment, StaticPoints
+from carlasc.motion.solving import best_pairs
 
 _MAX_GAP_S = 1.55  # an actor may be hidden for this time
 _NUMBERED_GAP_S = 10.0  # a numbered actor is the same after this time
@@ -138,10 +139,10 @@ class Linker:
         )
         possible = gap < np.where(is_other, np.where(is_lost, 0.0, _GATE_M), far)
         cost = gap + change + is_other * _OTHER_NUMBER
-        found = sorted((float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist())
-        return [(i, j, bool(is_other[i, j])) for _, i, j in found]
+        costs = sorted((float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist())
+        return [(i, j, bool(is_other[i, j])) for _, i, j in costs]
 
-    def _velocity(self, chain: Chain) -> NDArray[np.float64]:
+    def _velocity(self, chain: Chain) -> FloatArray:
         """Return the (3,) velocity, m/s, of an actor in its last segment; NaN if it is unknown."""
         last = chain[-1]
         if last.velocity is not None:
@@ -150,7 +151,7 @@ class Linker:
         for before in islice(reversed(chain), 1, None):
             elapsed = now - self._seconds.get(before.frame, now)
             if elapsed >= _HISTORY_S:
-                velocity: NDArray[np.float64] = (last.center - before.center) / elapsed
+                velocity: FloatArray = (last.center - before.center) / elapsed
                 return velocity
         return _UNKNOWN
 
@@ -158,38 +159,38 @@ class Linker:
         """Return the segments of earlier scans in which the actor of a new chain was static at the
         start of the chain.
         """
-        found: Chain = []
+        earlier: Chain = []
         for _, static in reversed(self._static):
             rest = static.segment_at(segment) if _is_slow(segment) else None
             if rest is None:
                 break
             segment = rest
-            found.append(rest)
-        return found[::-1]
+            earlier.append(rest)
+        return earlier[::-1]
 
     def _match(
-        self, found: list[Segment], alive: list[Chain]
+        self, segments: list[Segment], alive: list[Chain]
     ) -> list[tuple[Segment, Chain | None]]:
         """Pair the segments of one scan with the chains that they continue: the nearest prediction
         first, each chain once.
         """
-        if not found or not alive:
-            return [(segment, None) for segment in found]
+        if not segments or not alive:
+            return [(segment, None) for segment in segments]
         last = [chain[-1] for chain in alive]
         elapsed = np.array(
-            [self._seconds[found[0].frame] - self._seconds[end.frame] for end in last]
+            [self._seconds[segments[0].frame] - self._seconds[end.frame] for end in last]
         )
         centers, velocity, before = (
-            np.stack([s.center for s in found])[:, None],
-            _velocities(found)[:, None],
+            np.stack([s.center for s in segments])[:, None],
+            _velocities(segments)[:, None],
             _velocities(last),
         )
         shift = (before + velocity) / 2 * elapsed[:, None]
         # The visible part of an actor changes: the gap between boxes counts most, and their centres
         # have little weight.
-        gap, change = _gaps(found, last, shift), _lengths(velocity - before)
+        gap, change = _gaps(segments, last, shift), _lengths(velocity - before)
         offset = _lengths(np.stack([end.points.mean(axis=0) for end in last]) + shift - centers)
-        is_other = np.array([s.label for s in found])[:, None] != np.array(
+        is_other = np.array([s.label for s in segments])[:, None] != np.array(
             [end.label for end in last]
         )
         reach = _FARTHEST_M + _MAX_SPEED_M_S * elapsed
@@ -199,31 +200,20 @@ class Linker:
         candidates = [(float(cost[i, j]), i, j) for i, j in np.argwhere(possible).tolist()]
         taken = best_pairs(candidates)
         return [
-            (segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(found)
+            (segment, alive[taken[i]] if i in taken else None) for i, segment in enumerate(segments)
         ]
 
 
-def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
-    """Pair first and second numbers by (cost, first, second), the lowest cost first, each number
-    once; return the second by the first.
-    """
-    taken: dict[int, int] = {}
-    for _, i, j in sorted(costs):
-        if i not in taken and j not in taken.values():
-            taken[i] = j
-    return taken
-
-
-def _velocities(segments: list[Segment]) -> NDArray[np.float64]:
+def _velocities(segments: list[Segment]) -> FloatArray:
     """Return the (S, 3) velocities of segments, m/s, world; NaN where the scan has no flow."""
     return np.stack(
         [_UNKNOWN if segment.velocity is None else segment.velocity for segment in segments]
     )
 
 
-def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lengths(vectors: FloatArray) -> FloatArray:
     # the same sum on every processor
-    lengths: NDArray[np.float64] = np.linalg.norm(vectors, axis=-1)
+    lengths: FloatArray = np.linalg.norm(vectors, axis=-1)
     return lengths
 
 
@@ -233,9 +223,7 @@ def _is_slow(segment: Segment) -> bool:
     )
 
 
-def _gaps(
-    segments: list[Segment], ends: list[Segment], shifts: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _gaps(segments: list[Segment], ends: list[Segment], shifts: FloatArray) -> FloatArray:
     """Return the (S, C) gaps, metres, between the bounding boxes of segments and of `ends` moved by
     (C, 3) or (S, C, 3); 0 if they overlap.
     """

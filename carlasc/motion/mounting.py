@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, FloatArray
 from carlasc.core.geometry import Transform, invert, multiply, rotations_of, slerp, small_motions
 from carlasc.motion.solving import solve_positive
 
@@ -47,24 +47,22 @@ class Mounting:
         errors: (7,) standard errors, infinite where a value is not determined.
     """
 
-    values: NDArray[np.float64]
-    errors: NDArray[np.float64]
+    values: FloatArray
+    errors: FloatArray
 
     @property
-    def determined(self) -> NDArray[np.bool_]:
+    def determined(self) -> BoolArray:
         """(7,) bool: which values the drive determines."""
         return np.asarray(self.errors < _DETERMINED)
 
     @property
-    def wrong(self) -> NDArray[np.bool_]:
+    def wrong(self) -> BoolArray:
         """(7,) bool: which values are certainly not zero, and large enough to matter."""
         return self.determined & (
             np.abs(self.values) > np.maximum(_RELEVANT, _CERTAIN * self.errors)
         )
 
-    def correct(
-        self, poses: NDArray[np.float64], seconds: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def correct(self, poses: FloatArray, seconds: FloatArray) -> FloatArray:
         """Return the (F, 4, 4) poses of the sensor from given poses and their (F,) times: the wrong
         values are applied. The first pose stays.
         """
@@ -86,9 +84,9 @@ class Mounting:
 
 
 def find_mounting(
-    poses: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    runs: Sequence[tuple[int, NDArray[np.float64]]],
+    poses: FloatArray,
+    seconds: FloatArray,
+    runs: Sequence[tuple[int, FloatArray]],
 ) -> Mounting | None:
     """Fit the mounting to the motions of aligned scans; None if there are too few motions.
 
@@ -98,7 +96,7 @@ def find_mounting(
         runs: the aligned poses, in any frame: the row of the first scan, and the (K, 4, 4) poses of
             this scan and the following ones.
     """
-    parts = [_Motions.of(poses, seconds, first, found) for first, found in runs]
+    parts = [_Motions.of(poses, seconds, first, aligned) for first, aligned in runs]
     if sum(len(part.given) for part in parts) < 2 * len(_LEAST) * len(_LAGS):
         return None
     values = np.zeros(7)
@@ -129,38 +127,38 @@ class _Motions:
 
     Attributes:
         given: (P, 4, 4) motions.
-        found: (K, 4, 4) aligned poses.
+        aligned: (K, 4, 4) aligned poses.
         seconds: (K,) times of these scans.
         at: (P, 2) times of the start and the end of each motion.
     """
 
-    given: NDArray[np.float64]
-    found: NDArray[np.float64]
-    seconds: NDArray[np.float64]
-    at: NDArray[np.float64]
+    given: FloatArray
+    aligned: FloatArray
+    seconds: FloatArray
+    at: FloatArray
 
     @classmethod
     def of(
         cls,
-        poses: NDArray[np.float64],
-        seconds: NDArray[np.float64],
+        poses: FloatArray,
+        seconds: FloatArray,
         first: int,
-        found: NDArray[np.float64],
+        aligned: FloatArray,
     ) -> _Motions:
         """Pair the scans of a run."""
         rows = np.concatenate(
             [
-                np.stack([np.arange(len(found) - lag), np.arange(lag, len(found))], axis=1)
+                np.stack([np.arange(len(aligned) - lag), np.arange(lag, len(aligned))], axis=1)
                 for lag in _LAGS
-                if lag < len(found)
+                if lag < len(aligned)
             ]
             or [np.empty((0, 2), np.int64)]
         )
-        given, own = poses[first + rows], seconds[first : first + len(found)]
-        return cls(multiply(invert(given[:, 0]), given[:, 1]), found, own, own[rows])
+        given, own = poses[first + rows], seconds[first : first + len(aligned)]
+        return cls(multiply(invert(given[:, 0]), given[:, 1]), aligned, own, own[rows])
 
 
-def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _residuals(parts: Sequence[_Motions], values: FloatArray) -> FloatArray:
     """Return the (P, 6) differences from the expected motions of the sensor to the aligned ones:
     metres, and rotation vectors.
 
@@ -170,7 +168,7 @@ def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArra
     mounted, between = _transform(values), []
     for part in parts:
         one, other = (
-            slerp(part.found, part.seconds, part.at[:, end] - values[6]) for end in (0, 1)
+            slerp(part.aligned, part.seconds, part.at[:, end] - values[6]) for end in (0, 1)
         )
         between.append(
             multiply(invert(multiply(invert(mounted), part.given, mounted)), invert(one), other)
@@ -178,7 +176,7 @@ def _residuals(parts: Sequence[_Motions], values: NDArray[np.float64]) -> NDArra
     return small_motions(np.concatenate(between))
 
 
-def _transform(values: NDArray[np.float64]) -> Transform:
+def _transform(values: FloatArray) -> Transform:
     """Return the (4, 4) pose of the sensor from the first six values."""
     mounted = np.eye(4)
     x, y, z = values[3:6]

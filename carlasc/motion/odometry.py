@@ -12,8 +12,8 @@ from itertools import chain, islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
 from carlasc.core.cells import distinct
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, invert, slerp, transform_points
@@ -35,23 +35,23 @@ _ABOVE_M = 0.2
 _FASTEST_M_S = 40.0
 _CLEARLY = 1.1  # so many times the overlap make another start the better one
 
-UsableScan = tuple[NDArray[np.floating], NDArray[np.floating] | None]
+UsableScan = tuple[AnyFloatArray, AnyFloatArray | None]
 """(N, 3) points that `usable_points` chose, metres, sensor frame, and the (N,) seconds of each
 after the time of its frame, or None.
 """
 
 
 def estimate_poses(
-    scans: Iterable[NDArray[np.floating]],
+    scans: Iterable[AnyFloatArray],
     *,
-    seconds: Iterable[NDArray[np.floating]] | None = None,
-    times: Sequence[float] | NDArray[np.floating] | None = None,
+    seconds: Iterable[AnyFloatArray] | None = None,
+    times: Sequence[float] | AnyFloatArray | None = None,
     max_range_m: float = 100.0,
     min_range_m: float = 0.0,
     voxel_size_m: float | None = None,
     total: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Estimate the pose of every scan of a drive from its usable points, with the method of
     `follow_scans`.
 
@@ -88,7 +88,7 @@ def estimate_poses(
 def follow_scans(
     scans: Iterable[UsableScan],
     *,
-    times: Sequence[float] | NDArray[np.floating] | None = None,
+    times: Sequence[float] | AnyFloatArray | None = None,
     max_range_m: float = 100.0,
     min_range_m: float = 0.0,
     voxel_size_m: float | None = None,
@@ -144,7 +144,7 @@ def follow_scans(
 
 def _find_start(
     start: Sequence[UsableScan],
-    times: Sequence[float] | NDArray[np.floating] | None,
+    times: Sequence[float] | AnyFloatArray | None,
     begin: Callable[[], Any],
 ) -> Transform:
     """Return the motion from the first scan to the next one: `first_T_second`.
@@ -177,7 +177,7 @@ def _find_start(
 def _follow(
     odometry: Any,
     numbered: Iterable[tuple[int, UsableScan]],
-    times: Sequence[float] | NDArray[np.floating] | None,
+    times: Sequence[float] | AnyFloatArray | None,
     motion: Transform,
     *,
     back: bool = False,
@@ -193,14 +193,14 @@ def _follow(
         yield first_T_map @ pose
 
 
-def _cells_above(points: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the distinct cells (row, column) that things above the sensor are in, seen from above."""
+def _cells_above(points: AnyFloatArray) -> IntArray:
+    """Return the distinct cells (row, column), seen from above, of things above the sensor."""
     cells = np.floor(points[points[:, 2] > _ABOVE_M, :2] / _CELL_M).astype(np.int64) + _CELLS // 2
     inside = ((cells >= 0) & (cells < _CELLS)).all(axis=1)
     return np.unique(cells[inside], axis=0)
 
 
-def _likely_shift(above: Sequence[NDArray[np.int64]], reach_m: float) -> NDArray[np.float64]:
+def _likely_shift(above: Sequence[IntArray], reach_m: float) -> FloatArray:
     """Return the (x, y) motion in metres between scans under which their cells overlap most, if all
     move alike without a turn.
     """
@@ -215,9 +215,7 @@ def _likely_shift(above: Sequence[NDArray[np.int64]], reach_m: float) -> NDArray
     return np.array([shifts[x], shifts[y]])
 
 
-def _overlap(
-    first: NDArray[np.int64], last: NDArray[np.floating], first_T_last: Transform
-) -> float:
+def _overlap(first: IntArray, last: AnyFloatArray, first_T_last: Transform) -> float:
     """Return the share of the cells of what is above the sensor in the last scan, (N, 3) points,
     that are among those of the first scan.
     """
@@ -226,7 +224,7 @@ def _overlap(
     return (len(first) + len(cells) - len(both)) / max(len(cells), 1)
 
 
-def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+def usable_points(points: AnyFloatArray) -> BoolArray:
     """Return (N,) bool, which (N, 3 or more) points of a scan odometry uses: finite ones that are
     not on far ground.
     """
@@ -236,7 +234,7 @@ def usable_points(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def _usable(
-    scans: Iterable[NDArray[np.floating]], seconds: Iterable[NDArray[np.floating]] | None
+    scans: Iterable[AnyFloatArray], seconds: Iterable[AnyFloatArray] | None
 ) -> Iterator[UsableScan]:
     """Yield the used points of each scan, and their seconds."""
     per_point = None if seconds is None else iter(seconds)
@@ -293,8 +291,8 @@ def _register(
     return np.array(odometry.last_delta)
 
 
-def _elapsed(times: Sequence[float] | NDArray[np.floating] | None, number: int) -> float:
-    """Return the seconds from the previous frame to a frame; for the first frame, to the next one."""
+def _elapsed(times: Sequence[float] | AnyFloatArray | None, number: int) -> float:
+    """Return the seconds from the frame before; for the first frame, to the next one."""
     if times is None or len(times) < 2:
         return _PERIOD_S
     number = max(1, min(number, len(times) - 1))
@@ -304,7 +302,7 @@ def _elapsed(times: Sequence[float] | NDArray[np.floating] | None, number: int) 
 _TICK_S = 1e-4  # points within this time share a pose: 3 mm at 30 m/s
 
 
-def ticks_of(seconds: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def ticks_of(seconds: AnyFloatArray) -> tuple[FloatArray, IntArray]:
     """Return the (T,) distinct rounded times of (N,) points, seconds, increasing, and the (N,)
     index of the time of each point.
     """
@@ -313,9 +311,7 @@ def ticks_of(seconds: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArra
 
 
 @cached
-def move_each(
-    points: NDArray[np.floating], dst_T_then: NDArray[np.float64], tick_of: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def move_each(points: AnyFloatArray, dst_T_then: FloatArray, tick_of: IntArray) -> FloatArray:
     """Move each point by the transform of its time.
 
     Args:

@@ -16,8 +16,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray
 from carlasc.core.geometry import invert, multiply, rotation_z, thin, transform_points
 from carlasc.motion.planes import Planes, nearest_points, pose_of, register
 from carlasc.motion.solving import fast_rows, headings_of, resample, smooth, smooth_at
@@ -51,8 +51,8 @@ _GAIN = 0.3  # weight of the last correction in the estimate of the motion
 
 
 def estimate_path(
-    observations: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], *, rigid: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    observations: Sequence[FloatArray], seconds: FloatArray, *, rigid: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Estimate the position, the velocity and the heading of an actor at each of its observations.
 
     Rigid actors are registered, so the result does not depend on the side that is visible. People
@@ -98,10 +98,10 @@ def estimate_path(
 
 
 def is_static(
-    observations: Sequence[NDArray[np.float64]],
-    positions: NDArray[np.float64],
-    headings: NDArray[np.float64],
-    seconds: NDArray[np.float64],
+    observations: Sequence[FloatArray],
+    positions: FloatArray,
+    headings: FloatArray,
+    seconds: FloatArray,
 ) -> bool:
     """Return whether observations align as well without motion as with the estimated motion; the
     arguments are those of `misalignment`.
@@ -112,10 +112,10 @@ def is_static(
 
 
 def misalignment(
-    observations: Sequence[NDArray[np.float64]],
-    positions: NDArray[np.float64],
-    headings: NDArray[np.float64],
-    seconds: NDArray[np.float64],
+    observations: Sequence[FloatArray],
+    positions: FloatArray,
+    headings: FloatArray,
+    seconds: FloatArray,
     shifts_m: Sequence[float] = (0.0,),
 ) -> tuple[float, ...]:
     """Return how well observations of an actor, about a second apart, align: the mean distance to
@@ -137,18 +137,18 @@ def misalignment(
         multiply(points - positions[i], rotation_z(headings[i])[:3, :3])
         for i, points in enumerate(thinned)
     ]
-    found = []
+    means = []
     for i in np.unique(np.linspace(0, len(seconds) - 1, _PAIRS).astype(int)):
         j = int(np.argmin(np.abs(np.abs(seconds - seconds[i]) - _APART_S)))
         if j != i:
             shifted = [
                 _mean_distance(body[i] + np.array([shift, 0.0, 0.0]), body[j]) for shift in shifts_m
             ]
-            found.append([_mean_distance(thinned[i], thinned[j]), *shifted])
-    return tuple(np.mean(found, axis=0).tolist()) if found else (np.nan,) * (1 + len(shifts_m))
+            means.append([_mean_distance(thinned[i], thinned[j]), *shifted])
+    return tuple(np.mean(means, axis=0).tolist()) if means else (np.nan,) * (1 + len(shifts_m))
 
 
-def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+def _mean_distance(points: FloatArray, others: FloatArray) -> float:
     """Return the mean distance of points to the nearest of other points, metres.
 
     Each distance is at most `_MAX_DISTANCE_M`.
@@ -156,9 +156,7 @@ def _mean_distance(points: NDArray[np.float64], others: NDArray[np.float64]) -> 
     return float(np.minimum(np.sqrt(nearest_points(points, others)[1]), _MAX_DISTANCE_M).mean())
 
 
-def _limit_acceleration(
-    velocities: NDArray[np.float64], seconds: NDArray[np.float64], best: int
-) -> NDArray[np.float64]:
+def _limit_acceleration(velocities: FloatArray, seconds: FloatArray, best: int) -> FloatArray:
     """Limit the change of (F, 3) velocities to the acceleration of an actor, from the index `best`
     outwards.
     """
@@ -173,9 +171,7 @@ def _limit_acceleration(
     return bounded
 
 
-def headings_by_turns(
-    velocities: NDArray[np.float64], turns: NDArray[np.float64], seconds: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def headings_by_turns(velocities: FloatArray, turns: FloatArray, seconds: FloatArray) -> FloatArray:
     """Return headings: registered turns, corrected by the directions of motion over a second or
     two.
 
@@ -200,8 +196,8 @@ def headings_by_turns(
 
 
 def follow(
-    observations: Sequence[NDArray[np.float64]], seconds: NDArray[np.float64], best: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    observations: Sequence[FloatArray], seconds: FloatArray, best: int
+) -> tuple[FloatArray, FloatArray]:
     """Register the observations of a rigid, upright actor, from the best observation outwards.
 
     Args:
@@ -245,12 +241,12 @@ def follow(
 
 
 def corrections(
-    observations: Sequence[NDArray[np.float64]],
-    seconds: NDArray[np.float64],
-    states: NDArray[np.float64],
-    error: NDArray[np.float64],
+    observations: Sequence[FloatArray],
+    seconds: FloatArray,
+    states: FloatArray,
+    error: FloatArray,
     best: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Return the smooth change of the path of a rigid, upright actor with which its observations
     align.
 
@@ -276,9 +272,7 @@ def corrections(
     return smooth(laid - states, seconds, counts, _DRIVE_S)
 
 
-def _shift_of_ends(
-    before: NDArray[np.float64], now: NDArray[np.float64], velocity: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _shift_of_ends(before: FloatArray, now: FloatArray, velocity: FloatArray) -> FloatArray:
     """Return (K, 4) directions, world, in which two observations show the same ends of an actor,
     and the displacement of these ends, metres.
 
@@ -300,7 +294,7 @@ def _shift_of_ends(
     return np.array(shifts).reshape(-1, 4)
 
 
-def ends(values: NDArray[np.float64]) -> tuple[float, float]:
+def ends(values: FloatArray) -> tuple[float, float]:
     """Return the 2 % and 98 % quantiles of (N,) values.
 
     `np.quantile` returns the same and takes ten times as long.
@@ -319,12 +313,12 @@ def _between(low: float, high: float, share: float) -> float:
     return low + (high - low) * share if share < 0.5 else high - (high - low) * (1 - share)
 
 
-def middles_of(observations: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def middles_of(observations: Sequence[FloatArray]) -> FloatArray:
     """Return (F, 3) the middle of the bounds of the (M, 3) points of each observation."""
     return np.stack([(points.min(axis=0) + points.max(axis=0)) / 2 for points in observations])
 
 
-def best_observation(observations: Sequence[NDArray[np.float64]]) -> int:
+def best_observation(observations: Sequence[FloatArray]) -> int:
     """Return the index of the observation to start with: it has many points, shows more than one
     side, and is not at an end of the track.
     """
@@ -335,7 +329,7 @@ def best_observation(observations: Sequence[NDArray[np.float64]]) -> int:
     return int(np.argmax(counts * np.clip(np.array(across) / _SIDE_M**2, 1e-6, 1.0) * amid))
 
 
-def _least_variance(points: NDArray[np.float64]) -> float:
+def _least_variance(points: FloatArray) -> float:
     """Return the variance of (N, 2) points, N > 2, in the direction in which it is smallest."""
     x, y = (points - points.mean(axis=0)).T
     a, b, c = (

@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, FloatArray, IntArray
 from carlasc.core.cells import first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import Transform, rotation_z, thin
@@ -46,7 +46,7 @@ class Planes:
             np.empty((0, _SUMS)),
         )
 
-    def add(self, points: NDArray[np.float64]) -> None:
+    def add(self, points: FloatArray) -> None:
         """Add the (N, 3) points, metres, actor frame, that are in cells without a point."""
         joined, known = np.concatenate([self.points, points]), len(self.points)
         joined = joined[first_of_cells(np.floor(joined / _CELL_M).astype(np.int64))]
@@ -64,20 +64,20 @@ class Planes:
         self._sorted = joined[self._order]
 
     @property
-    def in_order(self) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
+    def in_order(self) -> tuple[FloatArray, IntArray, int]:
         """(M, 3) points, sorted along the axis of their largest extent, the (M,) index of each in
         `points`, and this axis.
         """
         return self._sorted, self._order, self._widest
 
 
-def covariances(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+def covariances(sums: FloatArray) -> FloatArray:
     """Return the (N, 3, 3) covariances of points from their (N, 10) sums: see `extend_sums`."""
     counts, totals = sums[:, 0, None, None], sums[:, 1:4]
     return sums[:, _SQUARES] / counts - totals[:, :, None] * totals[:, None, :] / (counts * counts)
 
 
-def _normals(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normals(covariances: FloatArray) -> FloatArray:
     """Return the (N, 3) normals of planes through points with (N, 3, 3) covariances."""
     values, vectors = principal_axes(covariances)
     flat = np.clip(1 - 3 * values[:, 0] / np.maximum(values[:, 1], 1e-6), 0.0, 1.0)
@@ -86,9 +86,7 @@ def _normals(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @cached(error_model="python")
-def extend_sums(
-    model: NDArray[np.float64], known: int, radius: float, sums: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def extend_sums(model: FloatArray, known: int, radius: float, sums: FloatArray) -> BoolArray:
     """Add new points to the sums of the points within a radius of each point.
 
     Args:
@@ -127,13 +125,13 @@ def extend_sums(
 
 @cached(error_model="python")
 def nearest_within(
-    points: NDArray[np.float64],
-    pose: NDArray[np.float64],
-    model: NDArray[np.float64],
-    order: NDArray[np.int64],
+    points: FloatArray,
+    pose: FloatArray,
+    model: FloatArray,
+    order: IntArray,
     axis: int,
     squared: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[IntArray, IntArray]:
     """Pair each point with the nearest point of a model within a distance; the model is sorted
     along an axis.
 
@@ -172,7 +170,7 @@ def nearest_within(
                 before = middle
             else:
                 after = middle
-        best, found = squared, -1
+        best, closest = squared, -1
         behind = moved[axis] - model[before, axis] if before >= 0 else np.inf
         ahead = model[after, axis] - moved[axis] if after <= last else np.inf
         while behind * behind <= best or ahead * ahead <= best:
@@ -184,18 +182,16 @@ def nearest_within(
                 ahead = model[after, axis] - moved[axis] if after <= last else np.inf
             x, y, z = moved[0] - model[k, 0], moved[1] - model[k, 1], moved[2] - model[k, 2]
             distance = x * x + y * y + z * z
-            if distance < best or (distance == best and order[k] < found):
-                best, found = distance, order[k]
-        if found >= 0:
-            rows[count], nearest[count] = i, found
+            if distance < best or (distance == best and order[k] < closest):
+                best, closest = distance, order[k]
+        if closest >= 0:
+            rows[count], nearest[count] = i, closest
             count += 1
     return rows[:count], nearest[:count]
 
 
 @cached(error_model="python")
-def nearest_points(
-    points: NDArray[np.float64], model: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def nearest_points(points: FloatArray, model: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return (N,) the index of the model point nearest to each point, and (N,) the squared
     distance, by comparing all pairs.
     """
@@ -231,7 +227,7 @@ _ENDS_M = 0.12  # error of the displacement of the ends of the visible part
 _FEWEST = 3  # least number of pairs that count
 
 
-def pose_of(state: NDArray[np.float64]) -> Transform:
+def pose_of(state: FloatArray) -> Transform:
     """Return the (4, 4) pose of an upright actor with the (4,) state x, y, z in metres, and yaw in
     radians.
     """
@@ -241,13 +237,13 @@ def pose_of(state: NDArray[np.float64]) -> Transform:
 
 
 def register(
-    points: NDArray[np.float64],
+    points: FloatArray,
     model: Planes,
-    predicted: NDArray[np.float64],
-    error: NDArray[np.float64],
-    previous: NDArray[np.float64],
-    shifts: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    predicted: FloatArray,
+    error: FloatArray,
+    previous: FloatArray,
+    shifts: FloatArray,
+) -> FloatArray:
     """Return the state, near the predicted one, that registers points to the planes of the model.
 
     Args:
@@ -259,7 +255,7 @@ def register(
         shifts: (K, 4) directions in which the ends of the visible part moved since then, and their
             displacement, metres.
     """
-    state: NDArray[np.float64] = _register(
+    state: FloatArray = _register(
         points, *model.in_order, model.points, model.normals, predicted, error, previous, shifts
     )
     return state
@@ -267,17 +263,17 @@ def register(
 
 @cached(error_model="python")
 def _register(
-    points: NDArray[np.float64],
-    ordered: NDArray[np.float64],
-    order: NDArray[np.int64],
+    points: FloatArray,
+    ordered: FloatArray,
+    order: IntArray,
     axis: int,
-    model: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    error: NDArray[np.float64],
-    previous: NDArray[np.float64],
-    shifts: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    model: FloatArray,
+    normals: FloatArray,
+    predicted: FloatArray,
+    error: FloatArray,
+    previous: FloatArray,
+    shifts: FloatArray,
+) -> FloatArray:
     """As `register`, with the (M, 3) points and normals of the model, and the results of
     `Planes.in_order`.
     """
@@ -289,13 +285,13 @@ def _register(
         cos, sin = math.cos(state[3]), math.sin(state[3])
         pose[0, 0], pose[0, 1], pose[1, 0], pose[1, 1] = cos, -sin, sin, cos
         pose[:3, 3] = state[:3]
-        information, pull = np.diag(prior), prior * (predicted - state)
+        information, right = np.diag(prior), prior * (predicted - state)
         for shift in shifts:  # the ends of the visible part are measured too
             left = shift[3]
             for a in range(3):
                 left += shift[a] * (previous[a] - state[a])
             for a in range(3):
-                pull[a] += shift[a] * left / _ENDS_M**2
+                right[a] += shift[a] * left / _ENDS_M**2
                 for b in range(3):
                     information[a, b] += shift[a] * shift[b] / _ENDS_M**2
         rows, nearest = nearest_within(points, pose, ordered, order, axis, reach * reach)
@@ -320,8 +316,8 @@ def _register(
             off += (point[2] - state[2] - model[k, 2]) * slope[2]
             weight = share / _VARIANCE_M2 / (1 + (off / scale) ** 2)
             for a in range(4):
-                pull[a] += slope[a] * weight * off
+                right[a] += slope[a] * weight * off
                 for b in range(a + 1):  # the lower half is read
                     information[a, b] += slope[a] * weight * slope[b]
-        state += solve_positive(information, pull)
+        state += solve_positive(information, right)
     return state

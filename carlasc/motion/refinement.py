@@ -19,8 +19,8 @@ from itertools import islice, pairwise
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from carlasc.core.cells import first_of_cells
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import invert, multiply, small_motions, transform_points
@@ -28,8 +28,8 @@ from carlasc.errors import reading
 from carlasc.motion.joint_alignment import (
     HALF_BLOCK,
     POINT_M,
+    AlignmentPass,
     Clusters,
-    Pass,
     align,
     blocks,
     planes,
@@ -53,7 +53,7 @@ _FORMATS = {
 _STRETCH = 2 * HALF_BLOCK  # scans whose poses become final together
 _THIN_M = 0.3  # one point per cell of this size is used
 _PLACE_M, _PLACES = 2.0, 4  # size of places, and one of so many is measured instead of aligned
-_MEASURE = Pass(1.0, 1, 0.35, 0.1)  # planes of scans that disagree are thick
+_MEASURE = AlignmentPass(1.0, 1, 0.35, 0.1)  # planes of scans that disagree are thick
 _FAR_M = 1e5  # farther points are no returns
 
 # The distance must decrease by a factor and a length, or by less if the gain is so many standard
@@ -83,11 +83,11 @@ class ThinnedScan:
         measured: (M, 3) float32, metres, sensor frame: points in places that take no part.
     """
 
-    used: NDArray[np.float32]
-    measured: NDArray[np.float32]
+    used: Float32Array
+    measured: Float32Array
 
     @classmethod
-    def of(cls, points: NDArray[np.float32], world_T_sensor: NDArray[np.float64]) -> Self:
+    def of(cls, points: Float32Array, world_T_sensor: FloatArray) -> Self:
         """Choose from the (N, 3) points of a scan, metres, sensor frame, which should be static."""
         near = points[(np.abs(points) < _FAR_M).all(axis=1)]
         chosen = near[first_of_cells(np.floor(near / np.float32(_THIN_M)).astype(np.int64))]
@@ -111,14 +111,14 @@ class RefinedPoses:
             such poses belong to another drive or to other frames, and are not refined.
     """
 
-    given: NDArray[np.float64]
-    poses: NDArray[np.float64]
-    before_m: NDArray[np.float64]
-    after_m: NDArray[np.float64]
-    refined: NDArray[np.bool_]
-    fits: NDArray[np.bool_]
+    given: FloatArray
+    poses: FloatArray
+    before_m: FloatArray
+    after_m: FloatArray
+    refined: BoolArray
+    fits: BoolArray
 
-    def changes(self) -> NDArray[np.float64]:
+    def changes(self) -> FloatArray:
         """Return the (F - 1, 6) changes of the motions from each scan to the next one: metres, then
         radians, sensor frame.
         """
@@ -132,7 +132,7 @@ class RefinedPoses:
         )
         return before, after
 
-    def left(self, frames: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
+    def left(self, frames: IntArray) -> tuple[tuple[int, int], ...]:
         """Return the first and the last frame of each stretch that was not refined; `frames` are
         the (F,) numbers of the scans.
         """
@@ -170,7 +170,7 @@ class RefinedPoses:
 
 def refine_poses(
     scans: Iterable[ThinnedScan],
-    given: NDArray[np.float64],
+    given: FloatArray,
     *,
     always: bool = False,
     steps: Callable[[int], None] | None = None,
@@ -210,20 +210,20 @@ def refine_poses(
                 poses[begin - 1], invert(given[begin - 1]), given[begin:last]
             )
         held = poses[near].copy()
-        found = align([scan.used for scan in kept], held, given[near], begin - start)
+        aligned = align([scan.used for scan in kept], held, given[near], begin - start)
         measured = [scan.measured for scan in kept]
         before[begin:end] = disagreement(measured, given[near])[rows]
-        now = disagreement(measured, found)[rows]
-        fits[begin:end] = _is_near(held, found) and _fit([scan.used for scan in kept], found)
+        now = disagreement(measured, aligned)[rows]
+        fits[begin:end] = _is_near(held, aligned) and _fit([scan.used for scan in kept], aligned)
         chosen = fits[begin] and (always or _is_better(before[begin:end], now))
         if chosen:
-            poses[begin:end], refined[begin:end] = found[rows], True
+            poses[begin:end], refined[begin:end] = aligned[rows], True
         after[begin:end] = now if chosen else before[begin:end]
         begin = end
     return RefinedPoses(given, poses, before, after, refined, fits)
 
 
-def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
+def _is_better(before: FloatArray, after: FloatArray) -> bool:
     both = np.isfinite(before) & np.isfinite(after)
     if not both.any():
         return False
@@ -237,57 +237,53 @@ def _is_better(before: NDArray[np.float64], after: NDArray[np.float64]) -> bool:
     return sure or now < min(_BETTER * was, was - _NEARER_M)
 
 
-def _fit(points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]) -> bool:
+def _fit(points: Sequence[Float32Array], poses: FloatArray) -> bool:
     """Return whether enough walls of single scans are flat together with the other scans there;
     True if there are few walls.
     """
     walls = common = 0
-    for found in blocks(points, poses, _WALL_M, shift=0.0):
-        alone = Clusters(np.arange(len(found.scan) + 1), found.scan, found.sums)
+    for block in blocks(points, poses, _WALL_M, shift=0.0):
+        alone = Clusters(np.arange(len(block.scan) + 1), block.scan, block.sums)
         _, spread = spread_of(alone, poses, 1)
         is_wall = (
-            (found.sums[:, 0] >= _WALL_POINTS) & _is_flat(spread) & (spread[:, 2, 2] > _TALL_M2)
+            (block.sums[:, 0] >= _WALL_POINTS) & _is_flat(spread) & (spread[:, 2, 2] > _TALL_M2)
         )
-        shared, together = spread_of(found, poses, MIN_SCANS)
-        cell = np.repeat(np.arange(len(found.start) - 1), np.diff(found.start))
+        shared, together = spread_of(block, poses, MIN_SCANS)
+        cell = np.repeat(np.arange(len(block.start) - 1), np.diff(block.start))
         is_wall &= shared[cell]
         walls += int(is_wall.sum())
         common += int((is_wall & _is_flat(together)[cell]).sum())
     return walls < _FEW_WALLS * len(points) or common > _COMMON * walls
 
 
-def _is_flat(covariances: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_flat(covariances: FloatArray) -> BoolArray:
     values, _ = principal_axes(covariances)
     return np.asarray((values[:, 0] < 0.1 * values[:, 1]) & (values[:, 1] > _WIDE_M2))
 
 
-def _changes(
-    given: NDArray[np.float64], found: NDArray[np.float64], span: int = 1
-) -> NDArray[np.float64]:
-    before, after = (multiply(invert(poses[:-span]), poses[span:]) for poses in (given, found))
+def _changes(given: FloatArray, aligned: FloatArray, span: int = 1) -> FloatArray:
+    before, after = (multiply(invert(poses[:-span]), poses[span:]) for poses in (given, aligned))
     return small_motions(multiply(invert(before), after))
 
 
-def _is_near(held: NDArray[np.float64], found: NDArray[np.float64]) -> bool:
+def _is_near(held: FloatArray, aligned: FloatArray) -> bool:
     """Return whether no motion changed by more than the greatest error of the poses of a drive."""
-    off = found[:, :3, 3] - held[:, :3, 3]
+    off = aligned[:, :3, 3] - held[:, :3, 3]
     for span, most_m, most_rad in ((1, _FARTHEST_M, _FARTHEST_RAD), (_SPAN, _OFF_M, _OFF_RAD)):
         moved = np.sqrt(np.square(off[span:] - off[:-span]).sum(axis=1))  # in the world
-        turned = np.sqrt(np.square(_changes(held, found, span)[:, 3:]).sum(axis=1))
+        turned = np.sqrt(np.square(_changes(held, aligned, span)[:, 3:]).sum(axis=1))
         if (moved > most_m).any() or (turned > most_rad).any():
             return False
     return True
 
 
-def finite_mean(values: NDArray[np.float64]) -> float:
+def finite_mean(values: FloatArray) -> float:
     """Return the mean of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else math.nan
 
 
-def disagreement(
-    points: Sequence[NDArray[np.float32]], poses: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def disagreement(points: Sequence[Float32Array], poses: FloatArray) -> FloatArray:
     """Return the (F,) root mean square distances of each scan from the planes of the others,
     metres; NaN where there are none.
 
@@ -296,20 +292,20 @@ def disagreement(
         poses: (F, 4, 4) world_T_sensor.
     """
     sums = np.zeros((len(points), 2))
-    for found in blocks(points, poses, _MEASURE.cell_m, shift=0.0):
-        normals, thickness = planes(found, poses, _MEASURE)
-        _add_distances(found, poses, normals, thickness, sums)
+    for block in blocks(points, poses, _MEASURE.cell_m, shift=0.0):
+        normals, thickness = planes(block, poses, _MEASURE)
+        _add_distances(block, poses, normals, thickness, sums)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.sqrt(sums[:, 0] / sums[:, 1]))
 
 
 @cached
 def _add_distances(
-    found: Clusters,
-    poses: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    thickness: NDArray[np.float64],
-    result: NDArray[np.float64],
+    block: Clusters,
+    poses: FloatArray,
+    normals: FloatArray,
+    thickness: FloatArray,
+    result: FloatArray,
 ) -> None:
     """Add to `result`, (F, 2), the squared distances of the clusters of each scan from the planes
     of the others, and their number.
@@ -317,8 +313,8 @@ def _add_distances(
     for g in range(len(thickness)):
         if thickness[g] < 0:
             continue
-        first, last = found.start[g], found.start[g + 1]
-        scan, sums = found.scan[first:last], found.sums[first:last]
+        first, last = block.start[g], block.start[g + 1]
+        scan, sums = block.scan[first:last], block.sums[first:last]
         off, weight = to_plane(scan, sums, poses, normals[g], POINT_M * POINT_M + thickness[g])
         total = weight.sum()
         for i in range(len(scan)):

@@ -6,8 +6,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
 from carlasc.core.geometry import Transform, rotate_vectors, transform_points
 from carlasc.core.scans import Scan
 
@@ -40,20 +40,20 @@ class Segment:
 
     frame: int
     label: int
-    members: NDArray[np.int64]
-    points: NDArray[np.float64]
-    velocity: NDArray[np.float64] | None
+    members: IntArray
+    points: FloatArray
+    velocity: FloatArray | None
     instance: int = 0
-    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    origin: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
-    def center(self) -> NDArray[np.float64]:
+    def center(self) -> FloatArray:
         """(3,) centre of the points' bounding box, metres, world."""
-        center: NDArray[np.float64] = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
+        center: FloatArray = (self.points.min(axis=0) + self.points.max(axis=0)) / 2
         return center
 
 
-def is_fast(flow: NDArray[np.floating], min_speed_m_s: float = MIN_SPEED_M_S) -> NDArray[np.bool_]:
+def is_fast(flow: AnyFloatArray, min_speed_m_s: float = MIN_SPEED_M_S) -> BoolArray:
     """Return (N,) bool, which of (N, 3) velocities, m/s, are finite and faster than a speed."""
     speed2 = np.square(np.asarray(flow, np.float64)).sum(axis=1)
     return np.isfinite(speed2) & (speed2 > min_speed_m_s**2)
@@ -155,10 +155,10 @@ class StaticPoints:
     """
 
     frame: int
-    members: NDArray[np.int64]
-    labels: NDArray[np.int64]
-    points: NDArray[np.float64]
-    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    members: IntArray
+    labels: IntArray
+    points: FloatArray
+    origin: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def empty(cls, frame: int) -> StaticPoints:
@@ -214,7 +214,7 @@ def static_actor_points(
     )
 
 
-def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _groups(key: IntArray) -> list[IntArray]:
     """Return the indices of each value of `key`, in the order in which the values occur first."""
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
@@ -222,8 +222,8 @@ def _groups(key: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return [parts[i] for i in np.argsort(first)]
 
 
-def _places(spread: NDArray[np.float64], own: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Split points, indices `own` of (N, K) features, at each gap above 1 in one of the features."""
+def _places(spread: FloatArray, own: IntArray) -> list[IntArray]:
+    """Split points, rows `own` of (N, K) features, at each gap above 1 in one feature."""
     for column in range(spread.shape[1]):
         values = spread[own, column]
         if np.ptp(values) > 1:
@@ -238,7 +238,7 @@ def _places(spread: NDArray[np.float64], own: NDArray[np.int64]) -> list[NDArray
     return [own]
 
 
-def _join(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.int64]:
+def _join(points: FloatArray, velocity: FloatArray) -> IntArray:
     """Return the component number of each point: neighbouring cells of one velocity are joined."""
     keys = np.concatenate(
         [np.floor(points / _CELL_M), np.round(velocity / _SAME_VELOCITY_M_S)], axis=1

@@ -1,5 +1,5 @@
 """Small linear problems, solved with the same bits on every processor; smoothing and resampling
-over time; headings.
+over time; headings; pairs of least cost.
 
 `np.linalg` is not used: LAPACK rounds differently on different processors.
 """
@@ -7,8 +7,8 @@ over time; headings.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from carlasc.core.arrays import FloatArray, IntArray
 from carlasc.core.compiling import cached
 from carlasc.core.geometry import multiply
 
@@ -17,7 +17,7 @@ _SWEEPS = 12  # greatest number for Jacobi's method, which takes about five
 
 
 @cached(error_model="python")
-def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def least_squares(design: FloatArray, values: FloatArray) -> FloatArray:
     """Return the (K, D) parameters x for which `design @ x` is nearest to the values; the columns
     are orthogonalised one after the other.
 
@@ -26,6 +26,9 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
         values: (N, D).
     """
     count, columns, wide = design.shape[0], design.shape[1], values.shape[1]
+    # Gram-Schmidt: invariant of the loop over k is that the first k columns of `basis` are
+    # orthonormal or zero, and that design = basis @ upper. Loops, not `@`, add in the order that is
+    # written.
     basis, upper, fit = design.copy(), np.zeros((columns, columns)), np.zeros((columns, wide))
     left = values.copy()
     for k in range(columns):
@@ -43,6 +46,8 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
         length = 0.0
         for i in range(count):
             length += basis[i, k] * basis[i, k]
+        # 1e-13 of its length is left, squared: the rounding errors of a column that is a sum of
+        # others.
         if length <= 1e-26 * whole:
             for i in range(count):
                 basis[i, k] = 0.0
@@ -57,6 +62,7 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
             fit[k, d] = along
             for i in range(count):
                 left[i, d] -= along * basis[i, k]
+    # Back substitution: the last parameter is alone in its equation, the others follow.
     for d in range(wide):
         for k in range(columns - 1, -1, -1):
             rest = fit[k, d]
@@ -67,7 +73,7 @@ def least_squares(design: NDArray[np.float64], values: NDArray[np.float64]) -> N
 
 
 @cached
-def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return the (N,) solution of a positive definite system, by Cholesky's method.
 
     Args:
@@ -76,6 +82,8 @@ def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> N
     """
     count = len(right)
     solution, column = right.copy(), np.empty(count)
+    # Forward elimination with the lower factor, column by column; `matrix` becomes the factor. The
+    # systems are banded, since few scans see the same planes: rows of zeros are skipped.
     for k in range(count):
         root = np.sqrt(matrix[k, k])
         solution[k] /= root
@@ -88,6 +96,7 @@ def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> N
                 solution[i] -= lower * solution[k]
                 for j in range(k + 1, i + 1):
                     matrix[i, j] -= lower * column[j]
+    # Then the transposed factor, from the last unknown to the first.
     for k in range(count - 1, -1, -1):
         solution[k] /= matrix[k, k]
         for i in range(k):
@@ -97,8 +106,8 @@ def solve_positive(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> N
 
 @cached(error_model="python")
 def principal_axes(
-    covariances: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    covariances: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
     """Return the eigenvalues of symmetric matrices, increasing, and their eigenvectors, by Jacobi's
     method.
 
@@ -111,6 +120,8 @@ def principal_axes(
     """
     values, vectors = np.empty((len(covariances), 3)), np.empty((len(covariances), 3, 3))
     for n in range(len(covariances)):
+        # Invariant: covariance = v @ a @ v.T. Each turn makes one element off the diagonal zero,
+        # and the sum of their squares falls, faster with each sweep (Golub and Van Loan, 8.5).
         a, v = covariances[n].copy(), np.eye(3)
         for _ in range(_SWEEPS):
             size = abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])
@@ -120,6 +131,8 @@ def principal_axes(
                 for q in range(p + 1, 3):
                     if a[p, q] == 0.0:
                         continue
+                    # The smaller of the two angles that make a[p, q] zero: with it, the method
+                    # converges.
                     ratio = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
                     tangent = (1.0 if ratio >= 0 else -1.0) / (
                         abs(ratio) + np.sqrt(ratio * ratio + 1.0)
@@ -141,6 +154,7 @@ def principal_axes(
                             cos * v[k, p] - sin * v[k, q],
                             sin * v[k, p] + cos * v[k, q],
                         )
+        # The diagonal has no order; the normal of a plane is the vector of the smallest value.
         order = np.argsort(np.array([a[0, 0], a[1, 1], a[2, 2]]))
         for k in range(3):
             values[n, k] = a[order[k], order[k]]
@@ -149,7 +163,7 @@ def principal_axes(
     return values, vectors
 
 
-def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def nearest_rotation(matrix: FloatArray) -> FloatArray:
     """Return the (3, 3) rotation nearest to a (3, 3) mean of rotations; the identity if these have
     no mean direction.
     """
@@ -165,11 +179,11 @@ def nearest_rotation(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def smooth(
-    values: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    values: FloatArray,
+    seconds: FloatArray,
+    weights: FloatArray,
     half_s: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Fit a parabola around each time, robustly; a straight line if there are few values.
 
     Args:
@@ -189,11 +203,11 @@ def smooth(
 
 def smooth_at(
     index: int,
-    values: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    values: FloatArray,
+    seconds: FloatArray,
+    weights: FloatArray,
     half_s: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Return the (D,) value and the (D,) derivative of `smooth` at one index."""
     distance = np.abs(seconds - seconds[index])
     near = np.flatnonzero(distance <= half_s + 1e-9)
@@ -211,18 +225,18 @@ def smooth_at(
     return fit[0], fit[1] if degree else np.zeros_like(fit[0])
 
 
-def _median(values: NDArray[np.float64]) -> float:
-    """Return the median of (N,) values, N > 0; `np.median` takes five times as long for few values."""
+def _median(values: FloatArray) -> float:
+    """Return the median of (N,) values, N > 0; for few, `np.median` takes five times as long."""
     ranked, half = np.sort(values), len(values) // 2
     return float(ranked[half]) if len(values) % 2 else float((ranked[half - 1] + ranked[half]) / 2)
 
 
 def resample(
-    at: NDArray[np.float64],
-    seconds: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    velocities: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    at: FloatArray,
+    seconds: FloatArray,
+    positions: FloatArray,
+    velocities: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
     """Return positions and velocities at other times: linear between the known times, at constant
     velocity beyond.
 
@@ -241,7 +255,7 @@ def resample(
     return path + speed * beyond[:, None], speed
 
 
-def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
+def headings_of(velocities: FloatArray) -> FloatArray:
     """Return (F,) headings in radians, unwrapped: the direction of (F, 3) velocities, interpolated
     while the actor is slow.
     """
@@ -253,6 +267,17 @@ def headings_of(velocities: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.interp(np.arange(len(velocities)), fast, angles)
 
 
-def fast_rows(velocities: NDArray[np.float64]) -> NDArray[np.int64]:
+def fast_rows(velocities: FloatArray) -> IntArray:
     """Return at which of (F, 3) velocities an actor moves fast enough to show where it points."""
     return np.flatnonzero(np.hypot(velocities[:, 0], velocities[:, 1]) > _HEADING_SPEED_M_S)
+
+
+def best_pairs(costs: list[tuple[float, int, int]]) -> dict[int, int]:
+    """Pair first and second numbers by (cost, first, second), the lowest cost first, each number
+    once; return the second by the first.
+    """
+    taken: dict[int, int] = {}
+    for _, i, j in sorted(costs):
+        if i not in taken and j not in taken.values():
+            taken[i] = j
+    return taken

@@ -13,6 +13,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import (
+    AnyFloatArray,
+    AnyIntArray,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 from carlasc.core.geometry import (
     Transform,
     invert,
@@ -71,15 +79,15 @@ class Track:
 
     label: int
     instance: int
-    members: Mapping[int, NDArray[np.integer]]
+    members: Mapping[int, AnyIntArray]
     first: int
-    world_T_actor: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    world_T_actor: FloatArray
+    velocity: FloatArray
+    lower: FloatArray
+    upper: FloatArray
     extent: Extent
     rigid: bool = True
-    surface: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    surface: Float32Array = field(default_factory=lambda: np.empty((0, 3), np.float32))
     confidence: float = 1.0
 
     def pose(self, frame: int) -> Transform | None:
@@ -87,7 +95,7 @@ class Track:
         row = frame - self.first
         return self.world_T_actor[row] if 0 <= row < len(self.world_T_actor) else None
 
-    def velocity_at(self, frame: int) -> NDArray[np.float64] | None:
+    def velocity_at(self, frame: int) -> FloatArray | None:
         """Return (3,) m/s, world, at a frame; None if the track does not extend to it."""
         row = frame - self.first
         return self.velocity[row] if 0 <= row < len(self.velocity) else None
@@ -103,7 +111,7 @@ class Track:
         return replace(self, members=members, first=start, world_T_actor=poses, velocity=velocity)
 
     @property
-    def size(self) -> NDArray[np.float64]:
+    def size(self) -> FloatArray:
         """(3,) metres: length, width, height of the body."""
         return self.upper - self.lower
 
@@ -140,6 +148,7 @@ def make_track(
     """
     seconds = np.array([times[segment.frame] for segment in chain])
     label = int(np.bincount([s.label for s in chain], [len(s.members) for s in chain]).argmax())
+    # Flow gives the path directly. Without it, the path is found by aligning the observations.
     keeps_shape = label not in deformable if rigid is None else rigid
     if any(segment.velocity is None for segment in chain):
         observations = [segment.points for segment in chain]
@@ -196,6 +205,8 @@ def with_surfaces(tracks: Sequence[Track]) -> list[Track]:
 
 def _with_body(track: Track, sizes: Sizes) -> Track:
     lower, upper = sizes.complete(track.label, track.extent)
+    # The origin of an actor is the centre of its body: where the body grows, poses, corners and
+    # surface move by the same vector, and nothing moves in the world.
     middle = (lower + upper) / 2
     poses = track.world_T_actor.copy()
     poses[:, :3, 3] += multiply(poses[:, :3, :3], middle[:, None])[..., 0]
@@ -212,21 +223,21 @@ def _with_body(track: Track, sizes: Sizes) -> Track:
     )
 
 
-def _integrate(
-    velocities: NDArray[np.float64], seconds: NDArray[np.float64], chain: Sequence[Segment]
-) -> NDArray[np.float64]:
+def _integrate(velocities: FloatArray, seconds: FloatArray, chain: Sequence[Segment]) -> FloatArray:
     """Integrate velocities by the trapezoidal rule, through the centre of the segment with most
     points.
     """
     steps = (velocities[1:] + velocities[:-1]) / 2 * np.diff(seconds)[:, None]
     path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    # The integral is known up to a constant; the largest segment shows most of the actor, so its
+    # centre is nearest to the centre of the body.
     best = int(np.argmax([len(segment.members) for segment in chain]))
     return path - path[best] + chain[best].center
 
 
 def _fit_box(
-    chain: Sequence[Segment], positions: NDArray[np.float64], headings: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], Extent, NDArray[np.float64]]:
+    chain: Sequence[Segment], positions: FloatArray, headings: FloatArray
+) -> tuple[FloatArray, Extent, FloatArray]:
     """Move the path to the centre of the visible part of the actor; return it, the extent, and the
     points in the actor frame.
 
@@ -234,6 +245,8 @@ def _fit_box(
     overlap only with the correct offset, which moves the origin to their centre.
     """
     best = int(np.argmax([len(segment.members) for segment in chain]))
+    # Moving the origin changes which points overlap, and thus the extent: three rounds, of which
+    # the last one changes millimetres.
     for _ in range(3):
         body, sensors = [], []
         for segment, position, heading in zip(chain, positions, headings, strict=True):
@@ -250,7 +263,7 @@ def _fit_box(
 
 def _frames_around(
     first: int, last: int, times: Mapping[int, float]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[IntArray, FloatArray]:
     """Return the frames from `_EXTRAPOLATE_S` before `first` to as long after `last`, and their
     times.
 
@@ -264,6 +277,7 @@ def _frames_around(
     more = max(1, round(_EXTRAPOLATE_S / period))
     frames = np.arange(first - more, last + more + 1)
     inside = np.interp(frames, known, seconds)
+    # `np.interp` holds its ends, so the frames beyond them are continued by the mean period.
     before, after = np.minimum(frames - known[0], 0), np.maximum(frames - known[-1], 0)
     return frames, inside + (before + after) * period
 
@@ -283,17 +297,17 @@ class MovingActors:
     """
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
-    moving: Mapping[int, NDArray[np.integer]] = field(default_factory=dict)
+    moving: Mapping[int, AnyIntArray] = field(default_factory=dict)
     summary: tuple[Mapping[str, Any], ...] = ()
-    own: tuple[NDArray[np.float64], ...] = ()
+    own: tuple[FloatArray, ...] = ()
     numbers: Mapping[int, int] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls,
         tracks: list[Track],
-        moving: Mapping[int, NDArray[np.integer]] | None = None,
-        own: Sequence[NDArray[np.float64]] = (),
+        moving: Mapping[int, AnyIntArray] | None = None,
+        own: Sequence[FloatArray] = (),
     ) -> Self:
         """Return the actors of tracks: moving ones with their tracks, static ones in the summary
         only.
@@ -310,6 +324,7 @@ class MovingActors:
         worker with each frame.
         """
         near = {number: track.between(first, last) for number, track in self.tracks.items()}
+        # A track may reach the frames by extrapolation only, with poses and without members.
         tracks = {
             number: track
             for number, track in near.items()
@@ -321,12 +336,12 @@ class MovingActors:
         numbers = {number: self.numbers[number] for number in tracks} if self.numbers else {}
         return MovingActors(tracks, moving, own=self.own, numbers=numbers)
 
-    def is_own(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def is_own(self, points: AnyFloatArray) -> BoolArray:
         """Return which of (N, 3) points, metres, sensor frame, are on the recording vehicle."""
-        found = np.zeros(len(points), np.bool_)
+        own = np.zeros(len(points), np.bool_)
         for corners in self.own:
-            found |= ((points >= corners[:3]) & (points <= corners[3:])).all(axis=1)
-        return found
+            own |= ((points >= corners[:3]) & (points <= corners[3:])).all(axis=1)
+        return own
 
     def to_bytes(self, key: str) -> bytes:
         """Return the content of a file with these actors. `key` is a digest of their source."""
@@ -355,7 +370,11 @@ class MovingActors:
             for frame, own in track.members.items():
                 members.append(own)
                 frames.append((number, frame, len(own)))
+        # Tables of numbers, one row per track or per scan of a track, and the values of all tracks
+        # one after the other: a file of ten arrays is read at once, whatever the number of tracks.
+        about = json.dumps({"key": key, "summary": self.summary}).encode()
         arrays = {
+            "about": np.frombuffer(about, np.uint8),
             "table": np.array(table, np.int64).reshape(-1, 8),
             "poses": np.concatenate([np.empty((0, 4, 4)), *poses]),
             "velocities": np.concatenate([np.empty((0, 3)), *velocities]),
@@ -371,9 +390,8 @@ class MovingActors:
             ).reshape(-1, 2),
             "own": np.array(self.own, np.float64).reshape(-1, 6),
         }
-        about = json.dumps({"key": key, "summary": self.summary})
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, about=np.frombuffer(about.encode(), np.uint8), **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
         return buffer.getvalue()
 
     @classmethod
@@ -405,7 +423,7 @@ def is_doubtful(confidence: float) -> bool:
 
 
 def _tracks(arrays: Mapping[str, NDArray[Any]]) -> dict[int, Track]:
-    members: dict[int, dict[int, NDArray[np.integer]]] = {}
+    members: dict[int, dict[int, AnyIntArray]] = {}
     offset = 0
     for number, frame, count in arrays["frames"].tolist():
         members.setdefault(number, {})[frame] = arrays["members"][offset : offset + count]

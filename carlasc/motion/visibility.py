@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.arrays import Float32Array
 from carlasc.core.cells import Pose, fast_azimuth, transform
 from carlasc.core.compiling import cached, inlined
 
@@ -49,14 +50,12 @@ class SortedReturns(NamedTuple):
     """
 
     start: NDArray[np.int32]
-    slope: NDArray[np.float32]
-    distance: NDArray[np.float32]
-    origin: NDArray[np.float32]
+    slope: Float32Array
+    distance: Float32Array
+    origin: Float32Array
 
     @classmethod
-    def of(
-        cls, points: NDArray[np.float32], origins: NDArray[np.float32] | None = None
-    ) -> SortedReturns:
+    def of(cls, points: Float32Array, origins: Float32Array | None = None) -> SortedReturns:
         """Sort the points of a scan by the directions of their rays.
 
         A column holds rays with one origin. Where the first and the last rays of a turn of a moving
@@ -76,8 +75,8 @@ class SortedReturns(NamedTuple):
 
 @cached
 def _directions(
-    points: NDArray[np.float32],
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+    points: Float32Array,
+) -> tuple[NDArray[np.int32], Float32Array, Float32Array]:
     """Return the column of each point, seen from (0, 0, 0), or -1 if it is too near; its slope; and
     its distance.
     """
@@ -91,6 +90,8 @@ def _directions(
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         flat = math.sqrt(x * x + y * y)
         distance[i] = math.sqrt(flat * flat + z * z)
+        # The slope rises with the elevation, and needs no arctangent: to sort and to compare, it is
+        # as good. The limit keeps it finite straight above the sensor.
         slope[i] = z / max(flat, 1e-3)
         column[i] = -1
         if distance[i] >= _MIN_RANGE_M:
@@ -100,8 +101,8 @@ def _directions(
 
 @cached
 def _by_column(
-    column: NDArray[np.int32], slope: NDArray[np.float32], began: NDArray[np.float32]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    column: NDArray[np.int32], slope: Float32Array, began: Float32Array
+) -> tuple[NDArray[np.int32], NDArray[np.int32], Float32Array]:
     """Return `start`, the indices of the points in the order of columns and slopes, and `origin`:
     see `SortedReturns`.
     """
@@ -109,6 +110,8 @@ def _by_column(
     for i in range(len(column)):
         begin[column[i] + 1] += column[i] >= 0
     begin = np.cumsum(begin)
+    # A counting sort: `begin` are the places of the columns, and `filled` the next free place of
+    # each. Both are exact, so the order of the points does not depend on the processor.
     filled, members = begin.copy(), np.empty(begin[_COLUMNS], np.int32)
     for i in range(len(column)):
         if column[i] >= 0:
@@ -119,6 +122,9 @@ def _by_column(
     for c in range(_COLUMNS):
         own = members[begin[c] : begin[c + 1]]
         if len(own):
+            # At the seam of a turn, a column holds rays of the first and of the last moment. The
+            # middle ray has the origin of the majority, and rays from elsewhere would be looked up
+            # wrongly.
             place = began[own[len(own) // 2]]
             origin[c] = place
             for k in np.argsort(slope[own]):
@@ -131,6 +137,7 @@ def _by_column(
                     order[count] = own[k]
                     count += 1
         start[c + 1] = count
+    # Two rounds, because the column before the first one with rays is the last one of the turn.
     for c in range(2 * _COLUMNS):  # columns without rays get the origin of the column before
         if begin[c % _COLUMNS] == begin[c % _COLUMNS + 1]:
             origin[c % _COLUMNS] = origin[(c - 1) % _COLUMNS]
@@ -144,7 +151,7 @@ def _column(azimuth: float) -> int:
 
 @cached
 def look_up(
-    points: NDArray[np.float32],
+    points: Float32Array,
     asked: NDArray[np.int32],
     pose: Pose,
     view: SortedReturns,
@@ -163,6 +170,8 @@ def look_up(
         free: (M,) gets the bit where the place of the point is free.
         hit: (M,) gets the bit where it is occupied.
     """
+    # A scan has one bit, and a side in time at most 32 scans: the bits of all scans are counted and
+    # compared at once, without a table of points by scans.
     flag = np.uint32(1) << np.uint32(bit)
     start, slope, distance, origin = view
     moved = (origin != origin[0]).any()
@@ -175,6 +184,7 @@ def look_up(
         else:
             x, y, z = x - origin[0, 0], y - origin[0, 1], z - origin[0, 2]
         flat = math.sqrt(x * x + y * y)
+        # Above, below and inside the vehicle, a direction says nothing about the place.
         if flat < _MIN_RANGE_M:
             continue
         far = math.sqrt(flat * flat + z * z)
@@ -188,6 +198,8 @@ def look_up(
 @inlined
 def _count(bits: np.int64) -> np.int64:
     """Return how many of the lower 32 bits are set."""
+    # Neighbouring bits are added in pairs, then in fours, then in bytes (Warren, "Hacker's
+    # Delight", 5-1); the product adds the four bytes in the highest one.
     bits -= (bits >> 1) & 0x55555555
     bits = (bits & 0x33333333) + ((bits >> 2) & 0x33333333)
     return (((bits + (bits >> 4)) & 0x0F0F0F0F) * 0x01010101 & 0xFFFFFFFF) >> 24
@@ -218,10 +230,13 @@ def undecided(
     for i in asked:
         passed = _count(np.int64(free[0, i])) + _count(np.int64(free[1, i]))
         occupied = _count(np.int64(hit[0, i])) + _count(np.int64(hit[1, i]))
+        # The rest of the scans can add at most `rest` to either count. A point is decided when no
+        # such addition changes which count is greater, or the length of a row without a hit.
         moves = passed >= least[0] and passed > occupied + rest
         may_change = passed + rest >= occupied
         for side in range(2):  # a row ends at the first scan that saw it occupied
             h = np.int64(hit[side, i])
+            # All bits below the highest hit are set, in five steps: 2^5 = 32 bits.
             for shift in (1, 2, 4, 8, 16):
                 h |= h >> shift
             in_a_row = _count(np.int64(free[side, i]) & ~h) + (left[side] if h == 0 else 0)
@@ -249,6 +264,8 @@ def _first_above(least, lo, hi, slope):  # type: ignore[no-untyped-def]
 @inlined
 def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no-untyped-def]
     """Return FREE, HIT or 0 (unknown) for a direction and a distance."""
+    # The window has the same size in metres at all ranges, and errors of rotation widen it in
+    # radians. A slope changes by 1 + slope^2 per radian of elevation: the derivative of tan.
     half = _SIDE_M / flat + _SIDE_RAD
     high = half * (1 + steep * steep)
     near, beyond = far - _DEPTH_M - _DEPTH_SHARE * far, far + _DEPTH_M + _DEPTH_SHARE * far
@@ -261,6 +278,8 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
         lo += 1
     first = math.floor((azimuth - half + math.pi) * _PER_RAD)
     last = math.floor((azimuth + half + math.pi) * _PER_RAD)
+    # A hit decides at once, for any ray. A ray that ends before the place hides it, even if others
+    # pass: then the place is at an edge, and unknown. So all columns of the window are needed.
     passed, hidden = 0, 0
     below, above = -1e9, 1e9
     below_range, above_range = 0.0, 0.0
@@ -287,6 +306,8 @@ def _look(azimuth, steep, flat, far, start, slope, distance):  # type: ignore[no
         return 0
     if passed:
         return FREE
+    # No ray is in the window: the rays above and below it decide, if they are so near to each other
+    # that nothing of the size of an actor is between them. Both must agree.
     if (above - below) * flat > _GAP_M:
         return 0
     if below_range > beyond and above_range > beyond:

@@ -20,6 +20,7 @@ from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
+from carlasc.core.first_use import is_first_use
 from carlasc.errors import CarlascError, carlasc_version, import_extra
 from carlasc.running.pools import ONE_THREAD, LostTaskError
 from carlasc.running.spreading import DaskClient, LazyClient
@@ -171,6 +172,9 @@ def run_on_cluster(
         tasks = _Tasks(client, function, distributed)
         waiting = iter(items)
         try:
+            if is_first_use(function):  # one worker compiles before the others start
+                tasks.submit(list(islice(waiting, 1)))
+                tasks.pending[0][1].exception()  # waits for its end
             tasks.submit(list(islice(waiting, tasks.window)))
             while tasks.pending:
                 yield from tasks.take(lost)
@@ -267,5 +271,6 @@ def one_line_if_lost(client: DaskClient) -> Iterator[None]:
         raise CarlascError(
             f"the scheduler {getattr(getattr(client, 'scheduler', None), 'address', '')}".rstrip(),
             problem="the connection was lost",
-            advice="check that the scheduler is running, and run the same command again to continue",
+            advice="check that the scheduler is running, and run the same command again to "
+            "continue",
         ) from error

@@ -227,14 +227,14 @@ def _connected(distributed: Any, place: Any, where: str) -> Iterator[Any]:
                     "DASK_CARLASC__WORKERS_TIMEOUT=1h",
                 ) from error
             ours = Versions.here()  # workers that start later are checked before their first task
-            for worker, found in client.run(Versions.here, on_error="return").items():
-                if not isinstance(found, Versions):
+            for worker, versions in client.run(Versions.here, on_error="return").items():
+                if not isinstance(versions, Versions):
                     raise CarlascError(
                         f"worker {worker}",
                         expected=f"carlasc {ours.carlasc}",
-                        found=f"none ({found})",
+                        found=f"none ({versions})",
                     )
-                ours.check(found, worker)
+                ours.check(versions, worker)
         yield client
     finally:
         with suppress(TimeoutError):  # the scheduler may have ended

@@ -1,4 +1,4 @@
-"""A pool of worker processes that can be stopped immediately, and that are replaced when they die."""
+"""A pool of worker processes that can be stopped at once, and that are replaced when they die."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.synchronize import Semaphore
 from typing import Any
 
-from carlasc.core.first_use import note_in_workers, wishes
+from carlasc.core.first_use import NoteRequest, note_in_workers, note_requests
 from carlasc.errors import CarlascError
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -159,6 +159,9 @@ class _RetriedTask(Future[Any]):
         except BrokenProcessPool as error:
             raise LostTaskError from error
 
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        return self._attempt.exception(timeout)
+
     def cancel(self) -> bool:
         self._owner.forget(self)
         return self._attempt.cancel()
@@ -188,7 +191,7 @@ class _ProcessGroup(ProcessPoolExecutor):
             workers,
             mp_context=self._context,
             initializer=_prepare_worker,
-            initargs=(self._context.Semaphore(), wishes()),
+            initargs=(self._context.Semaphore(), note_requests),
         )
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -232,7 +235,8 @@ def inherited_by_workers() -> Iterator[None]:
     Processes that are started in it inherit both.
     """
     before = {name: os.environ.get(name) for name in ONE_THREAD}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    set_mask = getattr(signal, "pthread_sigmask", None)  # POSIX only
+    mask = set_mask and set_mask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
@@ -242,11 +246,12 @@ def inherited_by_workers() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if set_mask:
+            set_mask(signal.SIG_SETMASK, mask)
 
 
-def _prepare_worker(first: Semaphore, wishes: tuple[tuple[Callable[[], None], float], ...]) -> None:
-    note_in_workers(wishes, first)
+def _prepare_worker(first: Semaphore, requests: list[NoteRequest]) -> None:
+    note_in_workers(requests, first)
     signal.signal(signal.SIGTERM, _exit_worker)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from itertools import chain, islice
 from typing import TypeVar
 
+from carlasc.core.first_use import is_first_use
 from carlasc.errors import CarlascError
 from carlasc.running.pools import LostTaskError, OwnProcesses
 from carlasc.running.spreading import Run
@@ -30,7 +31,8 @@ def run_all(
     """Yield `function(item)` for every item, in the order of the items.
 
     At most two items per worker (four on a cluster) are in progress at a time, so memory use does
-    not grow with the number of items.
+    not grow with the number of items. The first time on a machine, the first item is done before
+    the others start, so that loops are compiled once and not by all workers.
 
     Without an executor, the function runs in new processes with one thread each, or in this process
     if `workers` is 1. When the generator is closed or interrupted, these processes stop
@@ -78,6 +80,7 @@ def _submit_all(
     lost: Callable[[Item, str], Result] | None,
 ) -> Iterator[Result]:
     pending: deque[tuple[Item, Future[Result]]] = deque()
+    compiles = is_first_use(function)  # then the first item is done alone
 
     def take() -> Result:
         item, future = pending.popleft()
@@ -93,6 +96,9 @@ def _submit_all(
             if len(pending) == limit:
                 yield take()
             pending.append((item, executor.submit(function, item)))
+            if compiles:
+                pending[0][1].exception()  # waits for its end
+                compiles = False
         while pending:
             yield take()
     except BrokenExecutor as error:

@@ -62,7 +62,7 @@ def test_velocities_are_in_the_frame_of_each_scans_sensor():
 
 def test_an_actor_that_was_hidden_for_long_is_estimated_anew():
     """It turns while nobody sees it: one path over the gap would mix both motions."""
-    motion = ActorMotion(SEMANTICKITTI)
+    motion = ActorMotion(SEMANTICKITTI, Run(workers=1))
     before = {1: (MOVING_CAR, (10, 0, 0), (6, 0, 0), range(8))}
     after = {1: (MOVING_CAR, (40, 0, 0), (0, 4, 0), range(30, 38))}
     for number in [*range(8), *range(30, 38)]:
@@ -139,7 +139,7 @@ def test_points_of_actors_that_left_are_not_kept():
     """Paths are estimated as soon as a batch of actors was not seen for a while, so memory does not
     grow with the drive.
     """
-    motion = ActorMotion(SEMANTICKITTI)
+    motion = ActorMotion(SEMANTICKITTI, Run(workers=1))
     held = []
     for number in range(600):
         actors = {number // 4 + 1: (MOVING_CAR, (10, 0, 0), (0, 0, 0), range(number, number + 1))}

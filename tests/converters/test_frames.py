@@ -6,10 +6,10 @@ from helpers.datasets.recordings import MemoryFrame, MemoryRecording, MemoryWrit
 
 from carlasc.converting import Cloud, Sensor, Trajectory, VoxelContent
 from carlasc.converting.assembling import Rig, VehicleMotion, assemble
+from carlasc.converting.frame_stages import ScanBlock, ScanJob, make_fields
 from carlasc.converting.layout_options import AxesAndClasses
 from carlasc.converting.plans import begin, choose_recordings, plan_recording
 from carlasc.converting.results import check_outside
-from carlasc.converting.scan_stage import ScanBlock, ScanJob, make_fields
 from carlasc.converting.trajectory import frame_times, jitter, read_trajectory, scan_poses
 from carlasc.core import REMAPS, SEMANTICKITTI, Boxes, GridSpec
 from carlasc.core.axes import mirror_boxes, mirror_grid, mirror_points, mirror_poses, mirror_spec

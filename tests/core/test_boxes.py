@@ -106,29 +106,27 @@ def test_select_takes_boxes_by_mask_and_by_index():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "found"),
     [
-        ({"sizes": np.ones((1, 3))}, r"boxes: sizes: expected shape \(2, 3\), found \(1, 3\)"),
-        ({"labels": np.array([1, 2])}, "boxes: labels: expected unsigned integers, found int64"),
-        ({"centers": np.array([[0, 0, 0], [1, np.nan, 2]])}, r"centers: expected finite.*nan, "
-                                                             r"2.0\] in box 1 \(track 3\)"),
-        ({"sizes": np.array([[1, 1, 0], [1, 1, 1.0]])}, r"sizes: expected positive.*in box 0 "
-                                                        r"\(track 7\)"),
-        ({"quaternions": np.array([[1, 0, 0, 0], [1, 0, 0, 0.1]])}, "quaternions: expected a "
-                                                                    "rotation.*in box 1"),
-        ({"tracks": np.array([0, 3], np.uint32)}, "tracks: expected numbers above 0, found 0 in "
-                                                  "box 0"),
-        ({"tracks": np.array([3, 3], np.uint32)}, r"one box per track in a frame, found 3 in box 1 "
-                                                  r"\(track 3\)"),
+        ({"sizes": np.ones((1, 3))}, "(1, 3)"),
+        ({"labels": np.array([1, 2])}, "int64"),
+        ({"centers": np.array([[0, 0, 0], [1, np.nan, 2]])}, "nan, 2.0] in box 1 (track 3)"),
+        ({"sizes": np.array([[1, 1, 0], [1, 1, 1.0]])}, "in box 0 (track 7)"),
+        ({"quaternions": np.array([[1, 0, 0, 0], [1, 0, 0, 0.1]])}, "in box 1 (track 3)"),
+        ({"tracks": np.array([0, 3], np.uint32)}, "0 in box 0 (track 0)"),
+        ({"tracks": np.array([3, 3], np.uint32)}, "3 in box 1 (track 3)"),
     ],
-)  # fmt: skip
-def test_boxes_that_make_no_sense_are_refused(change, message):
-    with pytest.raises(FormatError, match=message):
+)
+def test_boxes_that_make_no_sense_are_refused(change, found):
+    with pytest.raises(FormatError) as error:
         replace(some_boxes(), **change)
+    assert error.value.where == f"boxes: {next(iter(change))}"
+    assert error.value.found.endswith(found)
 
 
 def test_an_error_in_a_table_names_the_file():
     table = some_boxes().to_table()
     table["width"] = -1
-    with pytest.raises(FormatError, match=r"boxes/000003.bin: boxes: sizes: expected positive"):
+    with pytest.raises(FormatError) as error:
         Boxes.from_table(table, "boxes/000003.bin")
+    assert error.value.where == "boxes/000003.bin: boxes: sizes"

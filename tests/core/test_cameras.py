@@ -103,18 +103,21 @@ def test_a_camera_comes_back_from_its_text():
     ],
 )
 def test_what_is_no_camera_is_refused_in_one_line(change, expected):
-    with pytest.raises(FormatError, match=expected) as error:
+    with pytest.raises(FormatError) as error:
         camera(**change)
+    assert error.value.expected.startswith(expected)
     assert "\n" not in str(error.value)
     about = camera().to_dict() | {
         name: np.asarray(value).tolist() for name, value in change.items()
     }
-    with pytest.raises(FormatError, match="cameras.json"):
+    with pytest.raises(FormatError) as error:
         CameraModel.from_dict(about, "cameras.json")
+    assert error.value.where.startswith("cameras.json")
 
 
 def test_a_camera_that_lacks_a_value_is_refused():
     about = camera().to_dict()
     del about["matrix"]
-    with pytest.raises(FormatError, match="a camera without matrix"):
+    with pytest.raises(FormatError) as error:
         CameraModel.from_dict(about, "cameras.json")
+    assert error.value.where.startswith("cameras.json") and "matrix" in error.value.found

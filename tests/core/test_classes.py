@@ -100,11 +100,9 @@ def test_carla_0914_tags_become_ours():
 
 def test_ids_beyond_the_vote_channels_are_named():
     CARLA.check(np.array([0, 24], np.uint32), "a.label")
-    with pytest.raises(
-        FormatError,
-        match=r"a.label: expected class ids 0..24 \(table carla\), found 30 in 2 of 3 labels",
-    ):
+    with pytest.raises(FormatError) as error:
         CARLA.check(np.array([0, 30, 30], np.uint32), "a.label")
+    assert (error.value.where, error.value.found) == ("a.label", "30 in 2 of 3 labels")
 
 
 def test_weights_follow_the_published_rule():
@@ -118,46 +116,43 @@ def test_weights_follow_the_published_rule():
 
 
 def test_names_that_do_not_exist_are_answered_with_those_that_do():
-    with pytest.raises(ArgumentError, match="expected one of .*carlasc11"):
-        remap_named("x")
-    with pytest.raises(FormatError, match="expected one of carla"):
-        table_named("x")
-    with pytest.raises(ArgumentError, match="Vehicle"):
-        CARLA.id_of("Spaceship")
+    for kind, ask, name, known in (
+        (ArgumentError, remap_named, "x", "carlasc11"),
+        (FormatError, table_named, "x", "carla"),
+        (ArgumentError, CARLA.id_of, "Spaceship", "Vehicle"),
+    ):
+        with pytest.raises(kind) as error:
+            ask(name)
+        assert known in error.value.expected and name in str(error.value)
     assert CARLA.id_of("vehicle") == 10
 
 
 def test_a_table_must_colour_what_it_names():
-    with pytest.raises(
-        ArgumentError,
-        match="expected a name and a colour for each id, found only one of them for 0",
-    ):
+    with pytest.raises(ArgumentError) as error:
         ClassTable("t", {0: "a"}, {})
-    with pytest.raises(ArgumentError, match="3 -> 99"):
+    assert error.value.where == "class table t" and error.value.found.endswith(" 0")
+    with pytest.raises(ArgumentError) as error:
         Remap("r", CARLA, CARLASC11, {3: 99})
+    assert "3 -> 99" in error.value.found
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    ("values", "expected", "found"),
     [
-        ({"names": {-1: "a"}, "colors": {-1: (0, 0, 0)}}, "expected names of ids 0..65535"),
-        ({"names": {70000: "a"}, "colors": {70000: (0, 0, 0)}}, "expected names of ids 0..65535"),
-        (
-            {"colors": {0: (0, 0, 256)}},
-            r"expected three values 0..255 for each colour, found \(0, 0, 256\) for 0",
-        ),
-        ({"ground": frozenset({1})}, "expected ids of the table in ground, found 1"),
-        ({"moving": frozenset({2})}, "expected ids of the table in moving, found 2"),
-        ({"geometry_only": 1}, "expected an id of the table in geometry_only, found 1"),
-        (
-            {"names": {3: "a"}, "colors": {3: (0, 0, 0)}, "num_channels": 3},
-            "expected num_channels above 3, up to 65536, found 3",
-        ),
+        ({"names": {-1: "a"}, "colors": {-1: (0, 0, 0)}}, "0..65535", "-1"),
+        ({"names": {70000: "a"}, "colors": {70000: (0, 0, 0)}}, "0..65535", "70000"),
+        ({"colors": {0: (0, 0, 256)}}, "0..255", "(0, 0, 256) for 0"),
+        ({"ground": frozenset({1})}, "ground", "1"),
+        ({"moving": frozenset({2})}, "moving", "2"),
+        ({"geometry_only": 1}, "geometry_only", "1"),
+        ({"names": {3: "a"}, "colors": {3: (0, 0, 0)}, "num_channels": 3}, "above 3", "3"),
     ],
 )
-def test_a_table_that_contradicts_itself_is_refused(values, message):
-    with pytest.raises(ArgumentError, match=f"class table t: {message}"):
+def test_a_table_that_contradicts_itself_is_refused(values, expected, found):
+    with pytest.raises(ArgumentError) as error:
         ClassTable(**{"name": "t", "names": {0: "a"}, "colors": {0: (0, 0, 0)}} | values)
+    assert error.value.where == "class table t"
+    assert expected in error.value.expected and found in error.value.found
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=list(TABLES))
@@ -188,36 +183,23 @@ def test_a_table_of_ones_own_is_kept_whole():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "where", "found"),
     [
-        ({"names": None}, "a.json: classes: expected names and colours by id"),
-        (
-            {"colors": {"0": [0, 0, 0]}},
-            "a.json: class table lab: expected a name and a colour for each id, found .* for 7",
-        ),
-        (
-            {"colors": {"0": [0, 0], "7": [0, 0, 0]}},
-            "a.json: classes: expected names and colours by id",
-        ),
-        (
-            {"movable": [9]},
-            "a.json: class table lab: expected ids of the table in movable, found 9",
-        ),
-        (
-            {"moveable": [7]},
-            "a.json: classes: expected only the keys name, names, .*found moveable",
-        ),
-        (
-            {"name": "carla"},
-            "a.json: classes: expected a name that is not in use.*give the table a new name",
-        ),
+        ({"names": None}, "classes", ""),
+        ({"colors": {"0": [0, 0, 0]}}, "class table lab", "7"),
+        ({"colors": {"0": [0, 0], "7": [0, 0, 0]}}, "classes", ""),
+        ({"movable": [9]}, "class table lab", "9"),
+        ({"moveable": [7]}, "classes", "moveable"),
+        ({"name": "carla"}, "classes", "carla"),
     ],
 )
-def test_a_damaged_table_in_a_file_is_named(change, message):
-    with pytest.raises(FormatError, match=message):
+def test_a_damaged_table_in_a_file_is_named(change, where, found):
+    with pytest.raises(FormatError) as error:
         table_from_json(LAB | change, "a.json")
-    with pytest.raises(FormatError, match="a.json: classes: expected the key 'names', found name"):
+    assert error.value.where == f"a.json: {where}" and found in error.value.found
+    with pytest.raises(FormatError) as error:
         table_from_json({"name": "lab"}, "a.json")
+    assert error.value.where == "a.json: classes" and "names" in error.value.expected
 
 
 def test_ground_and_actors_have_roles_in_every_table():

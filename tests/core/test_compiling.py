@@ -2,18 +2,12 @@
 part changes.
 """
 
-import fcntl
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numba
 import pytest
-from numba.core import event
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
-from numba.core.dispatcher import Dispatcher
 
 from carlasc.core import compiling
 
@@ -101,12 +95,12 @@ def test_a_file_in_the_place_of_the_folder_does_not_stop_the_program(tmp_path: P
 @pytest.mark.slow
 def test_what_old_versions_compiled_is_removed(tmp_path: Path) -> None:
     run(tmp_path / "a", tmp_path)
-    kept = sorted(tmp_path.glob(".cache/carlasc/*/outer/*"))
-    assert {path.suffix for path in kept} == {".nbc", ".nbi", ".lock"}
+    kept = sorted(tmp_path.glob(".cache/carlasc/*/outer.outer/*"))
+    assert len(kept) == 1
     for path in kept:
         os.utime(path, (0, 0))
     run(tmp_path / "a", tmp_path, factor=5)
-    now = sorted(tmp_path.glob(".cache/carlasc/*/outer/*"))
+    now = sorted(tmp_path.glob(".cache/carlasc/*/outer.outer/*"))
     assert len(now) == len(kept)
     assert not set(now) & set(kept)
 
@@ -117,67 +111,45 @@ def test_checked_loops_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     assert compiling.cache_folder() != plain
 
 
-@pytest.mark.slow
-def test_processes_that_need_a_function_at_once_compile_it_once(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(3) as pool:
-        made = list(pool.map(run, [tmp_path / name for name in "abc"], [tmp_path] * 3))
-    assert sorted(len(lines) for lines in made) == [1, 1, 3]
-    assert {lines[-1] for lines in made} == {"7"}
-
-
-def test_a_process_that_is_stopped_while_it_compiles_does_not_stop_the_others(
-    tmp_path: Path, monkeypatch
-) -> None:
-    @compiling.cached
-    def add(x):
-        return x + 1
-
-    monkeypatch.setattr(compiling, "_WAITED_S", 0.1)
-    with add._cache._lock_path.open("ab") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
-        assert add(2) == 3
-    assert add._cache._lock is None
-
-
-@pytest.mark.parametrize(
-    ("holder", "name"),
-    [
-        (numba.njit(compiling.fingerprint), "_cache"),
-        (Dispatcher, "enable_caching"),
-        (FunctionCache, "_impl_class"),
-        (FunctionCache, "cache_path"),
-        (FunctionCache, "load_overload"),
-        (FunctionCache, "save_overload"),
-        (CompileResultCacheImpl, "_locator_classes"),
-        (numba.core.config, "CACHE_DIR"),
-        (numba.core.config, "BOUNDSCHECK"),
-        (event, "Listener"),
-        (event, "register"),
-    ],
-)
-def test_numba_has_each_undocumented_name_that_the_cache_uses(holder, name) -> None:
-    assert hasattr(holder, name), (
-        f"Numba {numba.__version__} has no {name}, on which carlasc.core.compiling rests"
-    )
-
-
-def test_numba_asks_a_locator_for_no_more_than_ours_has() -> None:
-    wanted = {
-        name
-        for name, value in vars(_CacheLocator).items()
-        if getattr(value, "__isabstractmethod__", False)
-    }
-    missing = (wanted | {"ensure_cache_path", "from_function"}) - set(dir(compiling._SourceLocator))
-    assert not missing, f"Numba {numba.__version__} asks locators for {sorted(missing)}"
-
-
-def test_code_goes_through_our_cache_and_not_through_numbas_own() -> None:
+def test_code_is_kept_in_the_folder_of_the_user_beside_a_copy_of_its_source() -> None:
     @compiling.cached
     def double(x):
         return 2 * x
 
     assert double(2) == 4
-    kept = list(Path(double._cache.cache_path).glob("*.double-*"))
-    assert {path.suffix for path in kept} == {".nbc", ".nbi", ".lock"}, (
-        f"Numba {numba.__version__} does not use the cache"
-    )
+    folder = Path(double.stats.cache_path)
+    assert folder.is_relative_to(compiling.cache_folder().parent)
+    assert {path.suffix for path in folder.glob("*.double-*")} == {".nbc", ".nbi"}
+    copy = Path(double.py_func.__code__.co_filename)
+    assert copy.read_bytes() == Path(__file__).read_bytes()
+    assert copy.is_relative_to(compiling.cache_folder())
+
+
+def test_the_time_of_several_loops_is_added_up(monkeypatch):
+    times, notes, timers = iter([0.0, 0.7, 5.0, 5.2]), [], []
+
+    class Timer:
+        def __init__(self, wait_s, call):
+            self.wait_s, self.call, self.daemon, self.cancelled = wait_s, call, False, False
+            timers.append(self)
+
+        def start(self):
+            pass
+
+        def cancel(self):
+            self.cancelled = True
+
+    monkeypatch.setattr(compiling, "Timer", Timer)
+    monkeypatch.setattr(compiling.time, "perf_counter", lambda: next(times))
+    note = compiling.CompilingNote(lambda: notes.append("told"), 1.0)
+    note.on_start(None)
+    note.on_start(None)  # a loop that the first one calls
+    note.on_end(None)
+    note.on_end(None)
+    assert timers[0].cancelled and not notes
+    note.on_start(None)
+    assert timers[1].wait_s == pytest.approx(0.3)
+    timers[1].call()
+    note.on_end(None)
+    note.on_start(None)
+    assert notes == ["told"] and len(timers) == 2

@@ -8,8 +8,6 @@ import sys
 
 import pytest
 
-from carlasc.core import first_use
-
 PROGRAM = """
 import numpy as np
 from numba.core import event
@@ -120,31 +118,34 @@ def test_of_several_workers_that_compile_one_says_so(tmp_path):
     assert said == [1, 0]
 
 
-def test_the_time_of_several_loops_is_added_up(monkeypatch):
-    times, notes, timers = iter([0.0, 0.7, 5.0, 5.2]), [], []
+FIRST = """
+import os
+import carlasc.metrics.confusion as confusion
+from carlasc.running import Run, run_all
 
-    class Timer:
-        def __init__(self, wait_s, call):
-            self.wait_s, self.call, self.daemon, self.cancelled = wait_s, call, False, False
-            timers.append(self)
+def work(number):
+    import numpy as np
+    nine = np.ones(9, int)
+    confusion.ConfusionMatrix(3).update(nine, nine, nine > 0)
+    return os.getpid(), sum(confusion._count_pairs.stats.cache_misses.values())
 
-        def start(self):
-            pass
+if __name__ == "__main__":
+    print(len({process for process, misses in run_all(work, range(8), Run(workers=4)) if misses}))
+"""
 
-        def cancel(self):
-            self.cancelled = True
 
-    monkeypatch.setattr(first_use, "Timer", Timer)
-    monkeypatch.setattr(first_use.time, "perf_counter", lambda: next(times))
-    note = first_use.CompilingNote(lambda: notes.append("told"), 1.0)
-    note.start()
-    note.start()  # a loop that the first one calls
-    note.end()
-    note.end()
-    assert timers[0].cancelled and not notes
-    note.start()
-    assert timers[1].wait_s == pytest.approx(0.3)
-    timers[1].call()
-    note.end()
-    note.start()
-    assert notes == ["told"] and len(timers) == 2
+@pytest.mark.slow
+def test_one_worker_compiles_before_the_others_start(tmp_path):
+    (tmp_path / "script.py").write_text(FIRST)
+    compiled = [  # number of processes that compiled, in two runs
+        subprocess.run(
+            [sys.executable, str(tmp_path / "script.py")],
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+        ).stdout
+        for _ in range(2)
+    ]
+    assert compiled == ["1\n", "0\n"]

@@ -50,27 +50,24 @@ def test_poses_are_relative_to_the_first():
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("spoil", "words"),
     [
         (lambda t: t.__setitem__((0, 3), np.nan), "NaN or infinity"),
-        (
-            lambda t: t.__setitem__((1, 3), -1e12),
-            "expected a position within 1e\\+09 m, found 1e\\+12 m",
-        ),
+        (lambda t: t.__setitem__((1, 3), -1e12), "1e+12 m"),
         (lambda t: t.__imul__(2), "rigid transform"),
         (lambda t: t.__setitem__((3, 0), 1), "rigid transform"),
         (lambda t: t.__setitem__((slice(None), 1), -t[:, 1]), "reflection"),
     ],
 )
-def test_what_is_no_rigid_transform_is_refused_with_its_place(spoil, message):
+def test_what_is_no_rigid_transform_is_refused_with_its_place(spoil, words):
     transforms = np.stack([np.eye(4), np.eye(4)])
     spoil(transforms[1])
-    with pytest.raises(FormatError, match=f"poses.txt: transform 1: .*{message}"):
+    with pytest.raises(FormatError) as error:
         geometry.check_rigid(transforms, "poses.txt")
+    assert error.value.where == "poses.txt: transform 1" and words in str(error.value)
 
 
 def test_a_wrong_shape_is_refused():
-    with pytest.raises(
-        FormatError, match=r"pose.npy: expected 4 x 4 transforms, found shape \(3, 4\)"
-    ):
+    with pytest.raises(FormatError) as error:
         geometry.check_rigid(np.zeros((3, 4)), "pose.npy")
+    assert (error.value.where, error.value.found) == ("pose.npy", "shape (3, 4)")

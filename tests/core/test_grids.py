@@ -163,22 +163,25 @@ def test_what_makes_no_grid_is_refused(arguments):
 
 @pytest.mark.parametrize("resolution", [0, -1, math.nan, math.inf, (1, 1), (1, 1, 0)])
 def test_a_senseless_resolution_is_refused(resolution):
-    with pytest.raises(ArgumentError, match="resolution"):
+    with pytest.raises(ArgumentError) as error:
         GridSpec.published().with_resolution(resolution)
+    assert error.value.where == "resolution"
 
 
 def test_broken_params_name_the_file():
     good = GridSpec.published().to_params()
-    with pytest.raises(FormatError, match="p.json: expected the key 'min_bound'"):
+    with pytest.raises(FormatError) as error:
         GridSpec.from_params({k: v for k, v in good.items() if k != "min_bound"}, "p.json")
+    assert error.value.where == "p.json" and "min_bound" in error.value.expected
     for key, value in {
         "grid_size": [1.5, 1, 1],
         "max_bound": [-30, 1, 1],
         "coordinates": "polar",
         "min_bound": None,
     }.items():
-        with pytest.raises(FormatError, match="p.json"):
+        with pytest.raises(FormatError) as error:
             GridSpec.from_params(good | {key: value}, "p.json")
+        assert error.value.where.startswith("p.json")
 
 
 def test_a_grid_must_have_the_shape_of_its_spec():
@@ -187,8 +190,9 @@ def test_a_grid_must_have_the_shape_of_its_spec():
     counts[0, 0, 0] = 2
     grid = Grid(spec, np.zeros((2, 3, 4), np.uint8), counts)
     assert grid.known.sum() == 1
-    with pytest.raises(FormatError, match=r"grid counts: expected shape \(2, 3, 4\)"):
+    with pytest.raises(FormatError) as error:
         Grid(spec, np.zeros((2, 3, 4), np.uint8), np.zeros((4, 3, 2)))
+    assert error.value.where == "grid counts" and error.value.found == "(4, 3, 2)"
 
 
 def test_a_spec_pickles():

@@ -46,8 +46,9 @@ def test_kiss_icp_finds_a_known_trajectory_that_starts_at_rest():
 
 
 def test_an_empty_scan_is_named():
-    with pytest.raises(ArgumentError, match="found 3 in scan 0"):
+    with pytest.raises(ArgumentError) as error:
         estimate_poses([np.zeros((3, 3))] * 2)
+    assert error.value.found == "3 in scan 0"
 
 
 def test_no_scans_have_no_poses():
@@ -166,7 +167,10 @@ def test_a_drive_may_start_fast_at_a_low_rate():
 
 def test_seconds_must_be_those_of_the_points():
     scans = [np.zeros((200, 3))] * 2
-    with pytest.raises(ArgumentError, match="expected 200 of scan 1, one per point, found 199"):
-        estimate_poses(scans, seconds=[np.zeros(200), np.zeros(199)])
-    with pytest.raises(ArgumentError, match="expected 200 of scan 1, one per point, found 0"):
-        estimate_poses(scans, seconds=[np.zeros(200)])
+    for seconds, found in (
+        ([np.zeros(200), np.zeros(199)], "199"),
+        ([np.zeros(200)], "0"),
+    ):
+        with pytest.raises(ArgumentError) as error:
+            estimate_poses(scans, seconds=seconds)
+        assert "200 of scan 1" in error.value.expected and error.value.found == found

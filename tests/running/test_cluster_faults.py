@@ -31,18 +31,15 @@ def run(where: str, count: int = 4, workers: int | None = None) -> list[int]:
     "where", ["nonsense", "local:0", "local:x", "no.such.Class", "carlasc.NoSuchClass", ""]
 )
 def test_what_is_no_cluster(where):
-    with pytest.raises(
-        ArgumentError,
-        match=r"cluster: expected local, local:N, tcp://HOST:PORT, slurm, or the dotted",
-    ):
+    with pytest.raises(ArgumentError) as error:
         run(where)
+    assert error.value.where == "cluster" and "slurm" in error.value.expected
 
 
 def test_two_numbers_of_workers_contradict_each_other():
-    with pytest.raises(
-        ArgumentError, match="workers: expected no number of workers with local:2, found 3"
-    ):
+    with pytest.raises(ArgumentError) as error:
         run("local:2", workers=3)
+    assert (error.value.where, error.value.found) == ("workers", "3")
 
 
 @pytest.mark.slow
@@ -52,10 +49,9 @@ def test_no_scheduler_at_the_address():
 
     with dask.config.set({"carlasc.connect-timeout": "0.5s"}):
         for where in ("tcp://127.0.0.1:1", "tls://127.0.0.1:1", "tcp://nowhere.invalid:8786"):
-            with pytest.raises(
-                CarlascError, match=f"^cluster {where}: no scheduler answers: "
-            ) as caught:
+            with pytest.raises(CarlascError) as caught:
                 run(where)
+            assert caught.value.where == f"cluster {where}"
             assert "\n" not in str(caught.value)
             # the finalizer of one that is not closed would block a client that starts
             left = [
@@ -73,15 +69,13 @@ def test_no_work_opens_nothing():
 def test_a_cluster_without_workers(tmp_path: Path):
     import dask
 
-    with pytest.raises(
-        ArgumentError, match="workers: expected the number of jobs or workers that helpers"
-    ):
+    with pytest.raises(ArgumentError) as error:
         run("helpers.servers.dask_cluster.no_workers")
-    with pytest.raises(
-        CarlascError,
-        match="cluster helpers.servers.dask_cluster.broken: it does not start: no more machines",
-    ):
+    assert error.value.where == "workers"
+    with pytest.raises(CarlascError) as broken:
         run("helpers.servers.dask_cluster.broken")
+    assert broken.value.where == "cluster helpers.servers.dask_cluster.broken"
+    assert "no more machines" in broken.value.problem
     with (
         dask.config.set({"carlasc.workers-timeout": "300ms"}),
         dask_cluster.scheduler(tmp_path) as (address, _),

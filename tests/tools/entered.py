@@ -16,14 +16,23 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any
 
-import carlasc
-from carlasc import Dataset, FromCapture, FromScans, GridSpec, Run, regrid
-from carlasc.captures import Lidar
+import carlasc_converters
 
-PACKAGE = str(Path(carlasc.__file__).parent) + os.sep
+import carlasc
+from carlasc import Dataset, FromCapture, FromScans, GridSpec, Run, Scene, regrid
+from carlasc.captures import Lidar
+from carlasc.core.compiling import cache_folder
+from carlasc.groundtruth import GridOptions
+from carlasc.testing import SimulatedDrive
+
+PACKAGES = {
+    str(Path(package.__file__ or "").parent) + os.sep: shown
+    for package, shown in ((carlasc, ""), (carlasc_converters, "carlasc_converters/"))
+}
+COMPILED = str(cache_folder()) + os.sep  # here are the copies of the sources of compiled loops
 SPEC = GridSpec.published().with_size((32, 32, 8))
 LIDAR = Lidar(channels=16, points=4000)
 FRAMES = 6
@@ -56,19 +65,32 @@ class Entered:
         return f"{len(self.files)} files, {len(self.functions)} functions, {self.depth} deep"
 
 
+def file_of(code: CodeType) -> str | None:
+    """Return the path of the file of some code in its package; None if it is in no package."""
+    path = code.co_filename
+    if path.startswith(COMPILED):
+        module, _, _ = path.removeprefix(COMPILED).partition(os.sep)[0].rpartition(".")
+        return module.replace(".", "/").removeprefix("carlasc/") + ".py"
+    for root, shown in PACKAGES.items():
+        if path.startswith(root):
+            return shown + path.removeprefix(root)
+    return None
+
+
 def entered(function: Callable[[], object]) -> Entered:
     """Run a function, and return what of the package it entered in this thread."""
     found, stack = Entered(), list[str]()
 
     def profile(frame: FrameType, event: str, _: Any) -> None:
-        code = frame.f_code
-        if event == "call" and code.co_filename.startswith(PACKAGE):
-            stack.append(f"{code.co_filename.removeprefix(PACKAGE)}:{code.co_qualname}")
-            found.functions.add(stack[-1])
-            if len(stack) > found.depth:
-                found.deepest = tuple(stack)
-        elif event == "return" and code.co_filename.startswith(PACKAGE):
+        if event not in ("call", "return") or (file := file_of(frame.f_code)) is None:
+            return
+        if event == "return":
             stack.pop()
+            return
+        stack.append(f"{file}:{frame.f_code.co_qualname}")
+        found.functions.add(stack[-1])
+        if len(stack) > found.depth:
+            found.deepest = tuple(stack)
 
     before = sys.getprofile()
     sys.setprofile(profile)
@@ -85,7 +107,7 @@ def cases(folder: Path) -> dict[str, Callable[[], object]]:
     Each call does the work anew.
 
     One frame of a capture and of scans is made, each with its tracks, its report and all other
-    files of a run.
+    files of a run. A bag of 8 frames is converted, with grids. A page of one frame is written.
     """
     carlasc.simulate(folder / "capture", count=FRAMES, sensors=3, lidar=LIDAR, bev=False, run=ONE)
     regrid(folder / "capture", SPEC, folder / "grids", run=ONE)
@@ -111,12 +133,35 @@ def cases(folder: Path) -> dict[str, Callable[[], object]]:
                 run=ONE,
             )
 
+    def bag() -> object:
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            return carlasc.convert("bag", make_bag(folder), out, grids=GridOptions(SPEC), run=ONE)
+
+    def page() -> object:
+        with tempfile.TemporaryDirectory(dir=folder) as out:
+            return carlasc.view(scene, Path(out, "page.html"))
+
+    scene = Scene(folder / "grids", grid="evaluation_32x32x8", frames=(middle, middle + 1))
     return {
+        "convert bag": bag,
+        "view": page,
         "regrid from scans": scans,
         "regrid of a capture": capture,
         "Dataset[1]": lambda: dataset[1],
         "evaluate": lambda: carlasc.evaluate(folder / "grids", folder / "grids", run=ONE),
     }
+
+
+def make_bag(folder: Path) -> Path:
+    """Write a bag of ROS 1 with 8 scans of a simulated drive, if it does not exist; return it."""
+    from helpers.converters.bags import Messages, drive_messages, write_bag
+
+    bag = folder / "drive.bag"
+    if bag.exists():
+        return bag
+    store = Messages("bag")
+    drive = SimulatedDrive(8, rolling=True, channels=16, columns=120)
+    return write_bag(folder, "bag", drive_messages(store, drive, "odometry"), store=store)
 
 
 def count_case(case: Callable[[], object]) -> Entered:
