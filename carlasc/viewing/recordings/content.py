@@ -16,12 +16,10 @@ from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.storage.layout import FRAME_PERIOD_S
-from carlasc.viewing import colors as palette
+from carlasc.viewing.actor_lines import Trail, Trails, motion_arrows
 from carlasc.viewing.photos import Photo
-from carlasc.viewing.rendering.drawings import motion_arrows
 from carlasc.viewing.rendering.meshes import SQUARE, split_arcs, surrounded
 from carlasc.viewing.scene import SceneReader
-from carlasc.viewing.trails import Trail, Trails
 
 MAX_POINTS = 30_000
 """Default number of points per frame, so that a frame is smaller than half a megabyte."""
@@ -197,15 +195,6 @@ def thin_scan(scan: Scan, most: int) -> Scan:
         return scan
     order = np.arange(len(scan), dtype=np.uint64) * np.uint64(_GOLDEN) % np.uint64(2**32)
     return scan.select(np.sort(np.argpartition(order, most)[:most]))
-
-
-def point_colors(scan: Scan, by_id: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return (N, 3) uint8 RGB of the points of a scan, in the colours of their classes,
-    (num_channels, 3).
-    """
-    colors = by_id.copy()
-    colors[0] = palette.UNLABELLED
-    return colors[np.zeros(len(scan), np.int64) if scan.labels is None else scan.labels]
 
 
 def class_cells(grid: Grid) -> Iterator[tuple[int, NDArray[np.int64]]]:

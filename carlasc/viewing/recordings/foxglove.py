@@ -32,7 +32,7 @@ from carlasc.core.scans import Scan
 from carlasc.errors import import_extra
 from carlasc.storage.packed.output import PatientFile
 from carlasc.viewing import colors as palette
-from carlasc.viewing.recordings.content import RecordedFrame, class_surfaces, point_colors
+from carlasc.viewing.recordings.content import RecordedFrame, class_surfaces
 from carlasc.viewing.scene import GridPanel, SceneReader
 
 WORLD, EGO = "world", "ego"
@@ -205,7 +205,7 @@ class FoxgloveWriter:
         if numbered:
             points["instance"] = scan.instances
         points["xyz"], points["rgba"] = scan.points, 255
-        points["rgba"][:, :3] = point_colors(scan, self._reader.colors.by_id)
+        points["rgba"][:, :3] = self._reader.colors.of_points(scan)
         points["label"] = 0 if scan.labels is None else scan.labels
         float32 = m.PackedElementFieldNumericType.Float32
         axes = [

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import transform_points
 from carlasc.core.scans import Scan
 from carlasc.errors import MissingDataError
 from carlasc.viewing import colors as palette
+from carlasc.viewing.actor_lines import edges_of
 from carlasc.viewing.colors import AFTER_CLASSES, Entry
-from carlasc.viewing.finding import RemappedSequence, list_fields
 from carlasc.viewing.rendering.drawings import Drawing
 from carlasc.viewing.rendering.meshes import QuadMesh, box, join
+from carlasc.viewing.scene import RemappedSequence, list_fields
 
 BOX = Entry("box, with a bar to its front", palette.ARROW, AFTER_CLASSES + 10)
 """The entry of a legend for boxes."""
@@ -28,11 +28,6 @@ _LEAST_SIZE_M = 0.1
 _FEWEST_POINTS = 5
 _CLOSE_M = 0.05  # nearer points count as on the side
 _ANGLES = np.deg2rad(np.arange(0, 90, 2.0))
-
-_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_EDGES = [
-    (a, b) for a in range(8) for b in range(a + 1, 8) if np.sum(_CORNERS[a] != _CORNERS[b]) == 1
-]
 
 
 def check_boxes(data: RemappedSequence) -> None:
@@ -116,29 +111,11 @@ def with_boxes(drawing: Drawing, boxes: Boxes) -> Drawing:
     )
 
 
-def _lines_of(size: NDArray[np.floating]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the ends of the edges of a box, and of the bar on its floor, metres, frame of the box."""
-    corners, floor = _CORNERS * size, -size[2] / 2
-    bar = np.array([0.0, 0.0, floor]), np.array([size[0] / 2 + 0.8, 0.0, floor])
-    return [*((corners[a], corners[b]) for a, b in _EDGES), bar]
-
-
-def box_lines(boxes: Boxes) -> NDArray[np.float64]:
-    """Return (L, 2, 3) both ends of the edges of boxes, and of a bar from the middle of each to its
-    front, metres, sensor frame.
-    """
-    found = [
-        transform_points(pose, np.array(_lines_of(size)).reshape(-1, 3))
-        for pose, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True)
-    ]
-    return np.concatenate([np.empty((0, 3)), *found]).reshape(-1, 2, 3)
-
-
 def box_edges(boxes: Boxes) -> QuadMesh:
     """Return the edges of boxes as bars."""
     bars = []
     for sensor_T_box, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True):
-        for start, end in _lines_of(size):
+        for start, end in edges_of(size):
             lower, upper = np.minimum(start, end) - _BAR_M / 2, np.maximum(start, end) + _BAR_M / 2
             bar = box(lower, upper, palette.ARROW)
             rotation = sensor_T_box[:3, :3]

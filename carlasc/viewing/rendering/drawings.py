@@ -18,6 +18,7 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_c
 from carlasc.metrics.grids import VoxelOutcome, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
+from carlasc.viewing.actor_lines import MOVING_M_S, motion_arrows
 from carlasc.viewing.colors import (
     AFTER_CLASSES,
     ERRORS,
@@ -26,7 +27,6 @@ from carlasc.viewing.colors import (
     as_color,
     height_colors,
 )
-from carlasc.viewing.finding import RemappedSequence, without_invalid_points
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import (
     QuadMesh,
@@ -38,14 +38,12 @@ from carlasc.viewing.rendering.meshes import (
     quads,
 )
 from carlasc.viewing.rendering.raycasting import cast, empty_canvas, splat
-from carlasc.viewing.scene import SceneReader
+from carlasc.viewing.scene import RemappedSequence, SceneReader, without_invalid_points
 
 Extent = NDArray[np.float64]
 """(N, 3) float64 points, metres, that a camera fitted to the drawing shows."""
 
 _FLOOR = (240, 240, 243)
-_MOVING_M_S = 0.2  # slower points count as static
-_ARROW_CELL_M = 3.0
 GRID_COLORS: tuple[str, ...] = get_args(GridColor)
 _PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags"}
 _PARTS |= {"actor": "instance", "seen": "seen"}
@@ -219,10 +217,9 @@ def scan_drawing(
         legend = palette.height_entries(low, high)
     else:
         colors.table.check(points.labels, "scan labels")
-        by_id = colors.by_id.copy()
-        by_id[0] = palette.UNLABELLED
         unlabelled = [Entry("unlabelled", palette.UNLABELLED, -1)] if 0 in ids else []
-        point_colors, legend = by_id[points.labels], unlabelled + colors.entries(ids.tolist())
+        point_colors = colors.of_points(points)
+        legend = unlabelled + colors.entries(ids.tolist())
     note = None if len(points) else "the scan has no point"
     return Drawing(
         extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note
@@ -256,7 +253,7 @@ def flow_drawing(
     points = without_invalid_points(scan)
     extent = scan_extent(points) if extent is None else extent
     flow = np.asarray(points.flow)
-    moving = np.linalg.norm(flow, axis=1) > _MOVING_M_S
+    moving = np.linalg.norm(flow, axis=1) > MOVING_M_S
     point_colors = np.full((len(points), 3), palette.STATIC, np.uint8)
     legend = [Entry("standing", palette.STATIC, -1)]
     if points.labels is not None:
@@ -277,39 +274,6 @@ def with_arrows(drawing: Drawing, moving: Scan | None) -> Drawing:
     mesh = arrows(*ends, palette.ARROW, 0.24)
     mesh = mesh if drawing.mesh is None else join([drawing.mesh, mesh])
     return replace(drawing, mesh=mesh, legend=[*drawing.legend, VELOCITY])
-
-
-def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (M, 3) start points and (M, 3) vectors of the arrows that show how actors move, in
-    metres.
-
-    There is one arrow per instance, and one per cell of 3 m for points without an instance. An
-    arrow starts above the middle of its points and is as long as the distance moved in one second.
-
-    Args:
-        moving: the points that move, with flow.
-    """
-    if not len(moving):
-        return np.empty((0, 3)), np.empty((0, 3))
-    flow = np.asarray(moving.flow, np.float64)
-    keys = np.floor(moving.points[:, :2] / _ARROW_CELL_M).astype(np.int64)
-    if moving.instances is not None:
-        known = moving.instances > 0
-        keys[known] = np.column_stack(
-            [moving.instances[known], np.full(int(known.sum()), np.iinfo(np.int64).max)]
-        )
-    _, group = np.unique(keys, axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    count = np.bincount(group)
-    middle, vectors = (
-        np.stack([np.bincount(group, values[:, a]) for a in range(3)], axis=1) / count[:, None]
-        for values in (moving.points, flow)
-    )
-    top = np.full(len(count), -np.inf)
-    np.maximum.at(top, group, moving.points[:, 2])
-    middle[:, 2] = top + 0.4
-    real = np.linalg.norm(vectors, axis=1) > _MOVING_M_S
-    return middle[real], vectors[real]
 
 
 def voxel_drawing(

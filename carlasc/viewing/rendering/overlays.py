@@ -16,7 +16,7 @@ from carlasc.core.geometry import rotate_vectors
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics import cast_rays
 from carlasc.storage.camera_files import camera_named, read_image, scan_T_camera
-from carlasc.viewing.finding import SceneSource
+from carlasc.storage.files import check_target
 from carlasc.viewing.rendering.encoding import (
     FILMS,
     STILLS,
@@ -25,8 +25,7 @@ from carlasc.viewing.rendering.encoding import (
     write_pictures,
 )
 from carlasc.viewing.rendering.render import RenderResult
-from carlasc.viewing.scene import Scene, SceneReader, as_scene
-from carlasc.viewing.targets import check_target
+from carlasc.viewing.scene import Scene, SceneReader, SceneSource, as_scene
 
 _EDGE = 0.75  # brightness of a voxel at its edges in the picture
 

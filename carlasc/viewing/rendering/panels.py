@@ -14,7 +14,6 @@ from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.viewing.colors import Entry, merge_legends
-from carlasc.viewing.finding import RemappedSequence
 from carlasc.viewing.rendering.actor_boxes import BOX, boxes_in, with_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, View, Viewpoint
 from carlasc.viewing.rendering.drawings import (
@@ -34,7 +33,7 @@ from carlasc.viewing.rendering.drawings import (
 )
 from carlasc.viewing.rendering.pictures import Panel, draw_panels
 from carlasc.viewing.rendering.styles import Sheet
-from carlasc.viewing.scene import SceneReader
+from carlasc.viewing.scene import RemappedSequence, SceneReader
 
 MOST_PANELS = 64
 _VIEW_NAMES = {"perspective": "from behind", "bev": "from above"}

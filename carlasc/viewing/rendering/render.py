@@ -17,8 +17,8 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
+from carlasc.storage.files import check_target
 from carlasc.viewing.colors import merge_legends
-from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.rendering.actor_boxes import check_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
 from carlasc.viewing.rendering.drawings import GridColor, check_color
@@ -39,8 +39,7 @@ from carlasc.viewing.rendering.panels import (
     plan_cells,
 )
 from carlasc.viewing.rendering.styles import StyleOptions
-from carlasc.viewing.scene import Scene, SceneReader, as_scene
-from carlasc.viewing.targets import check_target
+from carlasc.viewing.scene import Scene, SceneReader, SceneSource, as_scene
 
 ORBIT_PICTURES = 120  # of an orbit around a single frame
 # frames are 0.1 s apart, so that a film runs at the speed of the drive
