@@ -19,7 +19,7 @@ MOVING_M_S = 0.2
 """Slower points count as static: flow has noise."""
 _ARROW_CELL_M = 3.0  # points without a number of an actor share an arrow within such a cell
 
-_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_CORNERS = np.array(list(np.ndindex(2, 2, 2))) - 0.5
 _EDGES = [
     (a, b) for a in range(8) for b in range(a + 1, 8) if np.sum(_CORNERS[a] != _CORNERS[b]) == 1
 ]

@@ -120,9 +120,8 @@ class Scene:
         return SceneReader(data, reference, contents, frames, self.palette, notes)
 
     def _default_contents(self, part: NamedPart) -> tuple[str, ...]:
-        has_grid = self.grid is not None or part.grid is not None or self.truth is not None
-        has_grid = has_grid or (bool(part.sequence.grids) and not part.is_scan)
-        if has_grid:
+        named = self.grid or part.grid or self.truth is not None
+        if named or (part.sequence.grids and not part.is_scan):
             return ("grid",) if self.truth is None else ("grid", "truth", "errors")
         if "points" in part.sequence.fields():
             return ("scan",)
@@ -644,13 +643,9 @@ class SceneReader:
         points = data.spec.from_axes(data.spec.centers().reshape(-1, 3)[moving["voxel"]]).astype(
             np.float32
         )
-        labels, actors = (
-            a.reshape(-1)[moving["voxel"]]
-            for a in (data.read_grid(frame).labels, self._instances(frame))
-        )
-        centers = Scan(
-            points, labels.astype(np.uint32), moving["velocity"].astype(np.float32), actors
-        )
+        labels = data.read_grid(frame).labels.reshape(-1)[moving["voxel"]].astype(np.uint32)
+        actors = self._instances(frame).reshape(-1)[moving["voxel"]]
+        centers = Scan(points, labels, moving["velocity"].astype(np.float32), actors)
         return mirror_scan(centers) if self.mirrored else centers
 
     def read_time(self, frame: int) -> float | None:

@@ -137,7 +137,7 @@ def view(
         overwrite: whether an existing file is replaced.
         progress: called with (frames done, frames in all) while a file is written.
         report: called with lines of text: for a recording with `full_points`, its approximate size;
-            for a window, the keys and the classes, and after each key its effect.
+            for a window, the keys, and after each key its effect.
 
     Returns:
         The file and its contents; None for a window.

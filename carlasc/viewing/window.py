@@ -94,7 +94,7 @@ class Window:
         control.set_lookat([-3.0, 0.0, -1.0])
         control.set_front([-0.79, 0.0, 0.61])
         control.set_up([0.0, 0.0, 1.0])
-        control.set_zoom(0.45)
+        control.set_zoom(0.55)
 
     @property
     def looks(self) -> list[str]:

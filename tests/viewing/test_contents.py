@@ -12,6 +12,7 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import FormatError
 from carlasc.viewing import Scene
+from carlasc.viewing.actor_lines import Trail
 from carlasc.viewing.page.contents import (
     OFFSET_STEPS,
     encode_actors,
@@ -22,7 +23,6 @@ from carlasc.viewing.page.contents import (
 )
 from carlasc.viewing.rendering.drawings import evidence_drawing
 from carlasc.viewing.scene import FrameContent
-from carlasc.viewing.actor_lines import Trail
 
 arrays = st.dictionaries(
     st.text(min_size=1, max_size=8),

@@ -5,11 +5,13 @@ actors; and their drawings.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
+from carlasc.core.geometry import Transform, rotation_z
 from carlasc.core.scans import Scan
 from carlasc.errors import MissingDataError
 from carlasc.viewing import colors as palette
@@ -69,7 +71,7 @@ def tight_boxes(scan: Scan) -> Boxes:
     Args:
         scan: with instances; with flow, boxes of moving actors have the right direction.
     """
-    rows: list[tuple[int, int, float, NDArray[np.float64], NDArray[np.float64]]] = []
+    tracks, labels, sizes, poses = list[int](), list[int](), list[Any](), list[Transform]()
     instances = np.zeros(len(scan), np.uint32) if scan.instances is None else scan.instances
     for actor in np.unique(instances[instances > 0]).tolist():
         members = np.flatnonzero(instances == actor)
@@ -79,21 +81,20 @@ def tight_boxes(scan: Scan) -> Boxes:
         velocity = (
             np.zeros(3) if scan.flow is None else scan.flow[members].astype(np.float64).mean(axis=0)
         )
-        yaw = _direction(points[:, :2], velocity)
-        turned = _turned(points, yaw)
+        sensor_T_box = rotation_z(_direction(points[:, :2], velocity))
+        turned = points @ sensor_T_box[:3, :3]
         lower, upper = turned.min(axis=0), turned.max(axis=0)
-        label = 0 if scan.labels is None else int(np.bincount(scan.labels[members]).argmax())
-        center = _turned(((lower + upper) / 2)[None], -yaw)[0]
-        rows.append((actor, label, yaw, center, np.maximum(upper - lower, _LEAST_SIZE_M)))
-    yaws = np.array([row[2] for row in rows])
-    zeros = np.zeros(len(rows))
-    return Boxes(
-        np.array([row[0] for row in rows], np.uint32),
-        np.array([row[1] for row in rows], np.uint32),
-        np.array([row[3] for row in rows]).reshape(-1, 3),
-        np.column_stack([np.cos(yaws / 2), zeros, zeros, np.sin(yaws / 2)]).reshape(-1, 4),
-        np.array([row[4] for row in rows]).reshape(-1, 3),
-        np.zeros(len(rows), np.bool_),
+        sensor_T_box[:3, 3] = sensor_T_box[:3, :3] @ ((lower + upper) / 2)
+        tracks.append(actor)
+        labels.append(0 if scan.labels is None else int(np.bincount(scan.labels[members]).argmax()))
+        sizes.append(np.maximum(upper - lower, _LEAST_SIZE_M))
+        poses.append(sensor_T_box)
+    return Boxes.from_poses(
+        np.array(tracks, np.uint32),
+        np.array(labels, np.uint32),
+        np.array(poses).reshape(-1, 4, 4),
+        np.array(sizes).reshape(-1, 3),
+        np.zeros(len(tracks), np.bool_),
     )
 
 
@@ -154,9 +155,3 @@ def _direction(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> fl
                 closeness,
             )
     return best if longest else best + float(np.pi / 2)
-
-
-def _turned(points: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
-    """Return points in a frame whose x axis has a yaw in the frame of the points."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return points @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -49,14 +49,7 @@ _PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferr
 _PARTS |= {"actor": "instance", "seen": "seen"}
 _KEPT_BY = {"actor": "actors", "seen": "seen"}  # options of regrid
 # upper bounds of the classes of probabilities, except for the last one
-_SHARES = (
-    0.6,
-    0.7,
-    0.8,
-    0.9,
-    0.95,
-    0.99,
-)
+_SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 _POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
 VELOCITY = Entry("velocity (distance in 1 s)", palette.ARROW, AFTER_CLASSES)
 _ORIGINS = (
@@ -126,11 +119,8 @@ def scan_extent(scan: Scan) -> Extent:
     if len(scan):
         lower, upper = (np.quantile(scan.points, share, axis=0) for share in (0.03, 0.97))
     side = np.array([5.0, 5.0, 0.0])  # the sensor and its surroundings are always in the picture
-    lower, upper = (
-        np.clip(np.minimum(lower, -side), -40, 40),
-        np.clip(np.maximum(upper, side), -40, 40),
-    )
-    corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    lower, upper = np.clip([np.minimum(lower, -side), np.maximum(upper, side)], -40, 40)
+    corners = np.array(list(np.ndindex(2, 2, 2)))
     return lower + corners * (upper - lower)
 
 
@@ -152,10 +142,8 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
     if not colors.tell_shapes(ids):
         low, high = grid.spec.lower[2], grid.spec.upper[2]
         layers = palette.height_colors(grid.spec.centers()[0, 0, :, 2], low, high)
-        voxel_colors, legend = (
-            np.broadcast_to(layers, (*grid.spec.size, 3)),
-            palette.height_entries(low, high),
-        )
+        voxel_colors = np.broadcast_to(layers, (*grid.spec.size, 3))
+        legend = palette.height_entries(low, high)
     else:
         voxel_colors, legend = colors.by_id[grid.labels], colors.entries(ids.tolist())
     return voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
@@ -221,9 +209,8 @@ def scan_drawing(
         point_colors = colors.of_points(points)
         legend = unlabelled + colors.entries(ids.tolist())
     note = None if len(points) else "the scan has no point"
-    return Drawing(
-        extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note
-    )
+    car = ego_vehicle() if ego else None
+    return Drawing(extent, car, points.points, point_colors, legend, note)
 
 
 def flow_drawing(
@@ -363,7 +350,7 @@ def evidence_drawing(
     """
     grid = data.read_grid(frame)
     values = data.read_part(_PARTS[color], frame)
-    numbers, legend = _classify(values, color)
+    numbers, legend = _classify(values, color), evidence_legend(color)
     colors = (
         palette.ACTORS.palette
         if color == "actor"
@@ -403,19 +390,17 @@ def evidence_legend(color: GridColor) -> list[Entry]:
     ]
 
 
-def _classify(values: NDArray[Any], color: GridColor) -> tuple[NDArray[np.int64], list[Entry]]:
-    """Return the entry of the legend for each voxel, and the legend."""
-    legend = evidence_legend(color)
+def _classify(values: NDArray[Any], color: GridColor) -> NDArray[np.int64]:
+    """Return the entry of the legend for each voxel; for actors the id in `palette.ACTORS`."""
     if color == "inferred":
         seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)
-        return np.where(
-            values & VoxelFlag.INFERRED, 3, np.where(values & VoxelFlag.CONTESTED, 2, seen)
-        ), legend
+        scanned = np.where(values & VoxelFlag.CONTESTED, 2, seen)
+        return np.where(values & VoxelFlag.INFERRED, 3, scanned)
     if color == "seen":
-        return np.minimum(np.bitwise_count(values), 2).astype(np.int64), legend
+        return np.minimum(np.bitwise_count(values), 2).astype(np.int64)
     if color == "actor":
-        return palette.actor_ids(values).astype(np.int64), legend
+        return palette.actor_ids(values).astype(np.int64)
     if color == "confidence":
-        return np.digitize(values.astype(np.float64), _SHARES), legend
+        return np.digitize(values.astype(np.float64), _SHARES)
     powers = np.floor(np.log2(np.maximum(values.astype(np.float64), 1)))
-    return np.minimum(powers, _POWERS - 1).astype(np.int64), legend
+    return np.minimum(powers, _POWERS - 1).astype(np.int64)

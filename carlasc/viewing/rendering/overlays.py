@@ -104,14 +104,14 @@ def _pictures(
                 where, expected=f"an image of {camera.name}", found="none", advice=advice
             )
         picture, labels = read_image(reader.data.sequence, camera, frame), grid.labels.reshape(-1)
-        found, _ = cast_rays(
+        first, _ = cast_rays(
             grid.labels[None],
             grid.spec,
             place[:3, 3],
             rotate_vectors(place, looks[looks_somewhere]),
         )
         voxels = np.full(len(looks), -1, np.int64)
-        voxels[looks_somewhere] = found[0]
+        voxels[looks_somewhere] = first[0]
         voxels[(voxels >= 0) & (labels[voxels] == 0)] = -1
         shaped = voxels.reshape(picture.shape[:2])
         colors = reader.colors.by_id[labels[shaped]].astype(np.float64)
