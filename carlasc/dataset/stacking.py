@@ -147,7 +147,7 @@ def _move(x, y, z, count, rows):  # type: ignore[no-untyped-def]
 
 @_step
 def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore[no-untyped-def]
-    """Write the radius, and the azimuth within AZIMUTH_ERROR: `arctan2` itself does not vectorise."""
+    """Write the radius, and the azimuth within AZIMUTH_ERROR: `arctan2` does not vectorise."""
     for n in range(count):
         squared = x[n] * x[n] + y[n] * y[n]
         angle = fast_azimuth(x[n], y[n])

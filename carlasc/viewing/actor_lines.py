@@ -145,7 +145,7 @@ class Trails:
 def _actors(
     content: FrameContent, moving: Scan | None
 ) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
-    """Yield the number, the class and the (3,) position of each actor, in the frame of the sensor."""
+    """Yield number, class and (3,) position of each actor, in the frame of the sensor."""
     boxes = content.boxes
     if boxes is not None:
         yield from zip(boxes.tracks.tolist(), boxes.labels.tolist(), boxes.centers, strict=True)

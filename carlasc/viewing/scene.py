@@ -363,7 +363,7 @@ class RemappedSequence:
 
     @property
     def stored_table(self) -> ClassTable:
-        """Class table of the grid's labels as they are stored, or of the scans' if no grid is read."""
+        """Class table of the grid's labels as stored, or of the scans' if no grid is read."""
         if self.stored is not None or not self.grid:
             return self.scan_table
         return self.sequence.classes_of(self.grid)

@@ -260,7 +260,7 @@ def _write_folder(content: PageContent, progress: Progress, out: Path) -> None:
 
 
 def _blocks(content: PageContent, scores: list[Scores], progress: Progress) -> Iterator[bytes]:
-    """Yield the frames, each as one block of arrays (see `page.contents`), and append its scores."""
+    """Yield each frame as one block of arrays (see `page.contents`), and append its scores."""
     trails = Trails()
     for done, frame in enumerate(content.frames, 1):
         arrays, own = content.read(frame, trails)

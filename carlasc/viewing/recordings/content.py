@@ -124,7 +124,7 @@ class RecordedFrame:
 
 
 class RecordingWriter(Protocol):
-    """Writes the frames of a scene to a file, one after the other, without keeping them in memory."""
+    """Writes the frames of a scene to a file one by one, without keeping them in memory."""
 
     def write(self, frame: RecordedFrame) -> None:
         """Append a frame."""

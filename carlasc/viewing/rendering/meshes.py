@@ -1,4 +1,4 @@
-"""Meshes of quads for ray casting: the exposed faces of a grid's occupied voxels, boxes and arrows."""
+"""Meshes of quads for ray casting: exposed faces of occupied voxels, boxes and arrows."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class QuadMesh:
         return len(self.corners)
 
     def triangles(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Return vertices (4 Q, 3) and triangles (2 Q, 3): quad q is the triangles 2 q and 2 q + 1."""
+        """Return vertices (4 Q, 3) and triangles (2 Q, 3): quad q is triangles 2 q and 2 q + 1."""
         first = 4 * np.arange(len(self), dtype=np.int32)[:, None, None]
         return self.corners.reshape(-1, 3), (
             first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -252,7 +252,7 @@ def _drawn_edges(
 
 
 def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
-    """Return (Q, 4, 3) faces, facing upwards, of the ground plan of a grid at a height in metres."""
+    """Return (Q, 4, 3) faces, facing upwards, of the ground plan of a grid at a height, metres."""
     pieces = (1, 1)
     # several along the radius too: Embree is slow with very thin faces
     if spec.coordinates == "cylindrical":

@@ -1,4 +1,4 @@
-"""The panels of a picture: the contents of a frame, the camera, and the order of frames and scenes."""
+"""The panels of a picture: contents of a frame, camera, and order of frames and scenes."""
 
 from __future__ import annotations
 
