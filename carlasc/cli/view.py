@@ -131,8 +131,8 @@ def view(
     """Show a sequence in a window (Open3D), or write it as a page for any browser or as a recording
     for Rerun or Foxglove (--out).
 
-    In all of them, you can rotate and zoom, step through the frames, and show or hide the grid,
-    points, scene flow and classes. Without --frames, a file shows the first 60 frames; a window and
+    In all of them, you can rotate and zoom, and step through the frames. Pages and recordings also
+    show and hide the grid, points, scene flow, boxes, tracks and classes. Without --frames, a file shows the first 60 frames; a window and
     the folder of a page show all frames.
     """
     shown = scene.scene(source, palette)

@@ -58,13 +58,13 @@ class LabelMap:
         """
         from carlasc.dataset.stacking import look_up
 
-        found = look_up(labels, self._table, self.target.dtype)
-        if found is None and self._remap is not None:
+        mapped = look_up(labels, self._table, self.target.dtype)
+        if mapped is None and self._remap is not None:
             return self._remap(labels, where)  # raises an error with the id
-        if found is None:
+        if mapped is None:
             self.source.check(labels, where)
             raise FormatError(where, expected=f"class ids of {self.source.name}")
-        return found
+        return mapped
 
 
 def _as_remap(remap: str | Remap | Mapping[int, int] | ArrayLike, classes: ClassTable) -> Remap:

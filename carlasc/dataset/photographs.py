@@ -15,7 +15,6 @@ from carlasc.storage import Sequence, layout
 from carlasc.storage.camera_files import (
     cameras_of,
     has_image,
-    image_fields,
     read_image,
     scan_T_camera,
 )
@@ -44,11 +43,6 @@ def frames_with_images(scans: Sequence, frames: NDArray[np.int64]) -> NDArray[np
     return frames[kept]
 
 
-def stored_images(scans: Sequence) -> dict[tuple[Sequence, str], None]:
-    """Return the image fields of a sequence that are stored in it, as keys for `common_frames`."""
-    return {(scans, field): None for field in image_fields(scans).values()}
-
-
 def read_cameras(scans: Sequence, frame: int) -> Values:
     """Return the images of a frame, and the camera models with their poses at the time of the
     images, both by camera name.
@@ -58,13 +52,12 @@ def read_cameras(scans: Sequence, frame: int) -> Values:
     """
     cameras = cameras_of(scans)
     images = {name: np.array(read_image(scans, camera, frame)) for name, camera in cameras.items()}
-    places = {name: scan_T_camera(scans, camera, frame) for name, camera in cameras.items()}
-    there = {
-        name: camera.replaced(sensor_T_camera=places[name])
+    posed = {
+        name: camera.replaced(sensor_T_camera=place)
         for name, camera in cameras.items()
-        if places[name] is not None
+        if (place := scan_T_camera(scans, camera, frame)) is not None
     }
-    return {"images": images, "cameras": there}
+    return {"images": images, "cameras": posed}
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from carlasc.dataset.fields import (
     Values,
 )
 from carlasc.dataset.labels import OF_GRID, GridFields, LabelMap, RemapLike
-from carlasc.dataset.photographs import OF_CAMERAS, frames_with_images, read_cameras, stored_images
+from carlasc.dataset.photographs import OF_CAMERAS, frames_with_images, read_cameras
 from carlasc.dataset.selection import (
     RecentScans,
     SequenceFrames,
@@ -43,6 +43,7 @@ from carlasc.dataset.selection import (
 )
 from carlasc.errors import ArgumentError, FormatError, MissingDataError, count
 from carlasc.storage import Sequence, Source, as_source, layout
+from carlasc.storage.camera_files import image_fields
 from carlasc.storage.metadata import Axes
 from carlasc.storage.transport.caching import CachedTree
 
@@ -65,30 +66,38 @@ class Dataset(_MapStyle):
     grid:
 
         occupancy     (T, X, Y, Z) uint8, 1 where a scan has a point; the oldest scan first, the
-        scan of the frame last density       (T, X, Y, Z) uint16, number of points per voxel
+                      scan of the frame last
+        density       (T, X, Y, Z) uint16, number of points per voxel
         visibility    (T, X, Y, Z) uint8, 2 where a scan has a point, 1 where only its rays passed,
-        0 elsewhere labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0
-        is free, and also unknown known         (X, Y, Z) bool, voxels with a vote: ignore all other
-        voxels in losses and metrics counts        (X, Y, Z) float32, number of votes per voxel
+                      0 elsewhere
+        labels        (X, Y, Z) uint8 class of each voxel (uint16 if ids exceed 255); 0 is free, and
+                      also unknown
+        known         (X, Y, Z) bool, voxels with a vote: ignore all other voxels in losses and
+                      metrics
+        counts        (X, Y, Z) float32, number of votes per voxel
         posterior     (K, X, Y, Z) float32, soft labels: probability of each class, 0 for free;
-        zeros where not known. K is the
-                      largest id of `classes` plus 1
+                      zeros where not known. K is the largest id of `classes` plus 1
         occupied      (X, Y, Z) float32, probability that the voxel is occupied; 0.5 where it is
-        unknown flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag` views         (X, Y, Z)
-        uint16, number of scans that saw the voxel instances     (X, Y, Z) int64, number of the
-        actor that the voxel belongs to, 0 for none; the same in all frames of a sequence voxel_flow
-        (X, Y, Z, 3) float32 m/s, velocity of the actor in the voxel, sensor frame; zero where
-        nothing moves camera_visible (X, Y, Z) uint8, bit i: the i-th camera of cameras.json sees
-        the voxel; see `carlasc.Voting(keep_seen=True)` images        {camera: (H, W, 3) uint8},
-        RGB; `carlasc.dataset.ResizeImages` resizes them cameras       {camera:
-        `carlasc.core.CameraModel`}, with their poses at the times of these images points        (N,
-        3) float32 metres, sensor frame of the frame; all points of the scan point_labels  (N,)
-        uint8 class of each point (uint16 if ids exceed 255) flow          (N, 3) float32 m/s,
-        velocity of each point, sensor frame remission     (N,) float32, fourth column of the scan:
-        remission in KITTI, zero in CarlaSC poses         (T, 4, 4) float64 current_T_past; the
-        identity where not valid valid         (T,) bool, whether the scan exists; in every sample
-        sequence      str, name of the sequence; in every sample frame         int, number of the
-        frame; in every sample
+                      unknown
+        flags         (X, Y, Z) uint8, sums of `carlasc.VoxelFlag`
+        views         (X, Y, Z) uint16, number of scans that saw the voxel
+        instances     (X, Y, Z) int64, number of the actor that the voxel belongs to, 0 for none;
+                      the same in all frames of a sequence
+        voxel_flow    (X, Y, Z, 3) float32 m/s, velocity of the actor in the voxel, sensor frame;
+                      zero where nothing moves
+        camera_visible (X, Y, Z) uint8, bit i: the i-th camera of cameras.json sees the voxel; see
+                      `carlasc.Voting(keep_seen=True)`
+        images        {camera: (H, W, 3) uint8}, RGB; `carlasc.dataset.ResizeImages` resizes them
+        cameras       {camera: `carlasc.core.CameraModel`}, with their poses at the times of these
+                      images
+        points        (N, 3) float32 metres, sensor frame of the frame; all points of the scan
+        point_labels  (N,) uint8 class of each point (uint16 if ids exceed 255)
+        flow          (N, 3) float32 m/s, velocity of each point, sensor frame
+        remission     (N,) float32, fourth column of the scan: remission in KITTI, zero in CarlaSC
+        poses         (T, 4, 4) float64 current_T_past; the identity where not valid
+        valid         (T,) bool, whether the scan exists; in every sample
+        sequence      str, name of the sequence; in every sample
+        frame         int, number of the frame; in every sample
 
     The history ends at the start of a sequence and at a gap in its frame numbers: earlier grids are
     empty, and their `valid` is False. Frames that lack a requested field are left out. `posterior`,
@@ -203,13 +212,9 @@ class Dataset(_MapStyle):
             for part in self._parts
             if part.grids is not None
         }
-        self._spec = (
-            grid
-            if isinstance(grid, GridSpec)
-            else common_value(specs, "grid geometry")
-            if specs
-            else None
-        )
+        self._spec = grid if isinstance(grid, GridSpec) else None
+        if specs and self._spec is None:
+            self._spec = common_value(specs, "grid geometry")
         self._label_map = self._make_label_map(remap)
         self.classes: ClassTable = self._label_map.target
 
@@ -331,7 +336,8 @@ class Dataset(_MapStyle):
         )
 
     def __repr__(self) -> str:
-        return f"<Dataset of {count(len(self), 'frame')} in {count(len(self._parts), 'sequence')}: {', '.join(self.fields)}>"
+        sizes = f"{count(len(self), 'frame')} in {count(len(self._parts), 'sequence')}"
+        return f"<Dataset of {sizes}: {', '.join(self.fields)}>"
 
     def _repr_html_(self) -> str:
         """Return the HTML for notebooks: the fields of samples, and the first sample from above."""
@@ -371,10 +377,10 @@ class Dataset(_MapStyle):
         if grids is not None:
             parts = self._grid_fields.parts(grids, grid)
             wanted |= {(grids, f"{grid}/{part}"): None for part in sorted(parts)}
-        wanted |= stored_images(scans) if (shows := self._asks(OF_CAMERAS)) else {}
-        frames = (
-            frames_with_images(scans, common_frames(wanted)) if shows else common_frames(wanted)
-        )
+        if shows := self._asks(OF_CAMERAS):
+            wanted |= {(scans, field): None for field in image_fields(scans).values()}
+        frames = common_frames(wanted)
+        frames = frames_with_images(scans, frames) if shows else frames
         part = SequenceFrames(scans, grids, grid, frames, tuple(wanted))
         if self._needs_poses:
             part.check_poses()
@@ -387,14 +393,14 @@ class Dataset(_MapStyle):
                 tables[part.scans.location] = part.scans.metadata.classes
             if self._asks(("labels", "posterior")) and part.grids is not None:
                 tables[f"{part.grids.location}/{part.grid}"] = part.grids.classes_of(part.grid)
-        where, found = next(iter(tables.items()), ("", self.sequences[0].metadata.classes))
-        label_map = LabelMap(remap, found)
+        where, stored = next(iter(tables.items()), ("", self.sequences[0].metadata.classes))
+        label_map = LabelMap(remap, stored)
         if tables:
             common_value({place: table.name for place, table in tables.items()}, "class table")
-        if tables and label_map.source != found:
+        if tables and label_map.source != stored:
             raise ArgumentError(
                 "remap",
-                expected=f"a remap of {where}'s class table {found.name}",
+                expected=f"a remap of {where}'s class table {stored.name}",
                 found=f"{label_map.name}, which maps {label_map.source.name}",
                 advice="use another `remap`, or None to keep the ids",
             )
@@ -410,26 +416,25 @@ class Dataset(_MapStyle):
         from carlasc.dataset.stacking import stack_scans
 
         spec = self.spec
-        moves = (
-            poses if self.align and poses is not None else np.tile(np.eye(4), (self.history, 1, 1))
-        )
+        if not self.align or poses is None:
+            poses = np.tile(np.eye(4), (self.history, 1, 1))
         scans = self._recent.read(part.scans, past)
         ranges = (part.scans.metadata.min_range_m, part.scans.metadata.max_range_m)
         stacks: Values = {}
         if "density" in self.fields:
-            stacks["density"] = stack_scans(scans, moves, spec, "density", *ranges)
+            stacks["density"] = stack_scans(scans, poses, spec, "density", *ranges)
         if "visibility" in self.fields:
             from carlasc.dataset.visibility import stack_visibility
 
             try:
-                stacks["visibility"] = stack_visibility(scans, moves, spec, *ranges)
+                stacks["visibility"] = stack_visibility(scans, poses, spec, *ranges)
             except FormatError as error:  # from poses.txt
                 raise error.within(part.scans.location) from error
         if "occupancy" in self.fields:
             stacks["occupancy"] = (
                 (stacks["density"] > 0).view(np.uint8)
                 if "density" in stacks
-                else stack_scans(scans, moves, spec, "occupancy", *ranges)
+                else stack_scans(scans, poses, spec, "occupancy", *ranges)
             )
         return stacks
 
@@ -440,11 +445,9 @@ class Dataset(_MapStyle):
             sample["points"] = np.array(
                 points[:, :3] if points is not None else (), np.float32, order="C"
             )
+        where = f"{part.scans.location}: labels of frame {frame}"
         if "point_labels" in self.fields:
-            labels = part.scans.read("labels", frame)
-            sample["point_labels"] = self._label_map(
-                labels, f"{part.scans.location}: labels of frame {frame}"
-            )
+            sample["point_labels"] = self._label_map(part.scans.read("labels", frame), where)
         if "flow" in self.fields:
             sample["flow"] = np.array(part.scans.read("flow", frame), np.float32, order="C")
         if "remission" in self.fields:

@@ -26,9 +26,8 @@ from carlasc.errors import ArgumentError, CarlascError
 from carlasc.storage.transport.caching import CachedTree
 
 _STORED_TOGETHER = 16  # frames per file of packed zarr stores
-_READ_AGAIN = (
-    4  # minimum length of a shard, relative to the additional frames that are read for histories
-)
+# minimum length of a shard, relative to the additional frames that are read for histories
+_READ_AGAIN = 4
 
 if TYPE_CHECKING:  # for type checkers it is a torch Sampler; torch is not imported at run time
     from torch.utils.data import Sampler as TorchSampler
@@ -55,10 +54,11 @@ class ShardSampler(_Sampler):
     If the data are opened with a cache (`carlasc.open(url, cache=folder)`), threads fetch the files
     of the next shards into it during an epoch. They end with the iteration.
 
-        dataset = Dataset(carlasc.open("s3://bucket/carlasc.zarr", cache="/scratch/cache"), "train",
-        history=16) sampler = ShardSampler(dataset, seed=0) loader =
-        torch.utils.data.DataLoader(dataset, batch_size=4, sampler=sampler, num_workers=2) for epoch
-        in range(epochs):
+        source = carlasc.open("s3://bucket/carlasc.zarr", cache="/scratch/cache")
+        dataset = Dataset(source, "train", history=16)
+        sampler = ShardSampler(dataset, seed=0)
+        loader = torch.utils.data.DataLoader(dataset, batch_size=4, sampler=sampler, num_workers=2)
+        for epoch in range(epochs):
             sampler.set_epoch(epoch)
             for batch in loader: ...
 
@@ -100,17 +100,10 @@ class ShardSampler(_Sampler):
             ArgumentError: an argument is not valid.
         """
         least = {"seed": 0, "shard": 1, "window": 1, "rank": 0, "world": 1, "read_ahead": 0}
-        given = {
-            "seed": seed,
-            "shard": shard,
-            "window": window,
-            "rank": rank,
-            "world": world,
-            "read_ahead": read_ahead,
-        }
-        for name, value in given.items():
-            if value is not None and value < least[name]:
-                raise ArgumentError(name, expected=f"{least[name]} or more", found=str(value))
+        given = (seed, 1 if shard is None else shard, window, rank, world, read_ahead)
+        for (name, lowest), value in zip(least.items(), given, strict=True):
+            if value < lowest:
+                raise ArgumentError(name, expected=f"{lowest} or more", found=str(value))
         if rank >= world:
             raise ArgumentError(
                 "rank", expected=f"0 to {world - 1}, for {world} processes", found=str(rank)
@@ -218,12 +211,10 @@ class ShardSampler(_Sampler):
 
     def _about(self) -> dict[str, int]:
         """Return the values on which the order depends, except the seed and the epoch."""
-        places = zip(self.dataset.sequences, self.dataset.frames, strict=True)
         digest = 0
-        for sequence, frames in places:
-            digest = zlib.crc32(
-                np.asarray(frames, "<i8").tobytes(), zlib.crc32(sequence.name.encode(), digest)
-            )
+        for sequence, frames in zip(self.dataset.sequences, self.dataset.frames, strict=True):
+            digest = zlib.crc32(sequence.name.encode(), digest)
+            digest = zlib.crc32(np.asarray(frames, "<i8").tobytes(), digest)
         return {
             "samples": len(self._shards),
             "data": digest,
@@ -346,9 +337,9 @@ class ReadAhead:
                     tree, path = file
                     tree.fetch(path, wait=False)
                     continue
-                found = self._dataset.cached_files(np.flatnonzero(self._shards == shard).tolist())
+                paths = self._dataset.cached_files(np.flatnonzero(self._shards == shard).tolist())
                 with self._changed:
-                    self._waiting.extend(found)
+                    self._waiting.extend(paths)
                     self._changed.notify_all()
 
     def _may_begin_shard(self) -> bool:

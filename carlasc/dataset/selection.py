@@ -152,13 +152,7 @@ def find_grid_sequences(
         ]
         group = next(iter(exact or candidates or only), {})
         if coordinates not in group:
-            existing = ", ".join(
-                sorted(
-                    f"{member.split or '?'}/{member.name}"
-                    for g in groups.values()
-                    for member in g.values()
-                )
-            )
+            existing = ", ".join(sorted(f"{split or '?'}/{name}" for split, name, _ in groups))
             raise MissingDataError(
                 source.location,
                 expected=f"{coordinates} grids of {scans.split or '?'}/{scans.name}",
@@ -174,13 +168,9 @@ def find_grid_name(grids: Sequence, grid: str | GridSpec) -> str:
     Raises:
         MissingDataError: the sequence has no such grid.
     """
-    if isinstance(grid, str):
-        if grid in grids.grids:
-            return grid
-    else:
-        for name, spec in grids.grids.items():
-            if spec == grid:
-                return name
+    for name, spec in grids.grids.items():
+        if grid in (name, spec):
+            return name
     existing = ", ".join(f"{name} ({spec})" for name, spec in grids.grids.items()) or "none"
     raise MissingDataError(
         grids.location,
@@ -225,12 +215,12 @@ def common_value(values: Mapping[str, _T], what: str) -> _T:
         FormatError: the values of two places differ; the message names both places.
     """
     (place, value), *others = values.items()
-    for other, found in others:
-        if found != value:
+    for other, theirs in others:
+        if theirs != value:
             raise FormatError(
                 other,
                 expected=f"the {what} of {place} ({value})",
-                found=str(found),
+                found=str(theirs),
                 advice="select sequences with equal values with `split`, a list of names",
             )
     return value
@@ -271,7 +261,8 @@ def _match(
         return list(groups)
     if isinstance(split, str) and split.lower() not in map(str.lower, layout.SPLITS):
         if not any(split in _names(key) for key in groups):
-            expected = f"{', '.join(layout.SPLITS)} in any case, or one or more of {first_names(key[1] for key in groups)}"
+            existing = first_names(key[1] for key in groups)
+            expected = f"{', '.join(layout.SPLITS)} in any case, or one or more of {existing}"
             raise ArgumentError("split", expected=expected, found=repr(split))
         split = [split]
     if isinstance(split, str):

@@ -72,9 +72,9 @@ def look_up(
     """Return `table[labels]` as `dtype`, with the shape of `labels`; None if a label is not in the
     table (after its end, or its value is -1).
     """
-    found = np.empty(labels.shape, dtype)
+    mapped = np.empty(labels.shape, dtype)
     flat = np.ascontiguousarray(labels).reshape(-1)
-    return found if _look_up(_read_only(flat), table, found.reshape(-1)) else None
+    return mapped if _look_up(_read_only(flat), table, mapped.reshape(-1)) else None
 
 
 def _geometry(spec: GridSpec) -> tuple[Any, ...]:
@@ -82,7 +82,8 @@ def _geometry(spec: GridSpec) -> tuple[Any, ...]:
     and its maximum error in cells.
     """
     voxel, sizes = spec.voxel_size, tuple(float(n) for n in spec.size)
-    # Rounding, the difference of voxel_size * size from the bounds, and the error of the azimuth.
+    # 1e-6: rounding of a product and a difference of float64. 1e-7 a cell: voxel_size is a float32
+    # difference, whose multiple is off from the bounds by up to 6e-8 of the size of the grid.
     doubt = 1e-6 + 1e-7 * max(sizes)
     doubt += AZIMUTH_ERROR / float(voxel[1]) if spec.coordinates == "cylindrical" else 0.0
     return spec.lower, tuple(1.0 / voxel), sizes, doubt
@@ -116,6 +117,7 @@ def _split_columns(words, x, y, z):  # type: ignore[no-untyped-def]
 
     Reading two 64-bit words per point vectorises; reading four floats does not.
     """
+    # on little-endian machines the first of two numbers is in the lower half of its word
     for n in range(len(words) // 2):
         xy, zw = words[2 * n], words[2 * n + 1]
         x[n] = np.uint32(xy).view(np.float32)
@@ -124,19 +126,13 @@ def _split_columns(words, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @_step
-def _copy_columns(xs, ys, zs, x, y, z):  # type: ignore[no-untyped-def]
-    for n in range(len(xs)):
-        x[n] = xs[n]
-        y[n] = ys[n]
-        z[n] = zs[n]
-
-
-@_step
 def _leave_out(x, y, z, count, near_squared, far_squared):  # type: ignore[no-untyped-def]
+    # A point is not removed, because blocks of a fixed length vectorise: NaN compares as false with
+    # every bound, through the transform too, so that it is in no cell.
     for n in range(count):
         squared = x[n] * x[n] + y[n] * y[n] + z[n] * z[n]
         if squared < near_squared or squared > far_squared:
-            x[n] = np.nan  # NaN is outside every grid
+            x[n] = np.nan
 
 
 @_step
@@ -151,10 +147,11 @@ def _move(x, y, z, count, rows):  # type: ignore[no-untyped-def]
 
 @_step
 def _to_cylindrical(x, y, count, lower, upper, radius, azimuth):  # type: ignore[no-untyped-def]
-    """Write the radius, and the azimuth within AZIMUTH_ERROR: `arctan2` itself does not vectorise."""
+    """Write the radius, and the azimuth within AZIMUTH_ERROR: `arctan2` does not vectorise."""
     for n in range(count):
         squared = x[n] * x[n] + y[n] * y[n]
         angle = fast_azimuth(x[n], y[n])
+        # the grid may begin at any azimuth, such as 0 or -pi: one turn leads into its interval
         turned = (
             angle + 2 * np.pi if angle < lower else (angle - 2 * np.pi if angle >= upper else angle)
         )
@@ -176,9 +173,12 @@ def _find_cells(x, y, z, count, geometry, cells):  # type: ignore[no-untyped-def
     clear = 0.5 - doubt
     doubtful = 0
     for n in range(count):
+        # in cells from the lower corner of the grid; a point in doubt is at most `doubt` off
         a, b, c = (x[n] - l0) * w0, (y[n] - l1) * w1, (z[n] - l2) * w2
         i, j, k = np.floor(a), np.floor(b), np.floor(c)
         inside = (i >= 0) & (i < s0) & (j >= 0) & (j < s1) & (k >= 0) & (k < s2)
+        # nearer than `doubt` to a face of its cell; outside of the grid too, since the exact rule
+        # may put such a point into the outermost cell. `|`, not `or`: branches do not vectorise.
         edge = (
             (np.abs(a - i - 0.5) > clear)
             | (np.abs(b - j - 0.5) > clear)
@@ -204,33 +204,40 @@ def _mark(cells, count, grid):  # type: ignore[no-untyped-def]
 
 
 @_step
-def _bin_block(x, y, z, radius, azimuth, found, count, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+def _bin_block(  # type: ignore[no-untyped-def]
+    x, y, z, radius, azimuth, voxels, count, rows, cells, geometry, ranges, grid
+):
     near, far = ranges
+    # before the transform, because ranges are measured from the sensor of the scan
     if near > 0.0 or far < np.inf:
         _leave_out(x, y, z, count, near * near, far * far)
     _move(x, y, z, count, rows)
     if cells.cylindrical:
         _to_cylindrical(x, y, count, cells.lower[1], cells.upper[1], radius, azimuth)
-        doubtful = _find_cells(radius, azimuth, z, count, geometry, found)
+        doubtful = _find_cells(radius, azimuth, z, count, geometry, voxels)
     else:
-        doubtful = _find_cells(x, y, z, count, geometry, found)
+        doubtful = _find_cells(x, y, z, count, geometry, voxels)
+    # Few blocks have a doubtful point, so that this loop, which does not vectorise, rarely runs. It
+    # takes x and y, not radius and azimuth: those have the error of the fast azimuth.
     for n in range(count if doubtful else 0):
-        if found[n] == -2:
+        if voxels[n] == -2:
             voxel = find_voxel(x[n], y[n], z[n], cells)
-            found[n] = voxel if voxel < len(grid) else -1
-    _mark(found, count, grid)
+            voxels[n] = voxel if voxel < len(grid) else -1
+    # here every entry is -1 or an index of the grid, as the exact rule has it
+    _mark(voxels, count, grid)
 
 
 @cached
 def _bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
+    # the same buffers for all blocks: they stay in the first-level cache
     x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
-    found = np.empty(_BLOCK, np.int32)
+    voxels = np.empty(_BLOCK, np.int32)
     for start in range(0, len(words), 2 * _BLOCK):
         block = words[start : start + 2 * _BLOCK]
         _split_columns(block, x, y, z)
         _bin_block(
-            x, y, z, radius, azimuth, found, len(block) // 2, rows, cells, geometry, ranges, grid
+            x, y, z, radius, azimuth, voxels, len(block) // 2, rows, cells, geometry, ranges, grid
         )
 
 
@@ -238,19 +245,21 @@ def _bin_rows(words, rows, cells, geometry, ranges, grid):  # type: ignore[no-un
 def _bin_planes(xs, ys, zs, rows, cells, geometry, ranges, grid):  # type: ignore[no-untyped-def]
     x, y, z = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     radius, azimuth = np.empty(_BLOCK), np.empty(_BLOCK)
-    found = np.empty(_BLOCK, np.int32)
+    voxels = np.empty(_BLOCK, np.int32)
     for start in range(0, len(xs), _BLOCK):
-        xb, yb, zb = (
-            xs[start : start + _BLOCK],
-            ys[start : start + _BLOCK],
-            zs[start : start + _BLOCK],
-        )
-        _copy_columns(xb, yb, zb, x, y, z)
-        _bin_block(x, y, z, radius, azimuth, found, len(xb), rows, cells, geometry, ranges, grid)
+        end = start + _BLOCK
+        block_x, block_y, block_z = xs[start:end], ys[start:end], zs[start:end]
+        count = len(block_x)
+        # copied although they are contiguous: the steps work in place and in float64
+        for n in range(count):
+            x[n] = block_x[n]
+            y[n] = block_y[n]
+            z[n] = block_z[n]
+        _bin_block(x, y, z, radius, azimuth, voxels, count, rows, cells, geometry, ranges, grid)
 
 
 @cached(error_model="python")
-def _look_up(labels, table, found):  # type: ignore[no-untyped-def]
+def _look_up(labels, table, mapped):  # type: ignore[no-untyped-def]
     size = len(table)
     complete = True
     for n in range(len(labels)):
@@ -258,5 +267,5 @@ def _look_up(labels, table, found):  # type: ignore[no-untyped-def]
         if label >= size or table[label] < 0:
             complete = False
         else:
-            found[n] = table[label]
+            mapped[n] = table[label]
     return complete

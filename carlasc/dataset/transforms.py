@@ -14,23 +14,14 @@ from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
 from carlasc.dataset.fields import Sample, Values
+from carlasc.dataset.labels import OF_GRID
 from carlasc.errors import ArgumentError
 
 _DIRECTIONS = ("x", "y")
 _TOLERANCE = 1e-5  # the published azimuth bounds are pi as float32, with an error of 9e-8
-_FIRST_GRID_AXIS = {"occupancy": 1, "density": 1, "visibility": 1, "posterior": 1} | dict.fromkeys(
-    (
-        "labels",
-        "known",
-        "counts",
-        "occupied",
-        "flags",
-        "views",
-        "instances",
-        "voxel_flow",
-        "camera_visible",
-    ),
-    0,
+# dimension of a field that is x or the radius
+_FIRST_GRID_AXIS = dict.fromkeys(OF_GRID, 0) | dict.fromkeys(
+    ("occupancy", "density", "visibility", "posterior"), 1
 )
 
 
@@ -93,7 +84,7 @@ class Flip:
 
         Call this before iterating over the DataLoader, as with a DistributedSampler.
         """
-        self._epoch.value = epoch
+        self._epoch.cell.value = epoch
 
     def __call__(self, sample: Sample) -> Sample:
         """Return the sample, possibly flipped. The input is not changed."""
@@ -101,7 +92,7 @@ class Flip:
         if self.seed is not None:
             seed = [
                 self.seed,
-                self._epoch.value,
+                self._epoch.cell.value,
                 zlib.crc32(sample["sequence"].encode()),
                 sample["frame"],
             ]
@@ -184,25 +175,11 @@ def _check_symmetric(spec: GridSpec, direction: str) -> None:
 class _SharedNumber:
     """A number in shared memory. Persistent workers have copies of all other attributes."""
 
-    def __init__(self, value: int = 0) -> None:
-        self._cell = multiprocessing.Value("q", value, lock=False)
-
-    @property
-    def value(self) -> int:
-        return int(self._cell.value)
-
-    @value.setter
-    def value(self, value: int) -> None:
-        self._cell.value = value
+    def __init__(self, value: int = 0, cell: Any = None) -> None:
+        self.cell = multiprocessing.Value("q", value, lock=False) if cell is None else cell
 
     def __reduce__(self) -> tuple[Callable[..., _SharedNumber], tuple[Any, ...]]:
         """Share the memory when a process is spawned; in any other pickle, store the number."""
         if get_spawning_popen() is not None:
-            return _shared, (self._cell,)
-        return _SharedNumber, (self.value,)
-
-
-def _shared(cell: Any) -> _SharedNumber:
-    number = _SharedNumber.__new__(_SharedNumber)
-    number._cell = cell
-    return number
+            return _SharedNumber, (0, self.cell)
+        return _SharedNumber, (int(self.cell.value),)

@@ -14,6 +14,8 @@ from carlasc.groundtruth.voting import Observation, count_votes
 
 UNSEEN, PASSED, HIT = 0, 1, 2
 """The values of the field `visibility`."""
+# about the faces of the outer surface of the published grid, 36,864, so that small grids are traced
+# as densely
 _FEWEST_RAYS = 40_000
 
 
@@ -46,13 +48,16 @@ def stack_visibility(
         (T, X, Y, Z) uint8: `HIT` where a scan has a point, `PASSED` where only rays passed,
         otherwise `UNSEEN`.
     """
+    # HIT is 2: a voxel with a point stays so, whatever other rays pass through it
     seen = 2 * stack_scans(scans, grid_T_scans, spec, "occupancy", min_range_m, max_range_m)
+    # the arc of a cylindrical cell grows from 0 with the radius, so it gives no step
     step_m = float(
         spec.voxel_size[[0, 2]].min()
         if spec.coordinates == "cylindrical"
         else spec.voxel_size.min()
     )
     x, y, z = spec.size
+    # the outer surface, in faces: about as many rays as can leave the grid by different voxels
     most = max(_FEWEST_RAYS, 2 * (x * y + y * z + x * z))
     limits = min_range_m or 0.0, math.inf if max_range_m is None else max_range_m
     for grid, points, grid_T_scan in zip(seen, scans, grid_T_scans, strict=True):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError
-from carlasc.metrics.confusion import ratio
+from carlasc.metrics.confusion import json_number, ratio
 from carlasc.metrics.conventions import Convention
 from carlasc.metrics.grids import SequenceGrid
 from carlasc.metrics.pairs import Pair
@@ -49,28 +49,20 @@ class ActorScore:
 
     def to_dict(self, classes: ClassTable) -> dict[str, Any]:
         """Return all scores by name, as fractions and m/s, for JSON; None for undefined scores."""
-        pq = {
-            name: self.panoptic.pq[label]
-            for label, name in classes.names.items()
-            if label < len(self.panoptic.pq)
-        }
+        pq = self.panoptic.pq
         means = {what: self.panoptic.mean(what) for what in ("pq", "sq", "rq")}
         figures = means | {"pq_things": self.panoptic.mean(which="things")} | vars(self.tracking)
         figures |= {"velocity_m_s": self.velocity_m_s}
         by_speed = {f"from {low:g} m/s": value for low, value in self.velocity_by_speed.items()}
         groups = {
-            "class_pq": pq,
+            "class_pq": {n: pq[label] for label, n in classes.names.items() if label < len(pq)},
             "velocity_by_class": self.velocity_by_class,
             "velocity_by_speed": by_speed,
         }
-        return {name: _number(value) for name, value in figures.items()} | {
-            name: {key: _number(value) for key, value in group.items()}
+        return {name: json_number(value) for name, value in figures.items()} | {
+            name: {key: json_number(value) for key, value in group.items()}
             for name, group in groups.items()
         }
-
-
-def _number(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
 
 
 class ActorScores:
@@ -98,9 +90,11 @@ class ActorScores:
                 or f"{side.grid}/instance" not in side.sequence.fields()
             ):
                 raise ArgumentError(
-                    "actors", expected="grids with instances for prediction and ground truth", found=f"no instances in {side.location}",
+                    "actors",
+                    expected="grids with instances for prediction and ground truth",
+                    found=f"no instances in {side.location}",
                     advice="make the ground truth with `regrid --keep-actors`",
-                )  # fmt: skip
+                )
 
     def update(self, pair: Pair, frame: int, prepared: Prepared) -> None:
         """Add a frame.
@@ -145,10 +139,7 @@ class ActorScores:
     def compute(self) -> ActorScore:
         """Return the scores of all added frames."""
         total, count = self.errors
-        by_class, by_speed = (
-            ratio(total.sum(axis=1), count.sum(axis=1)),
-            ratio(total.sum(axis=0), count.sum(axis=0)),
-        )
+        by_class, by_speed = (ratio(total.sum(axis=a), count.sum(axis=a)) for a in (1, 0))
         names = self.convention.classes.names
         return ActorScore(
             self.panoptic.compute(),
@@ -162,9 +153,9 @@ class ActorScores:
 def movable_of(convention: Convention, table: ClassTable) -> frozenset[int]:
     """Return the classes of a convention to which the movable classes of a table are mapped."""
     mapping = convention.maps[table.name]
-    found = {mapping[label] for label in table.movable if label in mapping}
+    actors = {mapping[label] for label in table.movable if label in mapping}
     return frozenset(
-        label for label in found if label in convention.averaged and label != convention.free
+        label for label in actors if label in convention.averaged and label != convention.free
     )
 
 

@@ -95,17 +95,17 @@ def cast_rays(
         solid |= (grid != free).astype(np.uint8) << np.uint8(bit)
     if len(grids) > 8:
         raise ArgumentError("grids", expected="at most 8 grids", found=str(len(grids)))
-    found = np.full((len(grids), len(starts) * len(steps)), -1, np.int64)
-    depth = np.zeros(found.shape)
+    voxels = np.full((len(grids), len(starts) * len(steps)), -1, np.int64)
+    depth = np.zeros(voxels.shape)
     _cast(
         solid.reshape(-1),
         np.array(spec.size),
         (starts - lower) / voxel,
         steps / voxel,
-        found,
+        voxels,
         depth,
     )
-    return found, depth
+    return voxels, depth
 
 
 def follow_rays(
@@ -195,12 +195,12 @@ def _follow(solid, size, start, ends, lengths, first, passed):  # type: ignore[n
 
 
 @cached
-def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-def]
+def _cast(solid, size, starts, steps, voxels, depth):  # type: ignore[no-untyped-def]
     """Walk each ray from voxel to voxel (Amanatides and Woo), in voxel units.
 
     The distance along the ray is in metres.
     """
-    num_grids = len(found)
+    num_grids = len(voxels)
     everything = (1 << num_grids) - 1
     nx, ny, nz = size[0], size[1], size[2]
     row, plane = nz, ny * nz
@@ -239,7 +239,7 @@ def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-
                 if hit:
                     for g in range(num_grids):
                         if hit >> g & 1:
-                            found[g, ray], depth[g, ray] = voxel, t
+                            voxels[g, ray], depth[g, ray] = voxel, t
                     open_grids ^= hit
                     if not open_grids:
                         break
@@ -255,7 +255,7 @@ def _cast(solid, size, starts, steps, found, depth):  # type: ignore[no-untyped-
                 if not inside:
                     for g in range(num_grids):
                         if open_grids >> g & 1:
-                            found[g, ray], depth[g, ray] = voxel, t
+                            voxels[g, ray], depth[g, ray] = voxel, t
                     break
                 voxel += step
 
@@ -308,10 +308,10 @@ def cast_rays_on_device(
     to_face = torch.where(step != 0, (cell + (step > 0) - start) / step, infinite)
     between = torch.where(step != 0, (1 / step).abs(), infinite)
     sign = torch.where(step > 0, 1, -1)
-    found = torch.full((len(grids), len(start)), -1, dtype=torch.int64, device=device)
-    depth = torch.zeros(found.shape, dtype=double, device=device)
+    voxels = torch.full((len(grids), len(start)), -1, dtype=torch.int64, device=device)
+    depth = torch.zeros(voxels.shape, dtype=double, device=device)
     walking = torch.arange(len(start), device=device)
-    open_rays = torch.ones(found.shape, dtype=torch.bool, device=device)
+    open_rays = torch.ones(voxels.shape, dtype=torch.bool, device=device)
     while len(walking):
         distance, axis = to_face[walking].min(dim=1)
         flat = (cell[walking] * strides).sum(dim=1)
@@ -322,10 +322,10 @@ def cast_rays_on_device(
         ends = (solid[:, flat] | leaves) & open_rays[:, walking]
         for g in range(len(grids)):
             rays = walking[ends[g]]
-            found[g, rays], depth[g, rays] = flat[ends[g]], distance[ends[g]]
+            voxels[g, rays], depth[g, rays] = flat[ends[g]], distance[ends[g]]
             open_rays[g, rays] = False
         goes_on = open_rays[:, walking].any(dim=0) & ~leaves
         walking, axis = walking[goes_on], axis[goes_on]
         cell[walking] = further[goes_on]
         to_face[walking, axis] += between[walking, axis]
-    return found, depth
+    return voxels, depth

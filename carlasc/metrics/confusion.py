@@ -7,6 +7,7 @@ the paper for a whole split.
 
 from __future__ import annotations
 
+import operator
 import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -260,6 +261,11 @@ def ratio(numerator: Any, denominator: Any) -> NDArray[np.float64]:
     )
 
 
+def json_number(value: float) -> float | None:
+    """Return a score for JSON: None for NaN."""
+    return None if np.isnan(value) else float(value)
+
+
 @dataclass(frozen=True)
 class TruthScore:
     """The comparison of ground truth with a reference. Scores of frames are added with `+`.
@@ -290,12 +296,7 @@ class TruthScore:
         return self.matrix.accuracy
 
     def __add__(self, other: TruthScore) -> TruthScore:
-        return TruthScore(
-            self.matrix + other.matrix,
-            self.known + other.known,
-            self.known_reference + other.known_reference,
-            self.known_both + other.known_both,
-        )
+        return TruthScore(*map(operator.add, vars(self).values(), vars(other).values()))
 
 
 def score_truth(

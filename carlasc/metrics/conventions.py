@@ -190,22 +190,22 @@ class Convention:
             values = iou
         else:
             values = iou[in_truth] if self.absent == "skip-truth" else iou[~np.isnan(iou)]
-        found = matrix.completeness()
+        occupied = matrix.completeness()
         names = [self.classes.names[index] for index in self.averaged]
         return ConventionScore(
             float(values.mean()) if len(values) else float("nan"),
             dict(zip(names, iou.tolist(), strict=True)),
-            found.precision,
-            found.recall,
-            found.iou,
-            1 - found.recall,
+            occupied.precision,
+            occupied.recall,
+            occupied.iou,
+            1 - occupied.recall,
         )
 
     def _map(self, labels: NDArray[Any], table: ClassTable, where: str) -> NDArray[np.uint8]:
         lookup = self._lookups[table.name]
         # the last entry is for all larger ids
-        found = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")
-        if (unknown := found == _UNKNOWN).any():
+        ids = lookup.take(labels.astype(np.uint32, copy=False), mode="clip")
+        if (unknown := ids == _UNKNOWN).any():
             bad = int(labels[unknown][0])
             raise FormatError(
                 where,
@@ -214,7 +214,7 @@ class Convention:
                 advice=f"the convention {self.name} has no class for this id: correct the labels, "
                 f"or use another convention",
             )
-        return found
+        return ids
 
     @cached_property
     def _lookups(self) -> dict[str, NDArray[np.uint8]]:
@@ -242,9 +242,16 @@ def own_convention(table: ClassTable, *, free: int = 0) -> Convention:
     mean over all classes, including free.
     """
     return Convention(
-        "own", f"the data's own classes ({table.name})", table, free, tuple(sorted(table.names)), {table.name: _identity(table)},
-        table, table, notes="Scores of other data sets cannot be compared with this one.",
-    )  # fmt: skip
+        "own",
+        f"the data's own classes ({table.name})",
+        table,
+        free,
+        tuple(sorted(table.names)),
+        {table.name: _identity(table)},
+        table,
+        table,
+        notes="Scores of other data sets cannot be compared with this one.",
+    )
 
 
 def _identity(table: ClassTable) -> dict[int, int]:

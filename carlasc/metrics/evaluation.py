@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from copy import copy
 from functools import cache, partial
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from carlasc.errors import ArgumentError, CarlascError, FormatError, MissingData
 from carlasc.metrics.actor_scores import ActorScores
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.conventions import CONVENTIONS, Convention, convention_named, own_convention
-from carlasc.metrics.grids import SequenceGrid
+from carlasc.metrics.grids import SeenBy, SequenceGrid
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.rays import RayIoU, ray_origins
 from carlasc.metrics.regions import (
@@ -38,7 +37,7 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 
 _FrameBatch = tuple[Pair, list[int]]  # frames of one pair that a worker scores in one task
-_Known = Callable[[Literal["lidar", "camera"]], NDArray[np.bool_] | None]
+_Known = Callable[[SeenBy], NDArray[np.bool_] | None]
 # Labels of prediction and ground truth, and `known` of the ground truth, which is read once for all
 # conventions.
 LabelPair = tuple[NDArray[np.unsignedinteger], NDArray[np.unsignedinteger], _Known]
@@ -123,10 +122,19 @@ class Scorer:
             return self.impossible
         summed = sum(self.matrices.values(), self._matrix())
         return Evaluation(
-            name, self.convention, summed, self.matrices, len(self.frames), self.scoring.voxels, self.failures, tuple(self.frames), notes,
-            self.breakdown.compute(), None if self.rays is None else self.rays.compute(),
+            name,
+            self.convention,
+            summed,
+            self.matrices,
+            len(self.frames),
+            self.scoring.voxels,
+            self.failures,
+            tuple(self.frames),
+            notes,
+            self.breakdown.compute(),
+            None if self.rays is None else self.rays.compute(),
             None if self.actors is None else self.actors.compute(),
-        )  # fmt: skip
+        )
 
     def _matrix(self) -> ConfusionMatrix:
         return ConfusionMatrix(self.convention.num_classes, free=self.convention.free)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.conventions import Convention
 from carlasc.metrics.evaluation import score_pairs
-from carlasc.metrics.grids import GridFrames, SequenceGrid
+from carlasc.metrics.grids import GridFrames, SeenBy, SequenceGrid
 from carlasc.metrics.pairs import Pair, Place, pair_grids
 from carlasc.metrics.results import Evaluation
 from carlasc.metrics.scoring import Scoring
@@ -47,12 +46,8 @@ class FutureGrid(GridFrames):
                 missing.
         """
         self.grid, self.around = grid, around
-        self.path, self.location, self.spec, self.classes = (
-            grid.path,
-            grid.location,
-            grid.spec,
-            grid.classes,
-        )
+        self.path, self.location = grid.path, grid.location
+        self.spec, self.classes = grid.spec, grid.classes
         numbers, sequence = grid.frames(), grid.sequence
         times = sequence.times_of(numbers)
         wanted = times + horizon_s
@@ -68,10 +63,11 @@ class FutureGrid(GridFrames):
             )
         if around == "present" and layout.POSES not in sequence.documents():
             raise MissingDataError(
-                sequence.location, expected=f"{layout.POSES}, which moves later frames to the "
-                                            f"present", found="none",
+                sequence.location,
+                expected=f"{layout.POSES}, which moves later frames to the present",
+                found="none",
                 advice="for grids around the sensor pose of the later frame, use `around=future`",
-            )  # fmt: skip
+            )
 
     def frames(self) -> NDArray[np.int64]:
         """Return the sorted frames that have a later frame."""
@@ -81,9 +77,7 @@ class FutureGrid(GridFrames):
         """Return (X, Y, Z) the labels of the later frame."""
         return self._later(frame).labels
 
-    def known(
-        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
-    ) -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
         """Return (X, Y, Z) bool, the known voxels of the later frame; None for cameras, because
         their mask cannot be moved.
         """
@@ -167,12 +161,12 @@ def _horizons(source: Place, grid: str | None) -> dict[float, str]:
         MissingDataError: no forecast grid exists.
         ArgumentError: several forecast grids have the same horizon.
     """
-    opened, found = as_source(source), dict[float, str]()
+    opened, tokens = as_source(source), dict[float, str]()
     names = sorted({name for sequence in opened.sequences().values() for name in sequence.grids})
     for match in filter(None, map(_NAMED.fullmatch, names)):
         if (
             match[1] == (grid or match[1])
-            and (other := found.setdefault(float(match[2]), match[0])) != match[0]
+            and (other := tokens.setdefault(float(match[2]), match[0])) != match[0]
         ):
             both = f"{other} and {match[0]}"
             raise ArgumentError(
@@ -181,12 +175,12 @@ def _horizons(source: Place, grid: str | None) -> dict[float, str]:
                 found=both,
                 advice="choose a name with `grid`",
             )
-    if not found:
+    if not tokens:
         expected = f"grids of forecasts such as {grid or 'forecast'}_1s"
         raise MissingDataError(
             opened.location, expected=expected, found=", ".join(names) or "no grid"
         )
-    return dict(sorted(found.items()))
+    return dict(sorted(tokens.items()))
 
 
 def _future(truth: GridFrames, horizon_s: float, around: Around) -> FutureGrid:

@@ -24,6 +24,9 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import Sequence, layout
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, check_size, open_npz
 
+SeenBy = Literal["lidar", "camera"]
+"""Whose mask of observed voxels is taken, for data that have both."""
+
 _BITS = 8  # voxels per byte of an .invalid file
 
 
@@ -54,9 +57,7 @@ class GridFrames(ABC):
         """Return the labels of a frame: (X, Y, Z), or (X * Y * Z,) if the geometry is not known."""
 
     @abstractmethod
-    def known(
-        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
-    ) -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
         """Return the known voxels of a frame (counts > 0, or not invalid), bool; None if the data
         do not have this information.
 
@@ -89,9 +90,7 @@ class SequenceGrid(GridFrames):
         """Return (X, Y, Z) labels."""
         return self.sequence.read(f"{self.grid}/labels", frame)
 
-    def known(
-        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
-    ) -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
         """Return (X, Y, Z) bool, the voxels with votes, or those that a camera also sees; None if
         the grid has no such fields.
         """
@@ -185,9 +184,7 @@ class LabelFolder(GridFrames):
         # with the size of the file, because devices have no size
         return np.fromfile(path, types[width], int(size // width))
 
-    def known(
-        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
-    ) -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
         """Return (X * Y * Z,) bool, the voxels that have votes or are not invalid; None if no such
         file exists.
 
@@ -199,20 +196,20 @@ class LabelFolder(GridFrames):
         if (counts := self._counts(frame)) is not None:
             return np.fromfile(counts, "<f4") > 0
         if (invalid := self._file(frame, ".invalid")).is_file():
-            found = np.fromfile(invalid, np.uint8)
-            if self.voxels is not None and found.size not in (
+            mask = np.fromfile(invalid, np.uint8)
+            if self.voxels is not None and mask.size not in (
                 self.voxels,
                 -(-self.voxels // _BITS),
             ):
                 raise FormatError(
                     invalid,
                     expected=f"{self.voxels} bytes, or {-(-self.voxels // _BITS)} of packed bits",
-                    found=str(found.size),
+                    found=str(mask.size),
                     advice="the file may be truncated, or of another grid",
                 )
-            return (
-                found if found.size == self.voxels else np.unpackbits(found, count=self.voxels)
-            ) == 0
+            if mask.size != self.voxels:
+                mask = np.unpackbits(mask, count=self.voxels)
+            return mask == 0
         return None
 
     def _file(self, frame: int, suffix: str) -> Path:
@@ -250,23 +247,10 @@ def compare_grids(prediction: Grid, truth: Grid) -> NDArray[np.uint8]:
     """
     check_same_geometry(prediction.spec, truth.spec)
     predicted, occupied = prediction.labels > 0, truth.labels > 0
-    outcomes = np.select(
-        [
-            ~truth.known,
-            occupied & (prediction.labels == truth.labels),
-            occupied & predicted,
-            occupied,
-            predicted,
-        ],
-        [
-            VoxelOutcome.NOT_COMPARED,
-            VoxelOutcome.RIGHT,
-            VoxelOutcome.WRONG,
-            VoxelOutcome.MISSED,
-            VoxelOutcome.INVENTED,
-        ],
-        default=VoxelOutcome.NOT_COMPARED,
-    )
+    right = occupied & (prediction.labels == truth.labels)
+    # the first condition that holds decides
+    conditions = [~truth.known, right, occupied & predicted, occupied, predicted]
+    outcomes = np.select(conditions, list(VoxelOutcome), VoxelOutcome.NOT_COMPARED)
     return outcomes.astype(np.uint8)
 
 
@@ -315,7 +299,7 @@ class CarlaOccGrids(GridFrames):
         """Return (X, Y, Z) tags."""
         return self._read(frame)[0]
 
-    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> NDArray[np.bool_]:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_]:
         """Return (X, Y, Z) bool, the voxels that have a class or are free.
 
         Occupied voxels without a class are unknown.
@@ -336,18 +320,15 @@ def find_carlaocc(folder: Path, grid: str | None) -> list[CarlaOccGrids]:
 
     With None, the first existing name of `CARLAOCC_GRIDS` is used.
     """
-    found = []
+    grids = []
     for sequence in (folder, *sorted(path for path in folder.glob("*") if path.is_dir())):
         existing = sorted(
             path.name for path in (sequence / "occupancy").glob("*") if any(path.glob("[0-9]*.npz"))
         )
-        names = [
-            name
-            for name in (*CARLAOCC_GRIDS, *existing)
-            if name in existing and grid in (None, name)
-        ]
-        found += [CarlaOccGrids(sequence, name) for name in names[:1]]
-    return found
+        usual = next((name for name in (*CARLAOCC_GRIDS, *existing) if name in existing), None)
+        if existing and (grid or usual) in existing:
+            grids.append(CarlaOccGrids(sequence, str(grid or usual)))
+    return grids
 
 
 def sequence_name(folder: Path) -> str:

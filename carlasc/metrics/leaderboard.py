@@ -53,25 +53,16 @@ class ScoreTable:
         rayed = any(result.get("rayiou") is not None for result in self.results)
         mixed = len({result["convention"] for result in self.results}) > 1
         names = self.class_names if classes else []
-        header = (
-            "Network",
-            *(["Convention"] if mixed else []),
-            *names,
-            *_FIGURES.values(),
-            *(["RayIoU"] if rayed else []),
-        )
+        header = ["Network", *["Convention"] * mixed, *names, *_FIGURES.values()]
+        header += ["RayIoU"] * rayed
         rows: list[tuple[Cell, ...]] = []
         for result in self.results:
-            values = [result["class_iou"].get(name) for name in names] + [
-                result[figure] for figure in _FIGURES
-            ]
-            values += [result.get("rayiou")] if rayed else []
+            values = [result["class_iou"].get(name) for name in names]
+            values += [result[figure] for figure in _FIGURES] + [result.get("rayiou")] * rayed
             cells = [math.nan if value is None else 100 * value for value in values]
-            rows.append(
-                (str(result["name"]), *([str(result["convention"])] if mixed else []), *cells)
-            )
+            rows.append((str(result["name"]), *[str(result["convention"])] * mixed, *cells))
         return FigureTable(
-            f"Scores by the convention {self.convention} (percent)", header, tuple(rows)
+            f"Scores by the convention {self.convention} (percent)", tuple(header), tuple(rows)
         )
 
     def to_markdown(self) -> str:
@@ -93,16 +84,11 @@ class ScoreTable:
         """
         table = self.table()
         rows = (dict(zip(table.header, row, strict=True)) for row in table.rows)
-        return data_frame(
-            (
-                {
-                    name: cell / 100 if isinstance(cell, float) else cell
-                    for name, cell in row.items()
-                }
-                for row in rows
-            ),
-            table.header[0],
+        fractions = (
+            {name: cell / 100 if isinstance(cell, float) else cell for name, cell in row.items()}
+            for row in rows
         )
+        return data_frame(fractions, table.header[0])
 
     def to_latex(self) -> str:
         """Return a LaTeX `tabular`."""
@@ -134,7 +120,8 @@ class ScoreTable:
                 f"<title>{html.escape(text)}</title></rect>"
             )
         width = len(self.class_names) * _BAR
-        return f'<svg width="{width}" height="{_HEIGHT}" role="img" aria-label="IoU of each class">{bars}</svg>'
+        size = f'width="{width}" height="{_HEIGHT}"'
+        return f'<svg {size} role="img" aria-label="IoU of each class">{bars}</svg>'
 
 
 def scores(files: Iterable[str | os.PathLike[str]], *, mixed: bool = False) -> ScoreTable:
@@ -203,8 +190,10 @@ def _read(file: Path) -> dict[str, Any]:
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
 body {{ font: 14px/1.4 sans-serif; margin: 2em; color: #222; background: #fff }}
-table {{ border-collapse: collapse }} th, td {{ padding: .35em .8em; border-bottom: 1px solid #ddd; text-align: right }}
-th:first-child, td:first-child {{ text-align: left }} rect {{ fill: #3566a8 }} caption {{ text-align: left; padding: .5em 0 }}
+table {{ border-collapse: collapse }}
+th, td {{ padding: .35em .8em; border-bottom: 1px solid #ddd; text-align: right }}
+th:first-child, td:first-child {{ text-align: left }} rect {{ fill: #3566a8 }}
+caption {{ text-align: left; padding: .5em 0 }}
 </style></head><body><table><caption>{title}</caption><thead><tr>{header}</tr></thead><tbody>
 {rows}</tbody></table></body></html>
 """

@@ -22,7 +22,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import SEMANTICKITTI
 from carlasc.errors import FormatError, MissingDataError, first_names
-from carlasc.metrics.grids import GridFrames, LabelFolder, SequenceGrid, find_carlaocc
+from carlasc.metrics.grids import GridFrames, LabelFolder, SeenBy, SequenceGrid, find_carlaocc
 from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
 from carlasc.storage.layout import identity_of
@@ -32,13 +32,8 @@ Place = str | os.PathLike[str] | Source
 OCC3D_SPEC = GridSpec("cartesian", (200, 200, 16), (-40.0, -40.0, -1.0), (40.0, 40.0, 5.4))
 OPENOCCUPANCY_SPEC = GridSpec("cartesian", (512, 512, 40), (-51.2, -51.2, -5.0), (51.2, 51.2, 3.0))
 KITTI_SPEC = GridSpec("cartesian", (256, 256, 32), (0.0, -25.6, -2.0), (51.2, 25.6, 4.4))
-_LABELS = (
-    "semantics",
-    "pred",
-    "occ_pred",
-    # possible names of the array of classes in an .npz: the name of the benchmark, and other common
-    # names
-)
+# possible names of the array of classes in an .npz: that of the benchmark, and other common ones
+_LABELS = ("semantics", "pred", "occ_pred")
 _NOISE = 255
 
 
@@ -90,9 +85,7 @@ class Occ3dScene(TokenFrames):
             raise FormatError(file, expected=f"class ids 0..{_NOISE}", found=found)
         return labels.astype(np.uint8, copy=False)
 
-    def known(
-        self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar"
-    ) -> NDArray[np.bool_] | None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> NDArray[np.bool_] | None:
         """Return (200, 200, 16) bool, the voxels that the LiDAR or a camera observed; None if the
         file does not contain the mask.
         """
@@ -137,7 +130,7 @@ class OpenOccupancyScene(TokenFrames):
         labels[x, y, z] = np.where(classes == 0, _NOISE, classes)
         return labels
 
-    def known(self, frame: int, seen_by: Literal["lidar", "camera"] = "lidar") -> None:
+    def known(self, frame: int, seen_by: SeenBy = "lidar") -> None:
         """Return None, because the benchmark has no masks of observed voxels."""
         return None
 
@@ -183,12 +176,12 @@ def foreign_grids(
     )
     for pattern, benchmark in (("sequences/*", "semantickitti"), ("data_2d_raw/*", "sscbench")):
         for sequence in sorted(folder.glob(pattern)):
-            found = (
+            folders = (
                 KittiFolder(sequence / name, sequence.name, benchmark)
                 for name in names
                 if (sequence / name).is_dir()
             )
-            yield from islice((grids for grids in found if len(grids.frames())), 1)
+            yield from islice((grids for grids in folders if len(grids.frames())), 1)
 
 
 @dataclass(frozen=True)
@@ -237,15 +230,18 @@ def pair_grids(
             isinstance(pair.prediction, KittiFolder)
             and pair.prediction.location == pair.truth.location
         ):
-            expected, found = (
-                "predictions in another folder than the ground truth",
-                "the ground truth itself",
+            raise MissingDataError(
+                pair.truth.location,
+                expected="predictions in another folder than the ground truth",
+                found="the ground truth itself",
             )
-            raise MissingDataError(pair.truth.location, expected=expected, found=found)
         pair.prediction.follow(pair.truth)
     left = sorted(set(truths) - {pair.truth.path for pair in pairs})
-    note = f"{len(left)} of {len(truths)} sequences of the ground truth have no prediction and were not scored: {', '.join(left[:3])}"
-    return pairs, (note + (", ..." if len(left) > 3 else ""),) if left else ()
+    if not left:
+        return pairs, ()
+    names = ", ".join(left[:3]) + (", ..." if len(left) > 3 else "")
+    missing = f"{len(left)} of {len(truths)} sequences of the ground truth have no prediction"
+    return pairs, (f"{missing} and were not scored: {names}",)
 
 
 def _truth_of(prediction: GridFrames, truths: Mapping[str, GridFrames]) -> GridFrames:
@@ -293,12 +289,12 @@ def open_grids(
             yield from foreign
             return
     source = as_source(place)
-    found = False
+    names = []
     for sequence in source.sequences().values():
         if name := _choose_grid(sequence, grid):
-            found = True
+            names.append(name)
             yield SequenceGrid(sequence, name)
-    if not found:
+    if not names:
         raise MissingDataError(
             source.location,
             expected=f"a grid {grid or 'with labels'} in at least one sequence",

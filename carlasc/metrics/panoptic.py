@@ -124,12 +124,8 @@ class PanopticQuality(Summed):
                 expected=f"class ids below {num_classes} other than free",
                 found=str(sorted(things)),
             )
-        self.num_classes, self.things, self.free, self.variant = (
-            num_classes,
-            frozenset(things),
-            free,
-            variant,
-        )
+        self.num_classes, self.things = num_classes, frozenset(things)
+        self.free, self.variant = free, variant
         self.reset()
 
     def reset(self) -> None:
@@ -196,15 +192,13 @@ class PanopticQuality(Summed):
             missed = size >= fewest
             missed[matched] = False
             self.counts[row] += np.bincount(classes[missed], minlength=k)
-        self.elements[0] += np.bincount(segments.true_class[true], common, minlength=k).astype(
-            np.int64
+        counted = (
+            (segments.true_class[true], common),
+            (segments.pred_class, segments.pred_size),
+            (segments.true_class, segments.true_size),
         )
-        self.elements[1] += np.bincount(
-            segments.pred_class, segments.pred_size, minlength=k
-        ).astype(np.int64)
-        self.elements[2] += np.bincount(
-            segments.true_class, segments.true_size, minlength=k
-        ).astype(np.int64)
+        for row, (classes, elements) in enumerate(counted):
+            self.elements[row] += np.bincount(classes, elements, minlength=k).astype(np.int64)
 
     def compute(self) -> PanopticScore:
         """Return the score of all added frames."""
@@ -262,7 +256,9 @@ def match_segments(
 
 
 @cached(error_model="python")
-def _match(pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, free):  # type: ignore[no-untyped-def]
+def _match(  # type: ignore[no-untyped-def]
+    pred_class, pred_ids, true_class, true_ids, is_thing, may_overlap, free
+):
     """Number the segments of both sides in order of occurrence, and count elements and overlaps, in
     one pass.
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.actor_scores import ActorScore
-from carlasc.metrics.confusion import ConfusionMatrix
+from carlasc.metrics.confusion import ConfusionMatrix, json_number
 from carlasc.metrics.conventions import Convention, ConventionScore
 from carlasc.metrics.rays import RayScore
 
@@ -189,17 +189,10 @@ class Evaluation:
         tables = semantic_table([self]), geometric_table([self]), *self._actor_tables()
         if not self.breakdown:
             return tables
-        rows: list[tuple[Cell, ...]] = []
-        for name, matrix in self.breakdown.items():
-            score = self.convention.score(matrix)
-            rows.append(
-                (
-                    name,
-                    *_percent(
-                        score.miou, score.precision, score.recall, score.iou, score.false_free
-                    ),
-                )
-            )
+        rows: list[tuple[Cell, ...]] = [
+            (name, *_percent(*_figures_of(self.convention.score(matrix)).values()))
+            for name, matrix in self.breakdown.items()
+        ]
         header = ("Region", "mIoU", "Precision", "Recall", "IoU", "False free")
         return (*tables, FigureTable("By region", header, tuple(rows)))
 
@@ -208,12 +201,12 @@ class Evaluation:
         if self.actors is None:
             return ()
         score, names = self.actors.panoptic, self.classes.names
-        found = [label for label in sorted(names) if not math.isnan(score.pq[label])]
+        present = [label for label in sorted(names) if not math.isnan(score.pq[label])]
         lstq = (self.actors.tracking.lstq, self.actors.tracking.association)
-        row = _percent(*score.pq[found].tolist(), score.mean(), score.mean(which="things"), *lstq)
+        row = _percent(*score.pq[present].tolist(), score.mean(), score.mean(which="things"), *lstq)
         header = (
             "Network",
-            *(names[label] for label in found),
+            *(names[label] for label in present),
             "PQ",
             "PQ of things",
             "LSTQ",
@@ -229,39 +222,20 @@ class Evaluation:
 
     def to_csv(self) -> str:
         """Return the scores of each frame as CSV."""
-        rows = [
-            [
-                "sequence",
-                "frame",
-                "miou",
-                "iou",
-                "precision",
-                "recall",
-                "false_free",
-                *self.class_iou,
-            ]
-        ]
+        names = ["miou", "iou", "precision", "recall", "false_free"]
+        rows = [["sequence", "frame", *names, *self.class_iou]]
         for frame in self.frame_scores:
-            score = frame.score
-            figures = [score.miou, score.iou, score.precision, score.recall, score.false_free]
-            cells = [
-                "" if math.isnan(v) else f"{v:.6f}" for v in (*figures, *score.class_iou.values())
-            ]
+            figures = _figures_of(frame.score)
+            values = [*(figures[name] for name in names), *frame.score.class_iou.values()]
+            cells = ["" if math.isnan(value) else f"{value:.6f}" for value in values]
             rows.append([frame.sequence, frame.frame, *cells])
         return _csv(rows)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all scores by name, as fractions, for JSON; None for undefined scores."""
-        score, interval = self.score, self.interval()
-        figures = {
-            "miou": score.miou,
-            "miou_without_free": self.miou_without_free,
-            "accuracy": self.matrix.accuracy,
-            "precision": score.precision,
-            "recall": score.recall,
-            "iou": score.iou,
-            "false_free": score.false_free,
-        }
+        interval = self.interval()
+        means = {"miou": self.miou, "miou_without_free": self.miou_without_free}
+        figures = means | {"accuracy": self.matrix.accuracy} | _figures_of(self.score)
         return {
             "name": self.name,
             "convention": self.convention.name,
@@ -269,19 +243,16 @@ class Evaluation:
             "frames": self.frames,
             "voxels": self.voxels,
             "scored_voxels": self.matrix.total,
-            **{name: _number(value) for name, value in figures.items()},
+            **{name: json_number(value) for name, value in figures.items()},
             "miou_interval": None if interval is None else [interval.low, interval.high],
-            "class_iou": {name: _number(value) for name, value in self.class_iou.items()},
-            "rayiou": None if self.rays is None else _number(self.rays.rayiou),
+            "class_iou": {name: json_number(value) for name, value in self.class_iou.items()},
+            "rayiou": None if self.rays is None else json_number(self.rays.rayiou),
             "actors": None if self.actors is None else self.actors.to_dict(self.classes),
             "breakdown": {
-                name: {
-                    "miou": _number(part.miou),
-                    "iou": _number(part.iou),
-                    "false_free": _number(part.false_free),
-                }
+                name: {key: json_number(part[key]) for key in ("miou", "iou", "false_free")}
                 for name, part in (
-                    (name, self.convention.score(matrix)) for name, matrix in self.breakdown.items()
+                    (name, _figures_of(self.convention.score(matrix)))
+                    for name, matrix in self.breakdown.items()
                 )
             },
             "confusion": self.matrix.counts.tolist(),
@@ -306,16 +277,17 @@ def semantic_table(evaluations: Sequence[Evaluation]) -> FigureTable:
     first = evaluations[0].convention
     with_free = first.free in first.averaged
     rayed = any(e.rays is not None for e in evaluations)
-    header = (
-        "Network", *evaluations[0].class_iou, "mIoU", *(["mIoU w/o free"] if with_free else []), "Accuracy", *(["RayIoU"] if rayed else []),
-    )  # fmt: skip
+    header = ["Network", *evaluations[0].class_iou, "mIoU"]
+    header += ["mIoU w/o free"] * with_free + ["Accuracy"] + ["RayIoU"] * rayed
     rows: list[tuple[Cell, ...]] = []
     for e in evaluations:
-        means = [e.miou, *([e.miou_without_free] if with_free else []), e.matrix.accuracy]
-        means += [math.nan if e.rays is None else e.rays.rayiou] if rayed else []
+        means = [e.miou, *[e.miou_without_free] * with_free, e.matrix.accuracy]
+        means += [math.nan if e.rays is None else e.rays.rayiou] * rayed
         rows.append((e.name, *_percent(*e.class_iou.values(), *means)))
     return FigureTable(
-        f"Semantic scene completion, IoU of each class, by {first.title}", header, tuple(rows)
+        f"Semantic scene completion, IoU of each class, by {first.title}",
+        tuple(header),
+        tuple(rows),
     )
 
 
@@ -323,24 +295,24 @@ def geometric_table(evaluations: Sequence[Evaluation]) -> FigureTable:
     """Return the table of completeness: precision, recall and IoU of occupied against free space,
     with one row per evaluation.
     """
-    rows: list[tuple[Cell, ...]] = []
-    for evaluation in evaluations:
-        score = evaluation.score
-        rows.append(
-            (evaluation.name, *_percent(score.precision, score.recall, score.iou, score.false_free))
-        )
+    rows: list[tuple[Cell, ...]] = [
+        (evaluation.name, *_percent(*list(_figures_of(evaluation.score).values())[1:]))
+        for evaluation in evaluations
+    ]
     header = ("Network", "Precision", "Recall", "IoU", "False free")
     return FigureTable(
         "Scene completion: all classes other than free count as one", header, tuple(rows)
     )
 
 
+def _figures_of(score: ConventionScore) -> dict[str, float]:
+    """Return the means of a score by name, mIoU first."""
+    names = "miou", "precision", "recall", "iou", "false_free"
+    return {name: getattr(score, name) for name in names}
+
+
 def _percent(*values: float) -> tuple[float, ...]:
     return tuple(100 * value for value in values)
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else float(value)
 
 
 @dataclass(frozen=True)
@@ -398,7 +370,7 @@ def bootstrap(
     Raises:
         ArgumentError: fewer than five sequences are given.
     """
-    _check_number(len(matrices))
+    _checkjson_number(len(matrices))
     counts = np.stack([matrix.counts for matrix in matrices])
     draws = np.random.default_rng(_SEED).integers(0, len(counts), (_DRAWS, len(counts)))
     values = [score(_matrix(counts[draw].sum(axis=0), matrices[0])) for draw in draws]
@@ -434,14 +406,14 @@ def compare(
         raise MissingDataError(
             "second", expected="sequences of the first", found=", ".join(sorted(second)) or "none"
         )
-    _check_number(len(common))
+    _checkjson_number(len(common))
     like = first[common[0]]
     a, b = (np.stack([side[path].counts for path in common]) for side in (first, second))
 
     def difference(one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
         return score(_matrix(one, like)) - score(_matrix(other, like))
 
-    found = difference(a.sum(axis=0), b.sum(axis=0))
+    observed = difference(a.sum(axis=0), b.sum(axis=0))
     rng = np.random.default_rng(_SEED)
     draws = rng.integers(0, len(common), (_DRAWS, len(common)))
     spread = [difference(a[draw].sum(axis=0), b[draw].sum(axis=0)) for draw in draws]
@@ -457,11 +429,11 @@ def compare(
         )
         for s in swaps
     ]
-    p_value = float(np.mean(np.abs(swapped) >= abs(found) - 1e-12))
-    return Comparison(_interval(found, spread, level), p_value, common)
+    p_value = float(np.mean(np.abs(swapped) >= abs(observed) - 1e-12))
+    return Comparison(_interval(observed, spread, level), p_value, common)
 
 
-def _check_number(sequences: int) -> None:
+def _checkjson_number(sequences: int) -> None:
     if sequences < _FEWEST_SEQUENCES:
         raise ArgumentError(
             "sequences",

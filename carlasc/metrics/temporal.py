@@ -266,5 +266,5 @@ class TrackingQuality(Summed):
 
 
 def _counts(numbers: NDArray[np.int64]) -> list[tuple[int, int]]:
-    found, sizes = np.unique(numbers, return_counts=True)
-    return list(zip(found.tolist(), sizes.tolist(), strict=True))
+    values, sizes = np.unique(numbers, return_counts=True)
+    return list(zip(values.tolist(), sizes.tolist(), strict=True))

@@ -15,7 +15,7 @@ from carlasc.core.geometry import Transform, invert, slerp
 from carlasc.errors import FormatError, MissingDataError, import_extra
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json, to_json
-from carlasc.storage.metadata import Axes, check_format
+from carlasc.storage.metadata import Axes
 from carlasc.storage.protocol import Sequence
 
 _FORMAT = 1
@@ -54,7 +54,7 @@ def cameras_from_json(data: bytes, where: str, axes: Axes) -> dict[str, CameraMo
             does not fit the axes of the scans.
     """
     values = parse_json(data, where)
-    check_format(values.get("format", 1), where)
+    layout.check_format(values.get("format", 1), where)
     listed = values.get("cameras")
     if not isinstance(listed, list):
         raise FormatError(where, expected="a list of cameras", found=type(listed).__name__)

@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from carlasc.errors import ArgumentError, FormatError, StorageError, describe
+from carlasc.errors import ArgumentError, ConflictError, FormatError, StorageError, describe
 
 Content = bytes | memoryview | Callable[[BinaryIO], object]
 
@@ -149,6 +149,27 @@ def write_output(path: Path, content: Content) -> None:
     """
     _remove_ended(path.parent.glob(f".{glob.escape(path.name)}.*{_PART}"))
     write_atomic(path, content)
+
+
+def check_target(out: Path, endings: tuple[str, ...], overwrite: bool) -> None:
+    """Check that a file can be written: its ending, and that its path is free.
+
+    Raises:
+        ArgumentError: another ending, or a folder.
+        ConflictError: the file exists, and `overwrite` is not given.
+    """
+    if out.suffix.lower() not in endings:
+        raise ArgumentError(
+            "out", expected=f"a file name that ends in {' or '.join(endings)}", found=str(out)
+        )
+    if out.is_dir():
+        raise ArgumentError("out", expected="a file name", found=f"the folder {out}")
+    if out.exists() and not overwrite:
+        raise ConflictError(
+            out,
+            problem="the file exists",
+            advice="choose another name, or replace it with `overwrite=True`",
+        )
 
 
 def remove_stale(folder: Path, *, deep: bool = False) -> None:

@@ -31,6 +31,11 @@ EVALUATION = "evaluation"  # the folder of the published grid
 POSES = "poses.txt"
 TIMES = "times.txt"
 METADATA = "carlasc.json"
+FORMAT = 2
+"""Version of carlasc.json.
+
+Version 1 had no key `format`, and `frame` ("carlasc" or "kitti") where version 2 has `axes`.
+"""
 CAMERAS = "cameras.json"
 PARAMS = "params.json"
 REPORT = "carlasc-report.json"
@@ -334,3 +339,20 @@ def _decode_lines(data: bytes, columns: int, where: str) -> NDArray[np.float64]:
                 where, expected=f"{columns} numbers per line", found=f"{len(row)} in line {number}"
             )
     return np.array(rows, np.float64).reshape(-1, columns)
+
+
+def check_format(version: object, where: str) -> None:
+    """Check that this version of carlasc reads files of a version of the format.
+
+    Raises:
+        FormatError: it is not a version, or is a newer one.
+    """
+    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
+        raise FormatError(where, expected="an integer above 0 in format", found=repr(version))
+    if version > FORMAT:
+        raise FormatError(
+            where,
+            expected=f"format {FORMAT} or older",
+            found=f"format {version}",
+            advice="upgrade carlasc to read it",
+        )

@@ -14,12 +14,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, table_from_json, table_to_json
 from carlasc.errors import FormatError
 from carlasc.storage.files import parse_json, to_json
-
-FORMAT = 2
-"""Version of carlasc.json.
-
-Version 1 had no key `format`, and `frame` ("carlasc" or "kitti") where version 2 has `axes`.
-"""
+from carlasc.storage.layout import FORMAT, check_format
 
 PREDICTED = "predicted by "
 """Prefix of the key `labels` of carlasc.json for predicted labels; the name of the network follows.
@@ -112,23 +107,6 @@ class Metadata:
         values |= {"source": self.source}
         return to_json(
             {key: value for key, value in values.items() if value is not None} | dict(self.extra)
-        )
-
-
-def check_format(version: object, where: str) -> None:
-    """Check that this version of carlasc reads files of a version of the format.
-
-    Raises:
-        FormatError: it is not a version, or is a newer one.
-    """
-    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
-        raise FormatError(where, expected="an integer above 0 in format", found=repr(version))
-    if version > FORMAT:
-        raise FormatError(
-            where,
-            expected=f"format {FORMAT} or older",
-            found=f"format {version}",
-            advice="upgrade carlasc to read it",
         )
 
 

@@ -30,7 +30,7 @@ from carlasc.core.tables import table_from_json
 from carlasc.errors import FormatError, MissingDataError, MissingKeyError, first_names
 from carlasc.storage import layout
 from carlasc.storage.files import parse_json
-from carlasc.storage.metadata import Metadata, check_format
+from carlasc.storage.metadata import Metadata
 
 
 class FileTree(Protocol):
@@ -213,7 +213,7 @@ class Sequence(ABC):
         record = self.params(grid).get("carlasc")
         if not isinstance(record, dict):
             return {}
-        check_format(
+        layout.check_format(
             record.get("format", 1), f"{self.location}/{layout.params_file(grid)}: carlasc"
         )
         return record

@@ -21,6 +21,6 @@ from .scene import FrameContent as FrameContent
 from .scene import GridPanel as GridPanel
 from .scene import Scene as Scene
 from .scene import SceneReader as SceneReader
-from .targets import ViewResult as ViewResult
+from .viewer import ViewResult as ViewResult
 from .viewer import view as view
 from .window import Window as Window

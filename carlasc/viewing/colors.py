@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.choices import PaletteName as PaletteName  # noqa: PLC0414 (part of this module)
 from carlasc.core.classes import ClassTable, Color
+from carlasc.core.scans import Scan
 from carlasc.core.tables import CARLA, CARLASC11, REMAPS, SEMANTICKITTI, SEMANTICKITTI19
 from carlasc.errors import check_choice
 from carlasc.metrics.grids import VoxelOutcome
@@ -129,6 +130,12 @@ class ClassColors:
         return (
             colorblind_palette(self.table) if self.palette == "colorblind" else self.table.palette
         )
+
+    def of_points(self, scan: Scan) -> NDArray[np.uint8]:
+        """Return (N, 3) uint8 RGB of the points of a scan by class: grey without one."""
+        colors = self.by_id.copy()
+        colors[0] = UNLABELLED
+        return colors[np.zeros(len(scan), np.int64) if scan.labels is None else scan.labels]
 
     def tell_shapes(self, ids: NDArray[np.int64]) -> bool:
         """Whether the colours of the (K,) ids that occur are useful.

@@ -85,14 +85,14 @@ def photos_of(sequence: Sequence, frame: int, mirrored: bool) -> tuple[Photo, ..
     Raises:
         FormatError: the calibration is damaged.
     """
-    found, mirror = [], np.diag([1.0, -1.0 if mirrored else 1.0, 1.0, 1.0])
+    photos, mirror = [], np.diag([1.0, -1.0 if mirrored else 1.0, 1.0, 1.0])
     for camera in cameras_of(sequence).values():
         place = (
             scan_T_camera(sequence, camera, frame) if has_image(sequence, camera, frame) else None
         )
         if place is not None:
-            found.append(Photo(camera, mirror @ place, image_bytes(sequence, camera, frame)[0]))
-    return tuple(found)
+            photos.append(Photo(camera, mirror @ place, image_bytes(sequence, camera, frame)[0]))
+    return tuple(photos)
 
 
 def encode_photos(photos: tuple[Photo, ...]) -> dict[str, NDArray[Any]]:

@@ -6,9 +6,13 @@ Pictures, pages, recordings and windows take a `Scene` and read it with a `Scene
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,29 +21,23 @@ from carlasc.core.axes import mirror_boxes, mirror_poses, mirror_scan, mirror_sp
 from carlasc.core.boxes import Boxes
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange, Frames
-from carlasc.core.geometry import Transform
+from carlasc.core.geometry import Transform, check_rigid
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
-from carlasc.core.tables import TABLES
-from carlasc.errors import ArgumentError, MissingDataError, check_choice
+from carlasc.core.tables import TABLES, remaps_between, to_table
+from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_choice, first_names
 from carlasc.metrics.grids import check_same_geometry, compare_grids
+from carlasc.storage import Sequence, Source, as_source, layout
 from carlasc.storage.field_files import check_velocity
+from carlasc.storage.folder import FolderSequence
 from carlasc.storage.metadata import Axes
 from carlasc.viewing.colors import ACTORS, ERRORS, PALETTES, ClassColors, PaletteName, actor_ids
-from carlasc.viewing.finding import (
-    FoundSequence,
-    RemappedSequence,
-    SceneSource,
-    choose_grid,
-    common_table,
-    describe_frames,
-    find_sequence,
-    find_truth,
-    frames_with,
-    list_fields,
-    table_of,
-)
 from carlasc.viewing.photos import Photo, photos_of
+
+SceneSource = str | os.PathLike[str] | Source | Sequence
+"""The source of a scene: anything that `carlasc.open` takes, a grid's folder, the file of one
+frame, a Source or a Sequence.
+"""
 
 CONTENTS = ("grid", "scan", "flow", "truth", "errors")
 """The contents of a frame that a picture can show."""
@@ -104,11 +102,11 @@ class Scene:
             MissingDataError: a sequence, grid or frame does not exist.
             FormatError: the data do not have the format.
         """
-        found = find_sequence(self.source, self.sequence)
-        truth = None if self.truth is None else find_truth(self.truth, found.sequence)
-        contents = self._default_contents(found) if what is None else self._check_contents(what)
-        grid = choose_grid(found, self.grid) if {"grid", "errors"} & set(contents) else ""
-        data = RemappedSequence(found.sequence, grid, stored=table_of(self.source_classes))
+        part = find_sequence(self.source, self.sequence)
+        truth = None if self.truth is None else find_sequence(self.truth, part.sequence)
+        contents = self._default_contents(part) if what is None else self._check_contents(what)
+        grid = choose_grid(part, self.grid) if {"grid", "errors"} & set(contents) else ""
+        data = RemappedSequence(part.sequence, grid, stored=table_of(self.source_classes))
         reference = None
         if truth is not None:
             reference = RemappedSequence(truth.sequence, choose_grid(truth, self.truth_grid))
@@ -117,46 +115,46 @@ class Scene:
         table = common_table(data, reference, table_of(self.classes))
         data = replace(data, shown=table)
         reference = None if reference is None else replace(reference, shown=table)
-        frames = self._choose_frames(found, frames_with(data, reference, contents))
-        notes = () if found.note is None else (found.note,)
+        frames = self._choose_frames(part, frames_with(data, reference, contents))
+        notes = () if part.note is None else (part.note,)
         return SceneReader(data, reference, contents, frames, self.palette, notes)
 
-    def _default_contents(self, found: FoundSequence) -> tuple[str, ...]:
-        has_grid = self.grid is not None or found.grid is not None or self.truth is not None
-        has_grid = has_grid or (bool(found.sequence.grids) and not found.is_scan)
-        if has_grid:
+    def _default_contents(self, part: NamedPart) -> tuple[str, ...]:
+        named = self.grid or part.grid or self.truth is not None
+        if named or (part.sequence.grids and not part.is_scan):
             return ("grid",) if self.truth is None else ("grid", "truth", "errors")
-        if "points" in found.sequence.fields():
+        if "points" in part.sequence.fields():
             return ("scan",)
         raise MissingDataError(
-            found.sequence.location, expected="a grid or points", found=list_fields(found.sequence)
+            part.sequence.location, expected="a grid or points", found=list_fields(part.sequence)
         )
 
     def _check_contents(self, what: str | Iterable[str]) -> tuple[str, ...]:
         contents = tuple(what.split(",") if isinstance(what, str) else what)
-        for name in contents:
-            if name not in CONTENTS:
-                raise ArgumentError(
-                    "what", expected=f"one or more of {', '.join(CONTENTS)}", found=repr(name)
-                )
-            if name in ("truth", "errors") and self.truth is None:
-                raise ArgumentError(
-                    "what", problem=f"{name} needs a ground truth", advice="give it with `truth`"
-                )
-        if not contents:
+        unknown = [name for name in contents if name not in CONTENTS]
+        if unknown or not contents:
             raise ArgumentError(
-                "what", expected=f"one or more of {', '.join(CONTENTS)}", found="nothing"
+                "what",
+                expected=f"one or more of {', '.join(CONTENTS)}",
+                found=repr(unknown[0]) if unknown else "nothing",
+            )
+        compared = [name for name in contents if name in ("truth", "errors")]
+        if compared and self.truth is None:
+            raise ArgumentError(
+                "what",
+                problem=f"{compared[0]} needs a ground truth",
+                advice="give it with `truth`",
             )
         return contents
 
-    def _choose_frames(self, found: FoundSequence, available: NDArray[np.int64]) -> tuple[int, ...]:
+    def _choose_frames(self, part: NamedPart, available: NDArray[np.int64]) -> tuple[int, ...]:
         frames = FrameRange.of(self.frames)
-        if self.frames is None and found.frame is not None:
-            frames = FrameRange(found.frame, found.frame + 1)
+        if self.frames is None and part.frame is not None:
+            frames = FrameRange(part.frame, part.frame + 1)
         chosen = frames.select(available)[:: self.every]
         if not len(chosen):
             raise MissingDataError(
-                found.sequence.location,
+                part.sequence.location,
                 expected=f"frames {frames}",
                 found=describe_frames(available),
                 advice="choose others with `frames`",
@@ -167,6 +165,299 @@ class Scene:
 def as_scene(source: Scene | SceneSource) -> Scene:
     """Return a Scene as it is, and the scene of all frames of anything else."""
     return source if isinstance(source, Scene) else Scene(source)
+
+
+@dataclass(frozen=True, eq=False)
+class NamedPart:
+    """The part of a source that its path names: a sequence, and perhaps its grid or frame.
+
+    Attributes:
+        sequence: the sequence.
+        grid: name of the grid, if the path is a grid's folder or a file in it.
+        frame: frame number, if the path is the file of one frame.
+        is_scan: whether the path is a file of a scan (points, labels, ...).
+        note: the choice among several sequences, or None.
+    """
+
+    sequence: Sequence
+    grid: str | None = None
+    frame: int | None = None
+    is_scan: bool = False
+    note: str | None = None
+
+
+def find_sequence(source: SceneSource, wanted: str | Sequence | None = None) -> NamedPart:
+    """Find a sequence in a source.
+
+    Args:
+        source: see `SceneSource`.
+        wanted: path or name of the sequence in the source; or the sequence of a prediction, whose
+            ground truth is the sequence with its path, with its name, or the only one. None takes
+            the first.
+
+    Raises:
+        MissingDataError: there is no sequence, or none of that name.
+        FormatError: the source cannot be read.
+    """
+    if isinstance(source, Sequence):
+        return NamedPart(source)
+    if (part := _open_part(source)) is not None:
+        return part
+    opened = as_source(source)
+    where, sequences = opened.location, opened.sequences()
+    if not sequences:
+        raise MissingDataError(where, expected="a sequence", found="none")
+    path, first = next(iter(sequences.items()))
+    if wanted is None:
+        note = f"{where}: {len(sequences)} sequences found, showing the first, {path}"
+        return NamedPart(first, note=note if len(sequences) > 1 else None)
+    if isinstance(wanted, Sequence):
+        if len(sequences) == 1:
+            return NamedPart(first)
+        path, name, coordinates = wanted.path, wanted.name, wanted.coordinates
+        expected, advice = f"the sequence {name} ({coordinates})", "give the folder of the sequence"
+    else:
+        path, name, coordinates = wanted, wanted, None
+        expected, advice = f"the sequence {name}", ""
+    same_name = (
+        sequence
+        for sequence in sequences.values()
+        if sequence.name == name and coordinates in (None, sequence.coordinates)
+    )
+    match = sequences.get(path) or next(same_name, None)
+    if match is None:
+        raise MissingDataError(
+            where, expected=expected, found=first_names(sequences), advice=advice
+        )
+    return NamedPart(match)
+
+
+def _open_part(source: str | os.PathLike[str] | Source) -> NamedPart | None:
+    """Open a grid's folder or the file of one frame; None if the source is neither."""
+    if isinstance(source, Source):
+        return None
+    path = Path(source)
+    if path.is_file() and path.suffix in (".label", ".bin"):
+        return _open_file(path.absolute())
+    if (path / layout.PARAMS).is_file():
+        path = path.absolute()
+        return NamedPart(FolderSequence(path.parent), grid=path.name)
+    return None
+
+
+def _open_file(path: Path) -> NamedPart:
+    """Open the sequence that a frame's file belongs to; its folder is that of a grid or of one of a
+    scan's fields.
+    """
+    folder = path.parent
+    frame = layout.frame_of(path.name, path.suffix)
+    is_scan = folder.name in layout.scan_folders()
+    if frame is None or not (is_scan or (folder / layout.PARAMS).is_file()):
+        raise FormatError(
+            path,
+            expected=f"a file named by its frame number (six digits), in a folder of scans or "
+            f"beside {layout.PARAMS}",
+            found="another file",
+            advice=f"the geometry of a grid is in its {layout.PARAMS}",
+        )
+    grid = None if is_scan else folder.name
+    return NamedPart(FolderSequence(folder.parent), grid, frame, is_scan)
+
+
+def table_of(classes: ClassTable | str | None) -> ClassTable | None:
+    """Return a class table, which may be given by its name."""
+    return TABLES[classes] if isinstance(classes, str) else classes
+
+
+def choose_grid(part: NamedPart, name: str | None) -> str:
+    """Return the requested grid, the grid in the path, `evaluation`, or the first grid."""
+    names = list(part.sequence.grids)
+    usual = layout.EVALUATION if layout.EVALUATION in names else next(iter(names), None)
+    wanted = name or part.grid or usual or layout.EVALUATION
+    if wanted not in names:
+        raise MissingDataError(
+            part.sequence.location,
+            expected=f"the grid {wanted}",
+            found=", ".join(names) or "no grid",
+        )
+    return wanted
+
+
+def common_table(
+    data: RemappedSequence, truth: RemappedSequence | None, wanted: ClassTable | None
+) -> ClassTable:
+    """Return the class table for all labels: the requested one, that of the data, or that of the
+    ground truth.
+    """
+    stored = [own.stored_table for own in (data, truth) if own is not None]
+    *candidates, last = stored if wanted is None else [wanted]
+    for target in candidates:
+        with suppress(ArgumentError):  # labels of one of the tables cannot be shown in this one
+            for table in stored:
+                remaps_between(table, target)
+            return target
+    for table in stored:
+        remaps_between(table, last)
+    return last
+
+
+def frames_with(
+    data: RemappedSequence, truth: RemappedSequence | None, contents: tuple[str, ...]
+) -> NDArray[np.int64]:
+    """Return the frames that have all contents."""
+    own = {"scan": ("points",), "flow": ("points", "flow"), "truth": ()}
+    needed = [
+        (data.sequence, name) for c in contents for name in own.get(c, (f"{data.grid}/labels",))
+    ]
+    if truth is not None and {"truth", "errors"} & set(contents):
+        needed.append((truth.sequence, f"{truth.grid}/labels"))
+    frames: NDArray[np.int64] | None = None
+    for sequence, name in needed:
+        available = sequence.frames(name)
+        if not len(available):
+            raise MissingDataError(
+                sequence.location, expected=f"the field {name}", found=list_fields(sequence)
+            )
+        common = available if frames is None else np.intersect1d(frames, available)
+        if frames is not None and not len(common):
+            raise MissingDataError(
+                sequence.location,
+                expected=f"{name} of frames {describe_frames(frames)}",
+                found=f"frames {describe_frames(available)}",
+            )
+        frames = common
+    return np.empty(0, np.int64) if frames is None else frames
+
+
+def list_fields(sequence: Sequence) -> str:
+    """Return the names of the fields of a sequence, for a message."""
+    return ", ".join(sorted(sequence.fields())) or "nothing"
+
+
+def describe_frames(frames: NDArray[np.int64]) -> str:
+    """Return the first and the last of some frames and their number, for a message."""
+    return f"{frames[0]} to {frames[-1]} ({len(frames)} frames)"
+
+
+@dataclass(frozen=True, eq=False)
+class RemappedSequence:
+    """A sequence whose labels are read as classes of another table.
+
+    Attributes:
+        sequence: where frames are read from.
+        grid: name of the grid that is read; "" for none.
+        stored: class table of the labels in the sequence; None takes those in the metadata of the
+            grid and of the scans.
+        shown: class table in which labels are returned; None leaves them as they are stored.
+    """
+
+    sequence: Sequence
+    grid: str
+    stored: ClassTable | None = None
+    shown: ClassTable | None = None
+
+    @property
+    def spec(self) -> GridSpec:
+        """Geometry of the grid."""
+        return self.sequence.grids[self.grid]
+
+    @property
+    def stored_table(self) -> ClassTable:
+        """Class table of the grid's labels as stored, or of the scans' if no grid is read."""
+        if self.stored is not None or not self.grid:
+            return self.scan_table
+        return self.sequence.classes_of(self.grid)
+
+    @property
+    def scan_table(self) -> ClassTable:
+        """Class table of the scans' labels as they are stored: a prediction beside them may have
+        another.
+        """
+        return self.sequence.metadata.classes if self.stored is None else self.stored
+
+    def read_grid(self, frame: int) -> Grid:
+        """Read the grid of a frame, in the table that is shown.
+
+        Raises:
+            FormatError: the grid does not have the format, or a label is not in its class table.
+        """
+        grid = self.sequence.grid(self.grid, frame)
+        labels = self._remap(
+            grid.labels, self.stored_table, f"{self.sequence.location}: {self.grid}, frame {frame}"
+        )
+        return replace(grid, labels=labels)
+
+    def read_scan(self, frame: int) -> Scan:
+        """Read the scan of a frame, in the table that is shown, without points that are not finite.
+
+        Raises:
+            FormatError: the scan does not have the format, or a label is not in its class table.
+        """
+        scan = without_invalid_points(self.sequence.scan(frame))
+        if scan.boxes is not None:
+            scan = replace(scan, boxes=self._remap_boxes(scan.boxes, frame))
+        if scan.labels is None:
+            return scan
+        where = f"{self.sequence.location}: labels, frame {frame}"
+        return replace(scan, labels=self._remap(scan.labels, self.scan_table, where))
+
+    def read_boxes(self, frame: int) -> Boxes | None:
+        """Read the tracked boxes of a frame, in the table that is shown; None where it was not
+        annotated.
+
+        Raises:
+            FormatError: the boxes do not have the format, or a label is not in its class table.
+        """
+        boxes = self.sequence.boxes(frame)
+        return None if boxes is None else self._remap_boxes(boxes, frame)
+
+    def read_pose(self, frame: int) -> Transform | None:
+        """Read (4, 4) first_T_sensor of a frame; None if the sequence has no poses.
+
+        Raises:
+            FormatError: the frame has no line in the file of poses, or its line is no rigid
+                transform.
+        """
+        try:
+            pose = self.sequence.read_pose(frame)
+        except MissingDataError:
+            return None
+        return check_rigid(pose, f"{self.sequence.location}/{layout.POSES}: frame {frame}")
+
+    def has(self, *fields: str) -> bool:
+        """Whether the sequence has all of these fields."""
+        return set(fields) <= set(self.sequence.fields())
+
+    def frames_with(self, *fields: str) -> set[int]:
+        """Return the frames that have all of these fields."""
+        return set.intersection(*(set(self.sequence.frames(field).tolist()) for field in fields))
+
+    def read_part(self, part: str, frame: int) -> NDArray[Any]:
+        """Read a part of the grid of a frame, such as "posterior", in the shape of the grid.
+
+        Raises:
+            MissingDataError: the frame lacks it.
+            FormatError: it does not have the format.
+        """
+        return self.sequence.read(f"{self.grid}/{part}", frame).reshape(self.spec.size)
+
+    def _remap_boxes(self, boxes: Boxes, frame: int) -> Boxes:
+        where = f"{self.sequence.location}: boxes, frame {frame}"
+        return replace(boxes, labels=self._remap(boxes.labels, self.scan_table, where))
+
+    def _remap(
+        self, labels: NDArray[np.unsignedinteger], stored: ClassTable, where: str
+    ) -> NDArray[np.unsignedinteger]:
+        target = self.shown or stored
+        labels = to_table(labels, stored, target, where)
+        target.check(labels, where)
+        return labels
+
+
+def without_invalid_points(scan: Scan) -> Scan:
+    """Return a scan without the points that have a coordinate that is NaN or infinite."""
+    finite = np.isfinite(scan.points)
+    return scan if finite.all() else scan.select(np.asarray(finite.all(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -328,6 +619,11 @@ class SceneReader:
         """Whether motion is known: the flow of points, or the velocity of voxels."""
         return self.has("flow") or self.has(f"{self.data.grid}/velocity")
 
+    @property
+    def has_cameras(self) -> bool:
+        """Whether the sequence has cameras."""
+        return layout.CAMERAS in self.data.sequence.documents()
+
     def read_motion(self, frame: int, scan: Scan | None) -> Scan | None:
         """Return the moving points of a frame with flow, or the centres of moving voxels if points
         have no flow; None if motion is not known.
@@ -347,14 +643,10 @@ class SceneReader:
         points = data.spec.from_axes(data.spec.centers().reshape(-1, 3)[moving["voxel"]]).astype(
             np.float32
         )
-        labels, actors = (
-            a.reshape(-1)[moving["voxel"]]
-            for a in (data.read_grid(frame).labels, self._instances(frame))
-        )
-        found = Scan(
-            points, labels.astype(np.uint32), moving["velocity"].astype(np.float32), actors
-        )
-        return mirror_scan(found) if self.mirrored else found
+        labels = data.read_grid(frame).labels.reshape(-1)[moving["voxel"]].astype(np.uint32)
+        actors = self._instances(frame).reshape(-1)[moving["voxel"]]
+        centers = Scan(points, labels, moving["velocity"].astype(np.float32), actors)
+        return mirror_scan(centers) if self.mirrored else centers
 
     def read_time(self, frame: int) -> float | None:
         """Return the seconds since the first frame, or None if the sequence has no times."""
@@ -371,8 +663,9 @@ class SceneReader:
             FormatError: the frame has no line in the file of poses, or its line is not a rigid
                 transform.
         """
-        found = (data.read_pose(frame) for data in (self.data, self.truth) if data is not None)
-        pose = next((pose for pose in found if pose is not None), None)
+        pose = self.data.read_pose(frame)
+        if pose is None and self.truth is not None:
+            pose = self.truth.read_pose(frame)
         return mirror_poses(pose) if self.mirrored and pose is not None else pose
 
     def path_of_ego(self) -> NDArray[np.float64]:

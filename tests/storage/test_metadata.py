@@ -6,7 +6,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.errors import FormatError
 from carlasc.storage import FolderSource, Metadata
-from carlasc.storage.metadata import FORMAT
+from carlasc.storage.layout import FORMAT
 
 LAB = ClassTable(
     "lab", {0: "none", 300: "floor"}, {0: (0, 0, 0), 300: (1, 2, 3)}, ground=frozenset({300})

@@ -12,6 +12,7 @@ from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.errors import FormatError
 from carlasc.viewing import Scene
+from carlasc.viewing.actor_lines import Trail
 from carlasc.viewing.page.contents import (
     OFFSET_STEPS,
     encode_actors,
@@ -22,7 +23,6 @@ from carlasc.viewing.page.contents import (
 )
 from carlasc.viewing.rendering.drawings import evidence_drawing
 from carlasc.viewing.scene import FrameContent
-from carlasc.viewing.trails import Trail
 
 arrays = st.dictionaries(
     st.text(min_size=1, max_size=8),
@@ -162,7 +162,7 @@ def test_voxels_have_actors_and_arrows_where_no_point_has_flow(moving_grid):
     assert np.array_equal(arrays["panel0/instance"] == 6, arrays["panel0/label"] == BLUE)
     (arrow,) = arrays["actors/arrows"].reshape(-1, 6)
     assert np.allclose(arrow[:2], (10, 5), atol=0.5) and np.allclose(arrow[3:], (3, 0, 0))
-    assert content.describe()["hasFlow"] and content.panels[0].evidence == ("instance",)
+    assert content.describe([])["hasFlow"] and content.panels[0].evidence == ("instance",)
     right = Scene(moving_grid).open().right_handed()
     moving = right.read_motion(0, None)
     assert np.allclose(moving.points.mean(axis=0)[:2], (10, -5), atol=0.5) and np.allclose(

@@ -45,7 +45,7 @@ def photographed(tmp_path_factory):
 
 def test_a_page_has_small_images_of_the_cameras_that_have_some(photographed):
     content = open_content(Scene(photographed), 0.2)
-    assert content.describe()["cameras"] == ["front", "second"]
+    assert content.describe([])["cameras"] == ["front", "second"]
     first, second = (unpack_arrays(pack_arrays(content.read(frame)[0])) for frame in (0, 1))
     assert "photos/second" in first and "photos/second" not in second
     for arrays, gray in ((first, 60), (second, 90)):
@@ -58,7 +58,7 @@ def test_a_page_has_small_images_of_the_cameras_that_have_some(photographed):
 def test_without_images_nothing_is_added(tmp_path):
     folder = write_blocks(tmp_path / "Town01_Light" / "cartesian", frames=1)
     content = open_content(Scene(folder), 0.2)
-    assert content.describe()["cameras"] == []
+    assert content.describe([])["cameras"] == []
     assert not [
         name for name in content.read(0)[0] if name.startswith("photos") or name == "actors/cameras"
     ]

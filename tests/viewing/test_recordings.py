@@ -454,7 +454,7 @@ def test_the_size_is_estimated_within_a_few_percent(ending, tmp_path):
 def test_a_scene_without_a_range_shows_its_first_frames_and_says_so(
     ending, blocks, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("carlasc.viewing.targets.MAX_FRAMES", 2)
+    monkeypatch.setattr("carlasc.viewing.viewer.MAX_FRAMES", 2)
     result = view(blocks, tmp_path / f"a{ending}")
     assert result.frames == (0, 1) and result.notes == ("3 frames found, showing the first 2",)
     assert view(Scene(blocks, frames=(0, None)), tmp_path / f"b{ending}").frames == (0, 1, 2)

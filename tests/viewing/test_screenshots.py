@@ -19,7 +19,7 @@ from carlasc.core.tables import CARLA
 from carlasc.errors import CarlascError
 from carlasc.groundtruth import FromScans, Voting
 from carlasc.viewing import Scene, view
-from carlasc.viewing.open3d_shapes import import_open3d
+from carlasc.viewing.window import import_open3d
 
 pytestmark = pytest.mark.slow
 

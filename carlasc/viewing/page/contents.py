@@ -27,13 +27,10 @@ from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics.confusion import ConfusionMatrix
 from carlasc.metrics.grids import check_same_geometry, compare_grids
 from carlasc.storage.camera_files import cameras_of, has_image
+from carlasc.viewing.actor_lines import Trail, Trails, box_lines, motion_arrows
 from carlasc.viewing.colors import ClassColors
-from carlasc.viewing.finding import SceneSource, find_truth
 from carlasc.viewing.photos import encode_photos
-from carlasc.viewing.rendering.actor_boxes import box_lines
-from carlasc.viewing.rendering.drawings import motion_arrows
-from carlasc.viewing.scene import FrameContent, Scene, SceneReader
-from carlasc.viewing.trails import Trail, Trails
+from carlasc.viewing.scene import FrameContent, Scene, SceneReader, SceneSource, find_sequence
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -175,13 +172,8 @@ def _narrow(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
     )
 
 
-# the fields of a grid that a page shows, if they exist
-EVIDENCE = (
-    "occupied",
-    "views",
-    "flags",
-    "instance",
-)
+EVIDENCE = ("occupied", "views", "flags", "instance")
+"""The fields of a grid that a page shows, if they exist."""
 
 
 @dataclass(frozen=True)
@@ -208,17 +200,12 @@ class PagePanel:
     beside: int | None = None
 
 
-@dataclass(frozen=True)
-class FrameScores:
-    """The scores of a frame, one value per run; NaN where nothing was counted.
+Scores = dict[str, list[float | None]]
+"""The scores of a frame, one value per run, None where nothing was counted; empty without a truth.
 
-    Attributes:
-        miou: mean IoU over the classes that occur in the frame's truth or prediction, without free.
-        iou: intersection over union of the occupied voxels.
-    """
-
-    miou: tuple[float, ...]
-    iou: tuple[float, ...]
+`miou` is the mean IoU over the classes that occur in the frame's truth or prediction, without free;
+`iou` the intersection over union of the occupied voxels.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,14 +229,8 @@ class PageContent:
         """The grids of the page: those of the first run, then those of the run beside it."""
         own = self._fields_of(self.reader)
         panels = [
-            PagePanel(
-                p.name,
-                p.title,
-                p.spec,
-                p.colors,
-                evidence=() if p.name in ("truth", "errors") else own,
-            )
-            for p in self.reader.panels
+            PagePanel(**vars(panel), evidence=() if panel.name in ("truth", "errors") else own)
+            for panel in self.reader.panels
         ]
         if self.beside is None:
             return tuple(panels)
@@ -292,18 +273,17 @@ class PageContent:
         the images.
         """
         sequence = self.reader.data.sequence
-        if find_spec("PIL") is None:
+        if find_spec("PIL") is None or not self.reader.has_cameras:
             return ()
-        own = cameras_of(sequence).values()
         return tuple(
             camera.name
-            for camera in own
+            for camera in cameras_of(sequence).values()
             if any(has_image(sequence, camera, frame) for frame in self.frames)
         )
 
-    def read(self, frame: int, trails: Trails | None = None) -> tuple[Arrays, FrameScores | None]:
+    def read(self, frame: int, trails: Trails | None = None) -> tuple[Arrays, Scores]:
         """Return the arrays of a frame, named `panel0/index`, `scan/index`, `actors/boxes`, ...,
-        and its scores if there is a truth.
+        and its scores.
 
         Args:
             frame: frame number.
@@ -321,33 +301,29 @@ class PageContent:
                 truth = content.grids[1]
                 grids.append(Grid(truth.spec, compare_grids(grids[-1], truth), truth.counts))
         arrays: Arrays = {}
+
+        def add(part: str, encoded: Arrays) -> None:
+            arrays.update({f"{part}/{name}": array for name, array in encoded.items()})
+
         for number, (panel, grid) in enumerate(zip(self.panels, grids, strict=True)):
             data = (self.reader if panel.run == 0 or self.beside is None else self.beside).data
-            names = [
-                name for name in panel.evidence if frame in data.frames_with(f"{data.grid}/{name}")
-            ]
-            found = encode_grid(grid) | encode_evidence(
-                grid, {name: data.read_part(name, frame) for name in names}
-            )
-            arrays |= {f"panel{number}/{name}": array for name, array in found.items()}
+            evidence = {
+                name: data.read_part(name, frame)
+                for name in panel.evidence
+                if frame in data.frames_with(f"{data.grid}/{name}")
+            }
+            add(f"panel{number}", encode_grid(grid) | encode_evidence(grid, evidence))
         moving = self.reader.read_motion(frame, content.scan)
         if content.scan is not None:
-            arrays |= {
-                f"scan/{name}": array
-                for name, array in encode_scan(content.scan, self.thin_m).items()
-            }
-        ways = (
-            trails.follow(self.frames.index(frame), content, moving) if trails is not None else ()
-        )
-        arrays |= {
-            f"actors/{name}": array for name, array in encode_actors(content, moving, ways).items()
-        }
+            add("scan", encode_scan(content.scan, self.thin_m))
+        tracks = trails.follow(self.frames.index(frame), content, moving) if trails else ()
+        add("actors", encode_actors(content, moving, tracks))
         if self.cameras:
             arrays |= encode_photos(self.reader.read_photos(frame))
         return arrays, self._score(grids)
 
-    def describe(self) -> dict[str, Any]:
-        """Return the values for the scripts of the page, except the frames and their scores."""
+    def describe(self, scores: Sequence[Scores]) -> dict[str, Any]:
+        """Return the values for the scripts of the page, with the scores of the frames."""
         reader = self.reader
         poses = [pose for pose in map(reader.read_pose, self.frames) if pose is not None]
         tables = {
@@ -374,6 +350,12 @@ class PageContent:
             "cameras": list(self.cameras),
             "pointCell": self.thin_m,
             "offsetSteps": OFFSET_STEPS,
+            "scores": None
+            if reader.truth is None
+            else {
+                name: [list(run) for run in zip(*(own[name] for own in scores), strict=True)]
+                for name in ("miou", "iou")
+            },
         }
 
     def _has_classes(self) -> bool:
@@ -391,25 +373,26 @@ class PageContent:
     def _fields_of(self, reader: SceneReader) -> tuple[str, ...]:
         return tuple(name for name in EVIDENCE if reader.has(f"{reader.data.grid}/{name}"))
 
-    def _score(self, grids: list[Grid]) -> FrameScores | None:
+    def _score(self, grids: list[Grid]) -> Scores:
         """Return the scores of the predictions of the runs, in the shown classes and in voxels that
         the ground truth knows.
         """
         if self.reader.truth is None:
-            return None
-        truth = grids[1]
-        predictions = [
-            grids[n] for n, panel in enumerate(self.panels) if panel.name == "prediction"
-        ]
-        classes = self.reader.table.num_channels
-        found = [
+            return {}
+        truth, classes = grids[1], self.reader.table.num_channels
+        matrices = [
             ConfusionMatrix(classes).update(grid.labels, truth.labels, truth.known)
-            for grid in predictions
+            for grid, panel in zip(grids, self.panels, strict=True)
+            if panel.name == "prediction"
         ]
-        return FrameScores(
-            tuple(matrix.mean_iou(with_free=False, absent="skip") for matrix in found),
-            tuple(matrix.completeness().iou for matrix in found),
-        )
+        values = {
+            "miou": [matrix.mean_iou(with_free=False, absent="skip") for matrix in matrices],
+            "iou": [matrix.completeness().iou for matrix in matrices],
+        }
+        return {
+            name: [None if math.isnan(value) else round(value, 5) for value in own]
+            for name, own in values.items()
+        }
 
 
 def open_content(
@@ -425,18 +408,14 @@ def open_content(
         raise ArgumentError(
             "beside", problem="only grids can be compared", advice="choose a source that has a grid"
         )
-    found = None if beside is None else find_truth(beside, reader.data.sequence)
-    sequence = reader.data.sequence if found is None else found.sequence
-    grid = beside_grid or (None if found is None else found.grid) or scene.grid
-    classes = scene.classes or reader.table
-    second = Scene(
-        sequence,
-        grid=grid,
-        classes=classes,
+    run = None if beside is None else find_sequence(beside, reader.data.sequence)
+    other = Scene(
+        reader.data.sequence if run is None else run.sequence,
+        grid=beside_grid or (None if run is None else run.grid) or scene.grid,
+        classes=scene.classes or reader.table,
         source_classes=scene.source_classes,
         palette=scene.palette,
-    )
-    other = second.open("grid")
+    ).open("grid")
     if other.left_handed != reader.left_handed:
         raise ArgumentError(
             "beside", expected="a run in the same axes", found="one in the other axes"
@@ -452,11 +431,6 @@ def open_content(
             advice="choose others with `frames`",
         )
     return PageContent(reader, other, frames, thin_m)
-
-
-def json_number(value: float) -> float | None:
-    """Return a number that JSON can hold: None for NaN."""
-    return None if math.isnan(value) else round(value, 5)
 
 
 def _describe_panel(panel: PagePanel) -> dict[str, Any]:

@@ -16,12 +16,16 @@ from carlasc.core.geometry import Transform
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import Scan
 from carlasc.storage.layout import FRAME_PERIOD_S
-from carlasc.viewing import colors as palette
+from carlasc.viewing.actor_lines import Trail, Trails, motion_arrows
 from carlasc.viewing.photos import Photo
-from carlasc.viewing.rendering.drawings import motion_arrows
-from carlasc.viewing.rendering.meshes import SQUARE, split_arcs, surrounded
+from carlasc.viewing.rendering.meshes import (
+    SIDES,
+    exposed_cells,
+    face_corners,
+    split_arcs,
+    surrounded,
+)
 from carlasc.viewing.scene import SceneReader
-from carlasc.viewing.trails import Trail, Trails
 
 MAX_POINTS = 30_000
 """Default number of points per frame, so that a frame is smaller than half a megabyte."""
@@ -53,61 +57,36 @@ def class_surfaces(grid: Grid) -> Iterator[tuple[int, Triangles]]:
     ground.
     """
     spec, labels = split_arcs(grid.spec, grid.labels)
-    parts = [_faces(spec, labels, axis, side) for axis in range(3) for side in (0, 1)]
+    parts = [_faces(spec, labels, axis, side) for axis, side in SIDES]
     corners, normals, owners = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     for label in np.unique(owners).tolist():
         chosen = owners == label
         first = 4 * np.arange(np.count_nonzero(chosen), dtype=np.uint32)[:, None, None]
         indices = (first + np.array([[0, 1, 2], [0, 2, 3]], np.uint32)).reshape(-1, 3)
-        yield (
-            label,
-            Triangles(
-                corners[chosen].reshape(-1, 3), np.repeat(normals[chosen], 4, axis=0), indices
-            ),
-        )
+        points = corners[chosen].reshape(-1, 3)
+        yield label, Triangles(points, np.repeat(normals[chosen], 4, axis=0), indices)
 
 
 def _faces(
     spec: GridSpec, labels: NDArray[np.unsignedinteger], axis: int, side: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.unsignedinteger]]:
-    """Return the (Q, 4, 3) corners, the (Q, 3) normals and the (Q,) classes of the exposed faces
-    towards one side of one axis.
+    """Return the (Q, 4, 3) corners, counter-clockwise seen from outside, the (Q, 3) normals and the
+    (Q,) classes of the exposed faces towards one side of one axis. Neighbours become one face.
     """
-    solid = surrounded(spec, labels > 0)
-    behind = np.roll(solid, 1 - 2 * side, axis)[1:-1, 1:-1, 1:-1]
-    shown = np.where(behind, 0, labels)
-    if axis == 0 and side == 0 and spec.lower[0] == 0:
-        shown[0] = 0  # at radius 0 the wedge ends in a line
-    if (axis, side) == (2, 0):
-        shown[:, :, 0] = 0
+    shown = np.where(exposed_cells(spec, surrounded(spec, labels > 0), axis, side, True), labels, 0)
     along = 2 if axis == 0 else 0  # the edges of cells are straight along the radius and along z
-    before = np.roll(shown, 1, along)
-    after = np.roll(shown, -1, along)
-    ends: tuple[list[slice | int], list[slice | int]] = ([slice(None)] * 3, [slice(None)] * 3)
-    ends[0][along], ends[1][along] = 0, -1
-    before[tuple(ends[0])], after[tuple(ends[1])] = 0, 0
+    lines = np.moveaxis(shown, along, 2)  # a view: runs are along the last axis
+    free = np.zeros((*lines.shape[:2], 1), lines.dtype)
+    steps = np.diff(lines, axis=2, prepend=free, append=free) != 0
 
-    def in_lines(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Return the cells of a mask, line after line along the axis of the runs."""
-        moved = np.argwhere(np.moveaxis(mask, along, 2))
+    def cells_of(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the cells of a mask, line after line."""
+        moved = np.argwhere(mask)
         return np.insert(moved[:, :2], along, moved[:, 2], axis=1)
 
-    first, last = (
-        in_lines((shown > 0) & (shown != before)),
-        in_lines((shown > 0) & (shown != after)),
-    )
-    edges = [spec.edges(a) for a in range(3)]
-    across, up = (axis + 1) % 3, (axis + 2) % 3
-    corners: NDArray[np.floating] = np.empty((len(first), 4, 3))
-    for number, (one, two) in enumerate(SQUARE if side else SQUARE[::-1]):
-        offset = np.zeros(3, np.int64)
-        offset[[axis, across, up]] = side, one, two
-        lattice = np.where(offset == 1, last + 1, first)
-        lattice[:, axis] = first[:, axis] + side
-        corners[:, number] = np.stack([edges[a][lattice[:, a]] for a in range(3)], axis=1)
-    corners = spec.from_axes(corners)
-    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    first, last = (cells_of((lines > 0) & ends) for ends in (steps[..., :-1], steps[..., 1:]))
+    corners, normals = face_corners(spec, first, last, axis, side)
+    corners = corners if side else corners[:, ::-1]
     return corners.astype(np.float32), normals.astype(np.float32), labels[tuple(first.T)]
 
 
@@ -145,7 +124,7 @@ class RecordedFrame:
 
 
 class RecordingWriter(Protocol):
-    """Writes the frames of a scene to a file, one after the other, without keeping them in memory."""
+    """Writes the frames of a scene to a file one by one, without keeping them in memory."""
 
     def write(self, frame: RecordedFrame) -> None:
         """Append a frame."""
@@ -197,15 +176,6 @@ def thin_scan(scan: Scan, most: int) -> Scan:
         return scan
     order = np.arange(len(scan), dtype=np.uint64) * np.uint64(_GOLDEN) % np.uint64(2**32)
     return scan.select(np.sort(np.argpartition(order, most)[:most]))
-
-
-def point_colors(scan: Scan, by_id: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return (N, 3) uint8 RGB of the points of a scan, in the colours of their classes,
-    (num_channels, 3).
-    """
-    colors = by_id.copy()
-    colors[0] = palette.UNLABELLED
-    return colors[np.zeros(len(scan), np.int64) if scan.labels is None else scan.labels]
 
 
 def class_cells(grid: Grid) -> Iterator[tuple[int, NDArray[np.int64]]]:

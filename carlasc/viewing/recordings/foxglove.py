@@ -3,16 +3,16 @@
 Topics, all in right-handed axes with z up; times are seconds since the first frame:
 
     /tf                      FrameTransforms: `ego`, the sensor, in `world`, the frame of the first
-    scan /points                  PointCloud: colours, class ids, and numbers of actors if they
-    exist /grid                    VoxelGrid, or SceneUpdate with meshes for a cylindrical grid;
-    with a ground truth
-                             /prediction, /truth and /errors; /actors: its voxels by actor
+                             scan
+    /points                  PointCloud: colours, class ids, and numbers of actors if they exist
+    /grid                    VoxelGrid, or SceneUpdate with meshes for a cylindrical grid; with a
+                             ground truth /prediction, /truth and /errors; /actors: its voxels by
+                             actor
     /flow, /boxes, /tracks   SceneUpdate: arrows, boxes, the tracks of the actors
     /path                    SceneUpdate: the trajectory of the vehicle in the whole recording
     /picture                 CompressedImage: the bird's-eye camera picture
-    /cameras/NAME/image, /cameras/NAME/calibration
-                             CompressedImage and CameraCalibration of each camera, whose frame is
-                             NAME
+    /cameras/NAME/image, /cameras/NAME/calibration CompressedImage and CameraCalibration of each
+                             camera, whose frame is NAME
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from carlasc.core.scans import Scan
 from carlasc.errors import import_extra
 from carlasc.storage.packed.output import PatientFile
 from carlasc.viewing import colors as palette
-from carlasc.viewing.recordings.content import RecordedFrame, class_surfaces, point_colors
+from carlasc.viewing.recordings.content import RecordedFrame, class_surfaces
 from carlasc.viewing.scene import GridPanel, SceneReader
 
 WORLD, EGO = "world", "ego"
@@ -75,6 +75,7 @@ class FoxgloveWriter:
         """Append a frame."""
         m, nanoseconds = self._messages, round(frame.time_s * 1e9)
         stamp = m.Timestamp(*divmod(nanoseconds, 10**9))
+        ego = {"timestamp": stamp, "frame_id": EGO}
 
         def log(topic: str, kind: str, **content: Any) -> None:
             if topic not in self._channels:
@@ -112,15 +113,9 @@ class FoxgloveWriter:
                     [entity(n, EGO, triangles=[t]) for n, t in self._wedges(panel, grid)],
                 )
             else:
-                log(
-                    f"/{panel.name}",
-                    "VoxelGrid",
-                    timestamp=stamp,
-                    frame_id=EGO,
-                    **self._voxels(panel, grid),
-                )
+                log(f"/{panel.name}", "VoxelGrid", **ego, **self._voxels(panel, grid))
         if frame.scan is not None:
-            log("/points", "PointCloud", timestamp=stamp, frame_id=EGO, **self._points(frame.scan))
+            log("/points", "PointCloud", **ego, **self._points(frame.scan))
         if self._reader.has_motion:
             arrows = [
                 self._arrow(tail, vector)
@@ -139,19 +134,9 @@ class FoxgloveWriter:
             log_scene("/path", [entity("path", WORLD, lines=[line])])
         self._path = None  # once
         if frame.picture is not None:
-            log(
-                "/picture",
-                "CompressedImage",
-                timestamp=stamp,
-                frame_id=EGO,
-                data=frame.picture,
-                format="jpeg",
-            )
+            log("/picture", "CompressedImage", **ego, data=frame.picture, format="jpeg")
         for photo in frame.photos:
-            topic, own = (
-                f"/cameras/{photo.camera.name}",
-                {"timestamp": stamp, "frame_id": photo.camera.name},
-            )
+            topic, own = f"/cameras/{photo.camera.name}", ego | {"frame_id": photo.camera.name}
             log(f"{topic}/image", "CompressedImage", data=photo.data, format=photo.kind, **own)
             log(f"{topic}/calibration", "CameraCalibration", **own, **_calibration(photo.camera))
         self._output.check()
@@ -205,7 +190,7 @@ class FoxgloveWriter:
         if numbered:
             points["instance"] = scan.instances
         points["xyz"], points["rgba"] = scan.points, 255
-        points["rgba"][:, :3] = point_colors(scan, self._reader.colors.by_id)
+        points["rgba"][:, :3] = self._reader.colors.of_points(scan)
         points["label"] = 0 if scan.labels is None else scan.labels
         float32 = m.PackedElementFieldNumericType.Float32
         axes = [

@@ -12,19 +12,14 @@ Entities, all in right-handed axes with z up:
     world/ego/instances          the points of actors, in a colour for each actor
     world/ego/cameras/NAME       the image of a camera, in its frustum
     world/ego/PANEL/CLASS        the voxels of each class: `grid`, or `prediction`, `truth` and
-    `errors`; `actors`: by actor picture                      the bird's-eye camera picture
+                                 `errors`; `actors`: by actor
+    picture                      the bird's-eye camera picture
 """
 
 from __future__ import annotations
 
-import os
-import threading
-from collections.abc import Callable
-from contextlib import suppress
 from datetime import timedelta
-from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import uuid4
 
@@ -56,76 +51,6 @@ _EYE, _TARGET = (
 )
 
 
-class PipedFile:
-    """Copies the data that is written to a pipe into a file.
-
-    On a full disk, Rerun's own thread ends, and a call that waits for the thread hangs. This class
-    always reads the pipe, so that the library sees no error, and keeps the first error of writing
-    for `check`.
-    """
-
-    def __init__(self, path: Path, begin: Callable[[str], object]) -> None:
-        """Create the file and begin to write it.
-
-        Args:
-            path: the file.
-            begin: opens the pipe for writing; its argument is the path.
-
-        Raises:
-            OSError: the file or the pipe cannot be created.
-        """
-        self._error: OSError | None = None
-        self._file = path.open("wb", buffering=0)
-        with TemporaryDirectory(prefix="carlasc-") as folder:
-            pipe = str(Path(folder) / path.name)
-            os.mkfifo(pipe)
-            # the other end can be opened from now on
-            descriptor = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-            try:
-                begin(pipe)
-            except BaseException:
-                os.close(descriptor)
-                raise
-        os.set_blocking(descriptor, True)
-        self._thread = threading.Thread(target=self._drain, args=(descriptor,), daemon=True)
-        self._thread.start()
-
-    def check(self) -> None:
-        """Raise the first error of writing, if any.
-
-        Raises:
-            OSError: the file could not be written.
-        """
-        if self._error is not None:
-            raise self._error
-
-    def close(self) -> None:
-        """Wait for the end of the pipe, which its writer must have closed, and close the file.
-
-        Raises:
-            OSError: the file could not be written.
-        """
-        self._thread.join()
-        self._file.close()
-        self.check()
-
-    def _drain(self, descriptor: int) -> None:
-        with open(descriptor, "rb", buffering=0) as pipe:
-            while block := pipe.read(_BLOCK):
-                if self._error is None:
-                    try:
-                        self._write(block)
-                    except OSError as error:
-                        self._error = error
-                        with suppress(OSError):  # the file is removed anyway
-                            self._file.truncate(0)
-
-    def _write(self, block: bytes) -> None:
-        view = memoryview(block)
-        while view:
-            view = view[self._file.write(view) :]
-
-
 class RerunWriter:
     """Writes a `.rrd` file.
 
@@ -145,9 +70,9 @@ class RerunWriter:
         )
         self._recording.set_log_time_enabled(False)
         self._recording.set_log_tick_enabled(False)
-        self._file = PipedFile(
-            path, partial(self._recording.save, default_blueprint=self._blueprint())
-        )
+        self._stream = self._recording.binary_stream()
+        self._file = path.open("wb")
+        self._recording.send_blueprint(self._blueprint(), make_active=False)
         self._recording.send_recording_name(reader.name)
         self._write_static()
 
@@ -209,13 +134,13 @@ class RerunWriter:
         Raises:
             OSError: it could not be written.
         """
-        self._recording.flush()
-        self._recording.disconnect()
-        self._file.close()
+        with self._file:
+            self._flush()
+            self._recording.disconnect()
+            self._flush()
 
     def _flush(self) -> None:
-        self._recording.flush()
-        self._file.check()
+        self._file.write(self._stream.read() or b"")
         self._waiting = 0
 
     def _write_static(self) -> None:

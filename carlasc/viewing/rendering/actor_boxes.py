@@ -5,19 +5,21 @@ actors; and their drawings.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.boxes import Boxes
-from carlasc.core.geometry import transform_points
+from carlasc.core.geometry import Transform, rotation_z
 from carlasc.core.scans import Scan
 from carlasc.errors import MissingDataError
 from carlasc.viewing import colors as palette
+from carlasc.viewing.actor_lines import edges_of
 from carlasc.viewing.colors import AFTER_CLASSES, Entry
-from carlasc.viewing.finding import RemappedSequence, list_fields
 from carlasc.viewing.rendering.drawings import Drawing
 from carlasc.viewing.rendering.meshes import QuadMesh, box, join
+from carlasc.viewing.scene import RemappedSequence, list_fields
 
 BOX = Entry("box, with a bar to its front", palette.ARROW, AFTER_CLASSES + 10)
 """The entry of a legend for boxes."""
@@ -28,11 +30,6 @@ _LEAST_SIZE_M = 0.1
 _FEWEST_POINTS = 5
 _CLOSE_M = 0.05  # nearer points count as on the side
 _ANGLES = np.deg2rad(np.arange(0, 90, 2.0))
-
-_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_EDGES = [
-    (a, b) for a in range(8) for b in range(a + 1, 8) if np.sum(_CORNERS[a] != _CORNERS[b]) == 1
-]
 
 
 def check_boxes(data: RemappedSequence) -> None:
@@ -74,7 +71,7 @@ def tight_boxes(scan: Scan) -> Boxes:
     Args:
         scan: with instances; with flow, boxes of moving actors have the right direction.
     """
-    rows: list[tuple[int, int, float, NDArray[np.float64], NDArray[np.float64]]] = []
+    tracks, labels, sizes, poses = list[int](), list[int](), list[Any](), list[Transform]()
     instances = np.zeros(len(scan), np.uint32) if scan.instances is None else scan.instances
     for actor in np.unique(instances[instances > 0]).tolist():
         members = np.flatnonzero(instances == actor)
@@ -84,21 +81,20 @@ def tight_boxes(scan: Scan) -> Boxes:
         velocity = (
             np.zeros(3) if scan.flow is None else scan.flow[members].astype(np.float64).mean(axis=0)
         )
-        yaw = _direction(points[:, :2], velocity)
-        turned = _turned(points, yaw)
+        sensor_T_box = rotation_z(_direction(points[:, :2], velocity))
+        turned = points @ sensor_T_box[:3, :3]
         lower, upper = turned.min(axis=0), turned.max(axis=0)
-        label = 0 if scan.labels is None else int(np.bincount(scan.labels[members]).argmax())
-        center = _turned(((lower + upper) / 2)[None], -yaw)[0]
-        rows.append((actor, label, yaw, center, np.maximum(upper - lower, _LEAST_SIZE_M)))
-    yaws = np.array([row[2] for row in rows])
-    zeros = np.zeros(len(rows))
-    return Boxes(
-        np.array([row[0] for row in rows], np.uint32),
-        np.array([row[1] for row in rows], np.uint32),
-        np.array([row[3] for row in rows]).reshape(-1, 3),
-        np.column_stack([np.cos(yaws / 2), zeros, zeros, np.sin(yaws / 2)]).reshape(-1, 4),
-        np.array([row[4] for row in rows]).reshape(-1, 3),
-        np.zeros(len(rows), np.bool_),
+        sensor_T_box[:3, 3] = sensor_T_box[:3, :3] @ ((lower + upper) / 2)
+        tracks.append(actor)
+        labels.append(0 if scan.labels is None else int(np.bincount(scan.labels[members]).argmax()))
+        sizes.append(np.maximum(upper - lower, _LEAST_SIZE_M))
+        poses.append(sensor_T_box)
+    return Boxes.from_poses(
+        np.array(tracks, np.uint32),
+        np.array(labels, np.uint32),
+        np.array(poses).reshape(-1, 4, 4),
+        np.array(sizes).reshape(-1, 3),
+        np.zeros(len(tracks), np.bool_),
     )
 
 
@@ -116,29 +112,11 @@ def with_boxes(drawing: Drawing, boxes: Boxes) -> Drawing:
     )
 
 
-def _lines_of(size: NDArray[np.floating]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the ends of the edges of a box, and of the bar on its floor, metres, frame of the box."""
-    corners, floor = _CORNERS * size, -size[2] / 2
-    bar = np.array([0.0, 0.0, floor]), np.array([size[0] / 2 + 0.8, 0.0, floor])
-    return [*((corners[a], corners[b]) for a, b in _EDGES), bar]
-
-
-def box_lines(boxes: Boxes) -> NDArray[np.float64]:
-    """Return (L, 2, 3) both ends of the edges of boxes, and of a bar from the middle of each to its
-    front, metres, sensor frame.
-    """
-    found = [
-        transform_points(pose, np.array(_lines_of(size)).reshape(-1, 3))
-        for pose, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True)
-    ]
-    return np.concatenate([np.empty((0, 3)), *found]).reshape(-1, 2, 3)
-
-
 def box_edges(boxes: Boxes) -> QuadMesh:
     """Return the edges of boxes as bars."""
     bars = []
     for sensor_T_box, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True):
-        for start, end in _lines_of(size):
+        for start, end in edges_of(size):
             lower, upper = np.minimum(start, end) - _BAR_M / 2, np.maximum(start, end) + _BAR_M / 2
             bar = box(lower, upper, palette.ARROW)
             rotation = sensor_T_box[:3, :3]
@@ -177,9 +155,3 @@ def _direction(points: NDArray[np.float64], velocity: NDArray[np.float64]) -> fl
                 closeness,
             )
     return best if longest else best + float(np.pi / 2)
-
-
-def _turned(points: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
-    """Return points in a frame whose x axis has a yaw in the frame of the points."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return points @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

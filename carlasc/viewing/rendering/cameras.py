@@ -60,26 +60,29 @@ class Viewpoint:
     fov_rad: float = DEFAULT_FOV_RAD
 
     def __post_init__(self) -> None:
-        flat = [self.azimuth_rad, self.elevation_rad, self.fov_rad, self.distance_m or 0.0]
-        flat += [*(self.target or ()), *(self.position or ())]
-        if not np.isfinite(flat).all():
-            raise ArgumentError("viewpoint", expected="finite numbers", found=str(self))
-        if not 0 < self.fov_rad < np.pi:
-            raise ArgumentError(
-                "viewpoint",
-                expected="a field of view between 0 and 180 degrees",
-                found=f"{np.rad2deg(self.fov_rad):g}",
-            )
-        if abs(self.elevation_rad) > np.pi / 2:
-            raise ArgumentError(
-                "viewpoint",
-                expected="an elevation of -90 to 90 degrees",
-                found=f"{np.rad2deg(self.elevation_rad):g}",
-            )
-        if self.distance_m is not None and self.distance_m <= 0:
-            raise ArgumentError(
-                "viewpoint", expected="a distance above 0 m", found=f"{self.distance_m:g}"
-            )
+        angles = [self.azimuth_rad, self.elevation_rad, self.fov_rad]
+        numbers = [*angles, self.distance_m or 0.0, *(self.target or ()), *(self.position or ())]
+        field_deg, elevation_deg = np.rad2deg([self.fov_rad, self.elevation_rad])
+        for valid, expected, found in (
+            (np.isfinite(numbers).all(), "finite numbers", str(self)),
+            (
+                0 < self.fov_rad < np.pi,
+                "a field of view between 0 and 180 degrees",
+                f"{field_deg:g}",
+            ),
+            (
+                abs(self.elevation_rad) <= np.pi / 2,
+                "an elevation of -90 to 90 degrees",
+                f"{elevation_deg:g}",
+            ),
+            (
+                self.distance_m is None or self.distance_m > 0,
+                "a distance above 0 m",
+                f"{self.distance_m}",
+            ),
+        ):
+            if not valid:
+                raise ArgumentError("viewpoint", expected=expected, found=found)
 
     @classmethod
     def parse(cls, text: str) -> Viewpoint:
@@ -343,7 +346,9 @@ def _fit(
 
 
 @cached(error_model="python")
-def _write_rays(position, axes, step, flat, width, height, first, origins, directions):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+def _write_rays(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    position, axes, step, flat, width, height, first, origins, directions
+):
     for row in range(first, first + len(origins) // width):
         y = (height / 2 - row - 0.5) * step
         for column in range(width):

@@ -18,6 +18,7 @@ from carlasc.errors import ArgumentError, FormatError, MissingDataError, check_c
 from carlasc.metrics.grids import VoxelOutcome, compare_grids
 from carlasc.storage.metadata import Axes
 from carlasc.viewing import colors as palette
+from carlasc.viewing.actor_lines import MOVING_M_S, motion_arrows
 from carlasc.viewing.colors import (
     AFTER_CLASSES,
     ERRORS,
@@ -26,7 +27,6 @@ from carlasc.viewing.colors import (
     as_color,
     height_colors,
 )
-from carlasc.viewing.finding import RemappedSequence, without_invalid_points
 from carlasc.viewing.rendering.cameras import Camera
 from carlasc.viewing.rendering.meshes import (
     QuadMesh,
@@ -38,27 +38,18 @@ from carlasc.viewing.rendering.meshes import (
     quads,
 )
 from carlasc.viewing.rendering.raycasting import cast, empty_canvas, splat
-from carlasc.viewing.scene import SceneReader
+from carlasc.viewing.scene import RemappedSequence, SceneReader, without_invalid_points
 
 Extent = NDArray[np.float64]
 """(N, 3) float64 points, metres, that a camera fitted to the drawing shows."""
 
 _FLOOR = (240, 240, 243)
-_MOVING_M_S = 0.2  # slower points count as static
-_ARROW_CELL_M = 3.0
 GRID_COLORS: tuple[str, ...] = get_args(GridColor)
 _PARTS = {"confidence": "occupied", "views": "views", "votes": "counts", "inferred": "flags"}
 _PARTS |= {"actor": "instance", "seen": "seen"}
 _KEPT_BY = {"actor": "actors", "seen": "seen"}  # options of regrid
 # upper bounds of the classes of probabilities, except for the last one
-_SHARES = (
-    0.6,
-    0.7,
-    0.8,
-    0.9,
-    0.95,
-    0.99,
-)
+_SHARES = (0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 _POWERS = 7  # classes of numbers: 1, 2 to 3, 4 to 7, ..., 64 and more
 VELOCITY = Entry("velocity (distance in 1 s)", palette.ARROW, AFTER_CLASSES)
 _ORIGINS = (
@@ -128,11 +119,8 @@ def scan_extent(scan: Scan) -> Extent:
     if len(scan):
         lower, upper = (np.quantile(scan.points, share, axis=0) for share in (0.03, 0.97))
     side = np.array([5.0, 5.0, 0.0])  # the sensor and its surroundings are always in the picture
-    lower, upper = (
-        np.clip(np.minimum(lower, -side), -40, 40),
-        np.clip(np.maximum(upper, side), -40, 40),
-    )
-    corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    lower, upper = np.clip([np.minimum(lower, -side), np.maximum(upper, side)], -40, 40)
+    corners = np.array(list(np.ndindex(2, 2, 2)))
     return lower + corners * (upper - lower)
 
 
@@ -154,10 +142,8 @@ def grid_drawing(grid: Grid, colors: ClassColors, *, ego: bool = True) -> Drawin
     if not colors.tell_shapes(ids):
         low, high = grid.spec.lower[2], grid.spec.upper[2]
         layers = palette.height_colors(grid.spec.centers()[0, 0, :, 2], low, high)
-        voxel_colors, legend = (
-            np.broadcast_to(layers, (*grid.spec.size, 3)),
-            palette.height_entries(low, high),
-        )
+        voxel_colors = np.broadcast_to(layers, (*grid.spec.size, 3))
+        legend = palette.height_entries(low, high)
     else:
         voxel_colors, legend = colors.by_id[grid.labels], colors.entries(ids.tolist())
     return voxel_drawing(grid.spec, voxel_colors, occupied, legend, "no voxel is occupied", ego)
@@ -219,14 +205,12 @@ def scan_drawing(
         legend = palette.height_entries(low, high)
     else:
         colors.table.check(points.labels, "scan labels")
-        by_id = colors.by_id.copy()
-        by_id[0] = palette.UNLABELLED
         unlabelled = [Entry("unlabelled", palette.UNLABELLED, -1)] if 0 in ids else []
-        point_colors, legend = by_id[points.labels], unlabelled + colors.entries(ids.tolist())
+        point_colors = colors.of_points(points)
+        legend = unlabelled + colors.entries(ids.tolist())
     note = None if len(points) else "the scan has no point"
-    return Drawing(
-        extent, ego_vehicle() if ego else None, points.points, point_colors, legend, note
-    )
+    car = ego_vehicle() if ego else None
+    return Drawing(extent, car, points.points, point_colors, legend, note)
 
 
 def flow_drawing(
@@ -256,7 +240,7 @@ def flow_drawing(
     points = without_invalid_points(scan)
     extent = scan_extent(points) if extent is None else extent
     flow = np.asarray(points.flow)
-    moving = np.linalg.norm(flow, axis=1) > _MOVING_M_S
+    moving = np.linalg.norm(flow, axis=1) > MOVING_M_S
     point_colors = np.full((len(points), 3), palette.STATIC, np.uint8)
     legend = [Entry("standing", palette.STATIC, -1)]
     if points.labels is not None:
@@ -277,39 +261,6 @@ def with_arrows(drawing: Drawing, moving: Scan | None) -> Drawing:
     mesh = arrows(*ends, palette.ARROW, 0.24)
     mesh = mesh if drawing.mesh is None else join([drawing.mesh, mesh])
     return replace(drawing, mesh=mesh, legend=[*drawing.legend, VELOCITY])
-
-
-def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (M, 3) start points and (M, 3) vectors of the arrows that show how actors move, in
-    metres.
-
-    There is one arrow per instance, and one per cell of 3 m for points without an instance. An
-    arrow starts above the middle of its points and is as long as the distance moved in one second.
-
-    Args:
-        moving: the points that move, with flow.
-    """
-    if not len(moving):
-        return np.empty((0, 3)), np.empty((0, 3))
-    flow = np.asarray(moving.flow, np.float64)
-    keys = np.floor(moving.points[:, :2] / _ARROW_CELL_M).astype(np.int64)
-    if moving.instances is not None:
-        known = moving.instances > 0
-        keys[known] = np.column_stack(
-            [moving.instances[known], np.full(int(known.sum()), np.iinfo(np.int64).max)]
-        )
-    _, group = np.unique(keys, axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    count = np.bincount(group)
-    middle, vectors = (
-        np.stack([np.bincount(group, values[:, a]) for a in range(3)], axis=1) / count[:, None]
-        for values in (moving.points, flow)
-    )
-    top = np.full(len(count), -np.inf)
-    np.maximum.at(top, group, moving.points[:, 2])
-    middle[:, 2] = top + 0.4
-    real = np.linalg.norm(vectors, axis=1) > _MOVING_M_S
-    return middle[real], vectors[real]
 
 
 def voxel_drawing(
@@ -399,7 +350,7 @@ def evidence_drawing(
     """
     grid = data.read_grid(frame)
     values = data.read_part(_PARTS[color], frame)
-    numbers, legend = _classify(values, color)
+    numbers, legend = _classify(values, color), evidence_legend(color)
     colors = (
         palette.ACTORS.palette
         if color == "actor"
@@ -439,19 +390,17 @@ def evidence_legend(color: GridColor) -> list[Entry]:
     ]
 
 
-def _classify(values: NDArray[Any], color: GridColor) -> tuple[NDArray[np.int64], list[Entry]]:
-    """Return the entry of the legend for each voxel, and the legend."""
-    legend = evidence_legend(color)
+def _classify(values: NDArray[Any], color: GridColor) -> NDArray[np.int64]:
+    """Return the entry of the legend for each voxel; for actors the id in `palette.ACTORS`."""
     if color == "inferred":
         seen = np.where(values & VoxelFlag.SEEN_NOW, 0, 1)
-        return np.where(
-            values & VoxelFlag.INFERRED, 3, np.where(values & VoxelFlag.CONTESTED, 2, seen)
-        ), legend
+        scanned = np.where(values & VoxelFlag.CONTESTED, 2, seen)
+        return np.where(values & VoxelFlag.INFERRED, 3, scanned)
     if color == "seen":
-        return np.minimum(np.bitwise_count(values), 2).astype(np.int64), legend
+        return np.minimum(np.bitwise_count(values), 2).astype(np.int64)
     if color == "actor":
-        return palette.actor_ids(values).astype(np.int64), legend
+        return palette.actor_ids(values).astype(np.int64)
     if color == "confidence":
-        return np.digitize(values.astype(np.float64), _SHARES), legend
+        return np.digitize(values.astype(np.float64), _SHARES)
     powers = np.floor(np.log2(np.maximum(values.astype(np.float64), 1)))
-    return np.minimum(powers, _POWERS - 1).astype(np.int64), legend
+    return np.minimum(powers, _POWERS - 1).astype(np.int64)

@@ -18,21 +18,10 @@ from carlasc.storage.files import write_output
 
 STILLS = (".png",)
 FILMS = (".gif", ".mp4", ".webp")
-_H264 = (
-    "-c:v",
-    "libx264",
-    "-crf",
-    "18",
-    "-preset",
-    "medium",
-    "-pix_fmt",
-    "yuv420p",
-    "-movflags",
-    "+faststart",
-)
+_H264 = "-c:v libx264 -crf 18 -preset medium -pix_fmt yuv420p -movflags +faststart"
 _ENCODERS = {
-    ".mp4": (*_H264, "-f", "mp4"),
-    ".webp": ("-c:v", "libwebp_anim", "-quality", "72", "-loop", "0", "-f", "webp"),
+    ".mp4": f"{_H264} -f mp4".split(),
+    ".webp": "-c:v libwebp_anim -quality 72 -loop 0 -f webp".split(),
 }
 
 
@@ -117,7 +106,7 @@ def _to_palette(picture: NDArray[np.uint8]) -> Any:
 
 
 def _encode(
-    file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, settings: tuple[str, ...]
+    file: BinaryIO, pictures: Iterator[NDArray[np.uint8]], fps: float, settings: list[str]
 ) -> None:
     """Encode a film into the file itself, by its name: a killed run leaves no other file, and the
     encoder can seek in it.
@@ -126,22 +115,9 @@ def _encode(
     with tempfile.TemporaryFile() as messages:
         picture = next(pictures)
         height, width, _ = picture.shape
+        raw = f"-v error -y -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps:g} -i -"
         process = subprocess.Popen(
-            [
-                *(
-                    encoder,
-                    "-v",
-                    "error",
-                    "-y",
-                    "-f",
-                    "rawvideo",
-                    "-pix_fmt",
-                    "rgb24",
-                    "-s",
-                    f"{width}x{height}",
-                ),
-                *("-r", f"{fps:g}", "-i", "-", *settings, f"file:{file.name}"),
-            ],
+            [encoder, *raw.split(), *settings, f"file:{file.name}"],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=messages,

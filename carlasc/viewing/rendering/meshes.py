@@ -1,4 +1,4 @@
-"""Meshes of quads for ray casting: the exposed faces of a grid's occupied voxels, boxes and arrows."""
+"""Meshes of quads for ray casting: exposed faces of occupied voxels, boxes and arrows."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ _Value = TypeVar("_Value", bound=np.generic)
 _WIDEST_ARC_RAD = np.deg2rad(4.0)  # wider cylindrical cells are drawn in several flat pieces
 SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
 """Corners of a face, in order around it."""
+SIDES = [(axis, side) for axis in range(3) for side in (0, 1)]
+"""The sides of a cell: an axis, and 0 for its lower or 1 for its upper side."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class QuadMesh:
         return len(self.corners)
 
     def triangles(self) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Return vertices (4 Q, 3) and triangles (2 Q, 3): quad q is the triangles 2 q and 2 q + 1."""
+        """Return vertices (4 Q, 3) and triangles (2 Q, 3): quad q is triangles 2 q and 2 q + 1."""
         first = 4 * np.arange(len(self), dtype=np.int32)[:, None, None]
         return self.corners.reshape(-1, 3), (
             first + np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -101,9 +103,11 @@ def grid_mesh(
     spec, occupied = split_arcs(whole, occupied)
     _, colors = split_arcs(whole, colors)
     pieces = spec.size[1] // whole.size[1]
-    solid = surrounded(spec, occupied)
-    sides = [(axis, side) for axis in range(3) for side in (0, 1)]
-    return join([_faces(spec, colors, solid, axis, side, pieces, on_floor) for axis, side in sides])
+    solid, meshes = surrounded(spec, occupied), []
+    for axis, side in SIDES:
+        exposed = exposed_cells(spec, solid, axis, side, on_floor)
+        meshes.append(_faces(spec, colors, solid, np.argwhere(exposed), axis, side, pieces))
+    return join(meshes)
 
 
 def split_arcs(spec: GridSpec, values: NDArray[_Value]) -> tuple[GridSpec, NDArray[_Value]]:
@@ -132,45 +136,73 @@ def surrounded(spec: GridSpec, occupied: NDArray[np.bool_]) -> NDArray[np.bool_]
     return solid
 
 
-def _faces(
-    spec: GridSpec,
-    colors: NDArray[np.uint8],
-    solid: NDArray[np.bool_],
-    axis: int,
-    side: int,
-    pieces: int,
-    on_floor: bool,
-) -> QuadMesh:
-    """Return the exposed faces towards one side of one axis."""
-    step = np.zeros(3, np.int64)
-    step[axis] = 2 * side - 1
-    inner = tuple(slice(1, n + 1) for n in spec.size)
-    outer = tuple(slice(1 + s, n + 1 + s) for n, s in zip(spec.size, step, strict=True))
-    exposed = solid[inner] & ~solid[outer]
+def exposed_cells(
+    spec: GridSpec, solid: NDArray[np.bool_], axis: int, side: int, on_floor: bool
+) -> NDArray[np.bool_]:
+    """Return the (X, Y, Z) solid cells whose face towards one side of one axis is visible.
+
+    Args:
+        spec: geometry of the grid.
+        solid: the solid cells, as `surrounded` returns them.
+        axis: number of the axis.
+        side: 0 for the lower, 1 for the upper side.
+        on_floor: whether the lowest faces of the lowest cells are left out.
+    """
+    behind = np.roll(solid, 1 - 2 * side, axis)[1:-1, 1:-1, 1:-1]
+    exposed = solid[1:-1, 1:-1, 1:-1] & ~behind
     if spec.coordinates == "cylindrical" and axis == 0 and side == 0 and spec.lower[0] == 0:
         exposed[0] = False  # at radius 0 the wedge ends in a line
     if on_floor and (axis, side) == (2, 0):
         exposed[:, :, 0] = False
-    cells = np.argwhere(exposed)
+    return exposed
 
-    across, along = (axis + 1) % 3, (axis + 2) % 3
+
+def face_corners(
+    spec: GridSpec, first: NDArray[np.int64], last: NDArray[np.int64], axis: int, side: int
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return the (Q, 4, 3) corners and the (Q, 3) outward normals of faces of runs of cells.
+
+    Args:
+        spec: geometry of the grid.
+        first: (Q, 3) first cell of each run.
+        last: (Q, 3) last cell of each run, equal to the first for a single cell.
+        axis: number of the axis that the faces are perpendicular to.
+        side: 0 for the lower, 1 for the upper side of the cells.
+    """
     edges = [spec.edges(a) for a in range(3)]
-    corners: NDArray[np.floating] = np.empty((len(cells), 4, 3))
+    corners: NDArray[np.floating] = np.empty((len(first), 4, 3))
+    for number, in_plane in enumerate(SQUARE):
+        offset = np.zeros(3, np.int64)
+        offset[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, *in_plane
+        lattice = np.where(offset == 1, last + 1, first)
+        lattice[:, axis] = first[:, axis] + side
+        corners[:, number] = np.stack([edges[a][lattice[:, a]] for a in range(3)], axis=1)
+    corners = spec.from_axes(corners)
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    normals *= 2 * side - 1
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return corners, normals
+
+
+def _faces(
+    spec: GridSpec,
+    colors: NDArray[np.uint8],
+    solid: NDArray[np.bool_],
+    cells: NDArray[np.int64],
+    axis: int,
+    side: int,
+    pieces: int,
+) -> QuadMesh:
+    """Return the faces of cells towards one side of one axis."""
+    across, along = (axis + 1) % 3, (axis + 2) % 3
+    front = cells + 1
+    front[:, axis] += 2 * side - 1
     openness = np.empty((len(cells), 4), np.float32)
     for number, (first, second) in enumerate(SQUARE):
-        offset = np.zeros(3, np.int64)
-        offset[[axis, across, along]] = side, first, second
-        lattice = cells + offset
-        corners[:, number] = np.stack([edges[a][lattice[:, a]] for a in range(3)], axis=1)
         openness[:, number] = _corner_openness(
-            solid, cells + 1 + step, across, along, 2 * first - 1, 2 * second - 1
+            solid, front, across, along, 2 * first - 1, 2 * second - 1
         )
-    corners = spec.from_axes(corners)
-
-    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) * (
-        2 * side - 1
-    )
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    corners, normals = face_corners(spec, cells, cells, axis, side)
     return QuadMesh(
         corners.astype(np.float32),
         normals.astype(np.float32),
@@ -220,7 +252,7 @@ def _drawn_edges(
 
 
 def footprint(spec: GridSpec, height: float) -> NDArray[np.float32]:
-    """Return (Q, 4, 3) faces, facing upwards, of the ground plan of a grid at a height in metres."""
+    """Return (Q, 4, 3) faces, facing upwards, of the ground plan of a grid at a height, metres."""
     pieces = (1, 1)
     # several along the radius too: Embree is slow with very thin faces
     if spec.coordinates == "cylindrical":
@@ -239,14 +271,13 @@ def box(lower: ArrayLike, upper: ArrayLike, color: ArrayLike, *, taper: float = 
     low_high = np.array([lower, upper], np.float32)
     inwards = np.array([[taper, taper, 0.0], [-taper, -taper, 0.0]], np.float32)
     faces = []
-    for axis in range(3):
-        for side in (0, 1):
-            face = np.empty((4, 3), np.float32)
-            for number, (first, second) in enumerate(SQUARE):
-                pick = np.zeros(3, np.int64)
-                pick[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, first, second
-                face[number] = low_high[pick, np.arange(3)] + pick[2] * inwards[pick, np.arange(3)]
-            faces.append(face if side else face[::-1])
+    for axis, side in SIDES:
+        face = np.empty((4, 3), np.float32)
+        for number, in_plane in enumerate(SQUARE):
+            pick = np.zeros(3, np.int64)
+            pick[[axis, (axis + 1) % 3, (axis + 2) % 3]] = side, *in_plane
+            face[number] = low_high[pick, np.arange(3)] + pick[2] * inwards[pick, np.arange(3)]
+        faces.append(face if side else face[::-1])
     return quads(np.array(faces), color, edges=True, open_sky=True)
 
 

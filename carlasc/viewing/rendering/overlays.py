@@ -16,7 +16,7 @@ from carlasc.core.geometry import rotate_vectors
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.metrics import cast_rays
 from carlasc.storage.camera_files import camera_named, read_image, scan_T_camera
-from carlasc.viewing.finding import SceneSource
+from carlasc.storage.files import check_target
 from carlasc.viewing.rendering.encoding import (
     FILMS,
     STILLS,
@@ -25,8 +25,7 @@ from carlasc.viewing.rendering.encoding import (
     write_pictures,
 )
 from carlasc.viewing.rendering.render import RenderResult
-from carlasc.viewing.scene import Scene, SceneReader, as_scene
-from carlasc.viewing.targets import check_target
+from carlasc.viewing.scene import Scene, SceneReader, SceneSource, as_scene
 
 _EDGE = 0.75  # brightness of a voxel at its edges in the picture
 
@@ -105,14 +104,14 @@ def _pictures(
                 where, expected=f"an image of {camera.name}", found="none", advice=advice
             )
         picture, labels = read_image(reader.data.sequence, camera, frame), grid.labels.reshape(-1)
-        found, _ = cast_rays(
+        first, _ = cast_rays(
             grid.labels[None],
             grid.spec,
             place[:3, 3],
             rotate_vectors(place, looks[looks_somewhere]),
         )
         voxels = np.full(len(looks), -1, np.int64)
-        voxels[looks_somewhere] = found[0]
+        voxels[looks_somewhere] = first[0]
         voxels[(voxels >= 0) & (labels[voxels] == 0)] = -1
         shaped = voxels.reshape(picture.shape[:2])
         colors = reader.colors.by_id[labels[shaped]].astype(np.float64)

@@ -146,17 +146,13 @@ def draw_page(
     image = image_module.fromarray(canvas)
     draw, font = import_extra("PIL.ImageDraw", "render").Draw(image), font_of(page.font_size)
     for box, title in zip(page.titles, titles, strict=False):
-        if wrapped:
-            for number, text in enumerate(wrap_text(title, font, box.width)):
-                top = (
-                    box.y
-                    + round(page.font_size * 0.4)
-                    + (number + 0.5) * line_height(page.font_size)
-                )
-                draw.text((box.x + box.width / 2, top), text, INK, font, anchor="mm")
-            continue
-        text = shorten(title, font, box.width - 8)
-        draw.text((box.x + box.width / 2, box.y + box.height / 2), text, INK, font, anchor="mm")
+        line, top = line_height(page.font_size), box.y + round(page.font_size * 0.4)
+        lines = (
+            wrap_text(title, font, box.width) if wrapped else [shorten(title, font, box.width - 8)]
+        )
+        for number, text in enumerate(lines):
+            middle = top + (number + 0.5) * line if wrapped else box.y + box.height / 2
+            draw.text((box.x + box.width / 2, middle), text, INK, font, anchor="mm")
     for box, note in zip(page.panels, notes, strict=False):
         if note:
             text = shorten(note, font, box.width - 8)

@@ -1,11 +1,13 @@
-"""The panels of a picture: the contents of a frame, the camera, and the order of frames and scenes."""
+"""The panels of a picture: contents of a frame, camera, and order of frames and scenes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from string import ascii_lowercase
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +16,6 @@ from carlasc.core.geometry import Transform, transform_points
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.storage import layout
 from carlasc.viewing.colors import Entry, merge_legends
-from carlasc.viewing.finding import RemappedSequence
 from carlasc.viewing.rendering.actor_boxes import BOX, boxes_in, with_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, View, Viewpoint
 from carlasc.viewing.rendering.drawings import (
@@ -34,7 +35,7 @@ from carlasc.viewing.rendering.drawings import (
 )
 from carlasc.viewing.rendering.pictures import Panel, draw_panels
 from carlasc.viewing.rendering.styles import Sheet
-from carlasc.viewing.scene import SceneReader
+from carlasc.viewing.scene import RemappedSequence, SceneReader
 
 MOST_PANELS = 64
 _VIEW_NAMES = {"perspective": "from behind", "bev": "from above"}
@@ -48,48 +49,52 @@ class FrameRenderer:
         reader: reads the scene; its `contents` are drawn side by side.
         camera: the camera for each of the contents. A camera that circles the scene has one
             distance, from which the whole scene is visible from each side.
-        extent: the extent of pictures of scans, the same in all frames.
         ego: whether the ego vehicle is drawn.
         color: what the colours of the grid mean.
         boxes: whether boxes around actors are drawn.
-        fixed_view: for a camera that does not follow the vehicle: the extent to show, and
-            `world_T_view`, the frame of that extent; or None.
     """
 
     reader: SceneReader
     camera: CameraOptions
-    extent: Extent
     ego: bool
     color: GridColor
     boxes: bool
-    fixed_view: tuple[Extent, Transform] | None
 
-    @classmethod
-    def of(
-        cls, reader: SceneReader, camera: CameraOptions, *, ego: bool, color: GridColor, boxes: bool
-    ) -> FrameRenderer:
-        """Return a renderer whose extent and fixed view are the same in all frames.
+    @cached_property
+    def extent(self) -> Extent:
+        """The extent of pictures of scans, the same in all frames: the grid beside them, or most of
+        the first scan.
+        """
+        reader = self.reader
+        if {"grid", "errors"} & set(reader.contents):
+            return grid_extent(reader.data.spec)
+        if "truth" in reader.contents and reader.truth is not None:
+            return grid_extent(reader.truth.spec)
+        return scan_extent(reader.data.read_scan(reader.frames[0]))
 
-        Args:
-            reader: reads the scene.
-            camera: the camera for each of the contents.
-            ego: whether the ego vehicle is drawn.
-            color: what the colours of the grid mean.
-            boxes: whether boxes around actors are drawn.
+    @cached_property
+    def fixed_view(self) -> tuple[Extent, Transform] | None:
+        """What a camera that does not follow the vehicle shows: the (8, 3) corners of a box around
+        the extents of all frames, in the frame of the middle pose, and `world_T_middle`.
 
         Raises:
-            MissingDataError: the camera stays in place, and the sequence has no poses.
+            MissingDataError: the sequence has no poses.
+            FormatError: a pose is not valid.
         """
-        extent = _scan_extent_in(reader)
-        return cls(
-            reader,
-            camera,
-            extent,
-            ego,
-            color,
-            boxes,
-            _view_of_drive(reader, extent) if camera.still else None,
+        if not self.camera.still:
+            return None
+        reader = self.reader
+        world_T_middle = _pose_of(reader, reader.frames[len(reader.frames) // 2])
+        middle_T_world = np.linalg.inv(world_T_middle)
+        points = np.concatenate(
+            [
+                transform_points(middle_T_world @ _pose_of(reader, frame), self.extent)
+                for frame in reader.frames
+            ]
         )
+        box = np.array([points.min(0), points.max(0)])
+        corners = np.array([(box[i, 0], box[j, 1], box[k, 2]) for i, j, k in np.ndindex(2, 2, 2)])
+        return corners, world_T_middle
 
     def panels(self, frame: int) -> list[Panel]:
         """Return the panels of a frame: each of the scene's contents from each of the views."""
@@ -115,14 +120,9 @@ class FrameRenderer:
 
     def _draw(self, content: str, frame: int) -> Drawing:
         reader, colors = self.reader, self.reader.colors
-        if content == "scan":
-            return scan_drawing(
-                reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego
-            )
-        if content == "flow":
-            return flow_drawing(
-                reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego
-            )
+        if content in ("scan", "flow"):
+            draw = scan_drawing if content == "scan" else flow_drawing
+            return draw(reader.data.read_scan(frame), colors, extent=self.extent, ego=self.ego)
         if content == "errors":
             return error_drawing(
                 reader.data.read_grid(frame), self._grid_of("truth").read_grid(frame), ego=self.ego
@@ -179,42 +179,6 @@ class FrameRenderer:
         return titles.get(content) or (str(data.spec) if truth is None else "prediction")
 
 
-def _scan_extent_in(reader: SceneReader) -> Extent:
-    """Return the extent of pictures of scans in all frames: the grid beside them, or most of the
-    first scan.
-    """
-    if {"grid", "errors"} & set(reader.contents):
-        return grid_extent(reader.data.spec)
-    if "truth" in reader.contents and reader.truth is not None:
-        return grid_extent(reader.truth.spec)
-    return scan_extent(reader.data.read_scan(reader.frames[0]))
-
-
-def _view_of_drive(reader: SceneReader, extent: Extent) -> tuple[Extent, Transform]:
-    """Return the extent for a camera that does not follow the vehicle: a box around the extents of
-    all frames.
-
-    Returns:
-        (8, 3) corners of the box in the frame of the middle pose, and `world_T_middle`.
-
-    Raises:
-        MissingDataError: the sequence has no poses.
-        FormatError: a pose is not valid.
-    """
-    world_T_middle = _pose_of(reader, reader.frames[len(reader.frames) // 2])
-    middle_T_world = np.linalg.inv(world_T_middle)
-    seen = [
-        transform_points(middle_T_world @ _pose_of(reader, frame), extent)
-        for frame in reader.frames
-    ]
-    points = np.concatenate(seen)
-    box = np.array([points.min(0), points.max(0)])
-    corners = np.array(
-        [(box[i, 0], box[j, 1], box[k, 2]) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    )
-    return corners, world_T_middle
-
-
 def _pose_of(reader: SceneReader, frame: int) -> Transform:
     pose = reader.read_pose(frame)
     if pose is None:
@@ -241,8 +205,7 @@ def _swept_extent(extent: Extent) -> Extent:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Cell:
+class Cell(NamedTuple):
     """One frame of one source.
 
     Attributes:
@@ -270,8 +233,9 @@ class PictureRenderer:
     captions: tuple[str, ...] = ()
     columns: int | None = None
 
-    def render(self, cells: Sequence[Cell], viewpoint: Viewpoint) -> NDArray[np.uint8]:
-        """Return the picture of some cells, (H, W, 3) uint8."""
+    def render(self, shot: tuple[Sequence[Cell], Viewpoint]) -> NDArray[np.uint8]:
+        """Return the picture of some cells from a viewpoint, (H, W, 3) uint8."""
+        cells, viewpoint = shot
         panels = [panel for cell in cells for panel in cell.renderer.panels(cell.frame)]
         if self.captions:
             extent = np.concatenate([panel.drawing.extent for panel in panels])
@@ -307,11 +271,7 @@ def plan_cells(renderers: Sequence[FrameRenderer], film: bool) -> list[list[Cell
             found="left-handed and right-handed ones",
         )
     if film:
-        frames = [
-            frame
-            for frame in renderers[0].reader.frames
-            if all(frame in r.reader.frames for r in renderers)
-        ]
+        frames = sorted(set.intersection(*(set(r.reader.frames) for r in renderers)))
         if not frames:
             where, advice = renderers[0].reader.path, "choose others with `frames`"
             raise MissingDataError(

@@ -53,7 +53,9 @@ def visible_triangles(mesh: QuadMesh, camera: Camera, width: int, height: int) -
 
 
 @cached
-def _fill(corners, xs, ys, step, flat, seen, nearness):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+def _fill(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    corners, xs, ys, step, flat, seen, nearness
+):
     """Fill the triangles of quads.
 
     `nearness` is 1 / depth for a pinhole camera, -depth for an orthographic one: both are linear.
@@ -157,19 +159,21 @@ def hits(
         origins: (n, 3), metres.
         directions: (n, 3).
     """
-    found = np.zeros((3, len(triangle)), np.float32)
-    _write_hits(corners, triangle, origins, directions, found)
-    return found
+    weights = np.zeros((3, len(triangle)), np.float32)
+    _write_hits(corners, triangle, origins, directions, weights)
+    return weights
 
 
 @cached
-def _write_hits(corners, triangle, origins, directions, found):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+def _write_hits(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    corners, triangle, origins, directions, weights
+):
     one, zero = np.float32(1), np.float32(0)
     origin = edge_a = edge_b = edge_c = normal = (zero, zero, zero)
     height, last = zero, -1
     for i in range(len(triangle)):
         if triangle[i] < 0:
-            found[2, i] = np.inf
+            weights[2, i] = np.inf
             continue
         start, ray = _point(origins[i]), _point(directions[i])
         if triangle[i] != last or start != origin:
@@ -188,8 +192,8 @@ def _write_hits(corners, triangle, origins, directions, found):  # type: ignore[
             height = _dot(a, normal)
         beside_b, beside_c = _dot(edge_b, ray), _dot(edge_c, ray)
         inverse = one / (beside_b + beside_c + _dot(edge_a, ray))
-        found[0, i], found[1, i] = min(beside_b * inverse, one), min(beside_c * inverse, one)
-        found[2, i] = height * (one / _dot(normal, ray))
+        weights[0, i], weights[1, i] = min(beside_b * inverse, one), min(beside_c * inverse, one)
+        weights[2, i] = height * (one / _dot(normal, ray))
 
 
 @jit

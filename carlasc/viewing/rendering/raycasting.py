@@ -165,7 +165,9 @@ def _sky_visibility(scene: Any, mesh: QuadMesh) -> NDArray[np.float32]:
 
 
 @cached(error_model="python")
-def _aim_at_sun(normals, triangle, origins, directions, depth, suns, which, facing):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+def _aim_at_sun(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    normals, triangle, origins, directions, depth, suns, which, facing
+):
     """Replace the first rays by rays towards the sun from the points that face it, write the
     samples that they belong to, and return their number.
     """
@@ -260,7 +262,6 @@ def splat(
     colors: NDArray[np.uint8],
     camera: Camera,
     canvas: Canvas,
-    radius_m: float = POINT_RADIUS_M,
 ) -> None:
     """Draw points onto a canvas as shaded balls.
 
@@ -269,29 +270,29 @@ def splat(
         colors: (N, 3) uint8 RGB.
         camera: the camera.
         canvas: the canvas; its content hides points that are farther.
-        radius_m: radius of a ball.
     """
     height, width = canvas.depth.shape
     columns, rows, depths = camera.project(points, width, height)
     pixel = camera.footprint(height) * (
         np.ones_like(depths) if camera.orthographic else np.maximum(depths, 1e-6)
     )
-    radii = np.clip(radius_m / pixel, _LEAST_RADIUS, _MOST_RADIUS)
+    radii = np.clip(POINT_RADIUS_M / pixel, _LEAST_RADIUS, _MOST_RADIUS)
     seen = (
         (depths > 0.1)
         & (np.abs(columns - width / 2) < width)
         & (np.abs(rows - height / 2) < height)
     )
     drawn = np.zeros((height, width), np.bool_)
-    _draw_balls(
-        columns[seen], rows[seen], depths[seen].astype(np.float32), radii[seen], np.ascontiguousarray(colors[seen]),
-        canvas.colors, canvas.depth, drawn,
-    )  # fmt: skip
+    where = columns[seen], rows[seen], depths[seen].astype(np.float32), radii[seen]
+    balls = np.ascontiguousarray(colors[seen])
+    _draw_balls(*where, balls, canvas.colors, canvas.depth, drawn)
     _darken_behind(canvas.colors, canvas.depth, drawn)
 
 
 @cached(error_model="python")
-def _draw_balls(columns, rows, depths, radii, colors, out, out_depth, drawn):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+def _draw_balls(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    columns, rows, depths, radii, colors, out, out_depth, drawn
+):
     height, width = out_depth.shape
     for i in range(len(columns)):
         radius = radii[i]
@@ -311,7 +312,9 @@ def _draw_balls(columns, rows, depths, radii, colors, out, out_depth, drawn):  #
 
 
 @cached(error_model="python")
-def _darken_behind(out, depth, drawn):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+def _darken_behind(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    out, depth, drawn
+):
     """Eye-dome lighting: the farther a point is behind its neighbours in the picture, the darker it
     is.
     """

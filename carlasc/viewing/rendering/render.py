@@ -17,8 +17,8 @@ from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import Sequence as StoredSequence
 from carlasc.storage import Source
+from carlasc.storage.files import check_target
 from carlasc.viewing.colors import merge_legends
-from carlasc.viewing.finding import SceneSource
 from carlasc.viewing.rendering.actor_boxes import check_boxes
 from carlasc.viewing.rendering.cameras import CameraOptions, Viewpoint
 from carlasc.viewing.rendering.drawings import GridColor, check_color
@@ -39,8 +39,7 @@ from carlasc.viewing.rendering.panels import (
     plan_cells,
 )
 from carlasc.viewing.rendering.styles import StyleOptions
-from carlasc.viewing.scene import Scene, SceneReader, as_scene
-from carlasc.viewing.targets import check_target
+from carlasc.viewing.scene import Scene, SceneReader, SceneSource, as_scene
 
 ORBIT_PICTURES = 120  # of an orbit around a single frame
 # frames are 0.1 s apart, so that a film runs at the speed of the drive
@@ -163,10 +162,7 @@ def render(
         if boxes:
             check_boxes(reader.data)
 
-    renderers = [
-        FrameRenderer.of(reader, camera, ego=style.ego, color=color, boxes=boxes)
-        for reader in readers
-    ]
+    renderers = [FrameRenderer(reader, camera, style.ego, color, boxes) for reader in readers]
     pictures = plan_cells(renderers, film)
     shown = (
         [cell.renderer.legend_of(cell.frame) for cells in pictures for cell in cells]
@@ -181,10 +177,10 @@ def render(
         caption_panels(pictures[0], style.captions, film) if together else (),
         style.columns or (columns_of(pictures[0]) if together else None),
     )
-    shots = _plan_shots(drawer, pictures, camera)
+    shots = _plan_shots(pictures, camera)
     if fps is None:
         fps = _ORBIT_FPS if camera.orbit and len(pictures) == 1 else _DRIVE_FPS
-    with closing(run_all(_Shot.render, shots, run)) as drawn:
+    with closing(run_all(drawer.render, shots, run)) as drawn:
         write_pictures(target, _reported(drawn, len(shots), run.progress), fps, sheet.dpi)
     if legend_file is not None and entries and sheet.font_size is not None:
         write_pictures(
@@ -247,31 +243,17 @@ def _check_kind(
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Shot:
-    """One picture: its contents and its camera."""
-
-    drawer: PictureRenderer
-    cells: list[Cell]
-    viewpoint: Viewpoint
-
-    def render(self) -> NDArray[np.uint8]:
-        return self.drawer.render(self.cells, self.viewpoint)
-
-
 def _plan_shots(
-    drawer: PictureRenderer, pictures: list[list[Cell]], camera: CameraOptions
-) -> list[_Shot]:
+    pictures: list[list[Cell]], camera: CameraOptions
+) -> list[tuple[list[Cell], Viewpoint]]:
     """Return the frames and the viewpoint of each picture."""
     if not camera.orbit:
-        return [_Shot(drawer, cells, camera.viewpoint) for cells in pictures]
+        return [(cells, camera.viewpoint) for cells in pictures]
     if len(pictures) == 1:
         pictures = pictures * ORBIT_PICTURES
-    angles = 2 * np.pi * np.arange(len(pictures)) / len(pictures)
-    return [
-        _Shot(drawer, cells, camera.viewpoint.turned(float(a)))
-        for cells, a in zip(pictures, angles, strict=True)
-    ]
+    angles = (2 * np.pi * np.arange(len(pictures)) / len(pictures)).tolist()
+    turned = map(camera.viewpoint.turned, angles)
+    return list(zip(pictures, turned, strict=True))
 
 
 def _reported(

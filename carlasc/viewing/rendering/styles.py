@@ -125,11 +125,11 @@ def _read_lengths(text: str) -> tuple[tuple[float, float], bool]:
     """Return the two lengths of a text, in inches if they have a unit, otherwise in pixels; and
     whether they have one.
     """
-    found = [
+    lengths = [
         _LENGTH.fullmatch(part.strip())
         for part in re.split(r"\s*x\s*", text.strip().lower(), maxsplit=1)
     ]
-    pairs = [(float(match[1]), match[2]) for match in found if match is not None]
+    pairs = [(float(match[1]), match[2]) for match in lengths if match is not None]
     if len(pairs) == 2:
         (width, first), (height, second) = pairs
         first = first or second  # in 8.8x5cm, both are centimetres

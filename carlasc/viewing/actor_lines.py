@@ -1,4 +1,4 @@
-"""The tracks of actors up to a frame, which pages, recordings and windows draw."""
+"""Lines that show actors: arrows of their motion, edges of their boxes, and their tracks."""
 
 from __future__ import annotations
 
@@ -10,15 +10,76 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from carlasc.core.boxes import Boxes
 from carlasc.core.geometry import transform_points
 from carlasc.core.scans import Scan
 from carlasc.viewing.scene import FrameContent
+
+MOVING_M_S = 0.2
+"""Slower points count as static: flow has noise."""
+_ARROW_CELL_M = 3.0  # points without a number of an actor share an arrow within such a cell
+
+_CORNERS = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+_EDGES = [
+    (a, b) for a in range(8) for b in range(a + 1, 8) if np.sum(_CORNERS[a] != _CORNERS[b]) == 1
+]
+
+
+def edges_of(size: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the (13, 2, 3) ends of the edges of a box, and of a bar on its floor from its middle
+    to its front, metres, frame of the box.
+    """
+    corners, floor = _CORNERS * size, -size[2] / 2
+    bar = np.array([(0.0, 0.0, floor), (size[0] / 2 + 0.8, 0.0, floor)])
+    return np.array([*((corners[a], corners[b]) for a, b in _EDGES), bar])
+
+
+def box_lines(boxes: Boxes) -> NDArray[np.float64]:
+    """Return (L, 2, 3) both ends of the lines of `edges_of` of all boxes, metres, sensor frame."""
+    ends = [
+        transform_points(pose, edges_of(size).reshape(-1, 3))
+        for pose, size in zip(boxes.sensor_T_box, boxes.sizes, strict=True)
+    ]
+    return np.concatenate([np.empty((0, 3)), *ends]).reshape(-1, 2, 3)
+
+
+def motion_arrows(moving: Scan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (M, 3) start points and (M, 3) vectors of the arrows that show how actors move, in
+    metres.
+
+    There is one arrow per instance, and one per cell of 3 m for points without an instance. An
+    arrow starts above the middle of its points and is as long as the distance moved in one second.
+
+    Args:
+        moving: the points that move, with flow.
+    """
+    if not len(moving):
+        return np.empty((0, 3)), np.empty((0, 3))
+    flow = np.asarray(moving.flow, np.float64)
+    keys = np.floor(moving.points[:, :2] / _ARROW_CELL_M).astype(np.int64)
+    if moving.instances is not None:
+        known = moving.instances > 0
+        keys[known] = np.column_stack(
+            [moving.instances[known], np.full(int(known.sum()), np.iinfo(np.int64).max)]
+        )
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    count = np.bincount(group)
+    middle, vectors = (
+        np.stack([np.bincount(group, values[:, a]) for a in range(3)], axis=1) / count[:, None]
+        for values in (moving.points, flow)
+    )
+    top = np.full(len(count), -np.inf)
+    np.maximum.at(top, group, moving.points[:, 2])
+    middle[:, 2] = top + 0.4
+    real = np.linalg.norm(vectors, axis=1) > MOVING_M_S
+    return middle[real], vectors[real]
+
 
 LONGEST = 50
 """Length of a trail in frames: five seconds at the rate of the data."""
 
 _LEAST_WAY_M = 1.0  # an actor that moved less is static: boxes of parked cars move by decimetres
-_MOVING_M_S = 0.2
 
 
 class Trail(NamedTuple):
@@ -84,7 +145,7 @@ class Trails:
 def _actors(
     content: FrameContent, moving: Scan | None
 ) -> Iterator[tuple[int, int, NDArray[np.float64]]]:
-    """Yield the number, the class and the (3,) position of each actor, in the frame of the sensor."""
+    """Yield number, class and (3,) position of each actor, in the frame of the sensor."""
     boxes = content.boxes
     if boxes is not None:
         yield from zip(boxes.tracks.tolist(), boxes.labels.tolist(), boxes.centers, strict=True)
@@ -94,7 +155,7 @@ def _actors(
         return
     chosen = scan.instances > 0
     if scan.flow is not None:
-        chosen &= np.linalg.norm(scan.flow, axis=1) > _MOVING_M_S
+        chosen &= np.linalg.norm(scan.flow, axis=1) > MOVING_M_S
     actors, first, group = np.unique(scan.instances[chosen], return_index=True, return_inverse=True)
     points = scan.points[chosen].astype(np.float64)
     count = np.bincount(group.reshape(-1), minlength=len(actors))
