@@ -44,7 +44,7 @@ from carlasc.viewing.targets import check_target
 
 ORBIT_PICTURES = 120  # of an orbit around a single frame
 # frames are 0.1 s apart, so that a film runs at the speed of the drive
-_DRIVE_FPS, _ORBIT_FPS = (
+_DRIVE_FPS, _ORBIT_FPS = (  # fact: film-rate
     10.0,
     20.0,
 )
