@@ -10,9 +10,9 @@ from entered import cases, count_case
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
-# Of the package, that one frame of `regrid` from scans enters: see tests/tools/entered.py. 42
-# before scans agreed on classes (consensus.py).
-MOST_FILES, DEEPEST = 43, 16
+# files of both packages that a case of tests/tools/entered.py enters
+MOST_FILES = {"regrid from scans": 40, "view": 20, "convert bag": 60}
+DEEPEST = 16
 
 
 def rooms():
@@ -108,10 +108,16 @@ def test_converters_and_examples_use_no_private_name():
         assert not private, f"{path.relative_to(ROOT)}: {private}"
 
 
-@pytest.mark.needs("trimesh", "embreex")
-def test_one_frame_from_scans_passes_through_few_files(tmp_path):
-    found = count_case(cases(tmp_path)["regrid from scans"])
-    assert len(found.files) <= MOST_FILES, sorted(found.files)
+@pytest.fixture(scope="module")
+def counted(tmp_path_factory):
+    return cases(tmp_path_factory.mktemp("entered"))
+
+
+@pytest.mark.needs("trimesh", "embreex", "rosbags")
+@pytest.mark.parametrize("case", MOST_FILES)
+def test_a_frame_passes_through_few_files(counted, case):
+    found = count_case(counted[case])
+    assert len(found.files) <= MOST_FILES[case], sorted(found.files)
     assert found.depth <= DEEPEST, found.deepest
 
 

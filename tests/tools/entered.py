@@ -1,8 +1,8 @@
-"""`python -m entered [CASE ...]`: how many files and functions of `carlasc` make one frame, and how
-deeply they call each other.
+"""`PYTHONPATH=tests:tests/tools python -m entered [CASE ...]`: how many files and functions of
+`carlasc` and its converters make one frame, and how deeply they call each other.
 
 What is loaded or compiled once is left out: each case runs once before it is counted. A call counts
-if its code is in a file of the package, that of a compiled loop too where Numba tells of it.
+if its code is in a file of these packages, that of a compiled loop too where Numba tells of it.
 Comprehensions, generator expressions and lambdas count like functions; from Python 3.12 on, most
 comprehensions are no calls, so a version before it counts more. A generator is as deep as the call
 that resumes it.
@@ -15,15 +15,24 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import carlasc_converters
+from helpers.converters import bags
+
 import carlasc
 from carlasc import Dataset, FromCapture, FromScans, GridSpec, Run, regrid
 from carlasc.captures import Lidar
+from carlasc.converting import convert
+from carlasc.groundtruth import GridOptions
+from carlasc.testing import SimulatedDrive
 
-PACKAGE = str(Path(carlasc.__file__).parent) + os.sep
+PACKAGES = tuple(
+    str(Path(str(package.__file__)).parent) + os.sep for package in (carlasc, carlasc_converters)
+)
 SPEC = GridSpec.published().with_size((32, 32, 8))
 LIDAR = Lidar(channels=16, points=4000)
 FRAMES = 6
@@ -35,7 +44,7 @@ class Entered:
     """What was entered while a function ran.
 
     Attributes:
-        functions: the functions, as `file:name`, with the paths of files in the package.
+        functions: the functions, as `file:name`, with the paths of files from their package on.
         deepest: the longest chain of them that were in progress at one time, the caller first.
     """
 
@@ -56,18 +65,25 @@ class Entered:
         return f"{len(self.files)} files, {len(self.functions)} functions, {self.depth} deep"
 
 
+@cache
+def _short(file: str) -> str:
+    """Return the path of a file from its package on."""
+    package = next(package for package in PACKAGES if file.startswith(package))
+    return str(Path(file).relative_to(Path(package).parent))
+
+
 def entered(function: Callable[[], object]) -> Entered:
-    """Run a function, and return what of the package it entered in this thread."""
+    """Run a function, and return what of the packages it entered in this thread."""
     found, stack = Entered(), list[str]()
 
     def profile(frame: FrameType, event: str, _: Any) -> None:
         code = frame.f_code
-        if event == "call" and code.co_filename.startswith(PACKAGE):
-            stack.append(f"{code.co_filename.removeprefix(PACKAGE)}:{code.co_qualname}")
+        if event == "call" and code.co_filename.startswith(PACKAGES):
+            stack.append(f"{_short(code.co_filename)}:{code.co_qualname}")
             found.functions.add(stack[-1])
             if len(stack) > found.depth:
                 found.deepest = tuple(stack)
-        elif event == "return" and code.co_filename.startswith(PACKAGE):
+        elif event == "return" and code.co_filename.startswith(PACKAGES):
             stack.pop()
 
     before = sys.getprofile()
@@ -85,38 +101,39 @@ def cases(folder: Path) -> dict[str, Callable[[], object]]:
     Each call does the work anew.
 
     One frame of a capture and of scans is made, each with its tracks, its report and all other
-    files of a run.
+    files of a run; a bag of 8 frames is converted, with a grid for each.
     """
     carlasc.simulate(folder / "capture", count=FRAMES, sensors=3, lidar=LIDAR, bev=False, run=ONE)
     regrid(folder / "capture", SPEC, folder / "grids", run=ONE)
-    finer = GridSpec.published().with_size((64, 64, 16))
-    regrid(folder / "capture", finer, folder / "finer", run=ONE)
-    middle, observe = FRAMES // 2, FromScans()
+    middle = (FRAMES // 2, FRAMES // 2 + 1)
     dataset = Dataset(folder / "grids", grid="evaluation_32x32x8")
 
-    def scans() -> object:
-        with tempfile.TemporaryDirectory(dir=folder) as out:
-            return regrid(
-                folder / "grids", SPEC, out, observe=observe, frames=(middle, middle + 1), run=ONE
-            )
+    def into(write: Callable[[Path], object]) -> Callable[[], object]:
+        def case() -> object:
+            with tempfile.TemporaryDirectory(dir=folder) as out:
+                return write(Path(out) / "out")
 
-    def capture() -> object:
-        with tempfile.TemporaryDirectory(dir=folder) as out:
-            return regrid(
-                folder / "capture",
-                SPEC,
-                out,
-                observe=FromCapture(),
-                frames=(middle, middle + 1),
-                run=ONE,
-            )
+        return case
+
+    def one_frame(source: str, observe: FromScans | FromCapture) -> Callable[[], object]:
+        return into(
+            lambda out: regrid(folder / source, SPEC, out, observe=observe, frames=middle, run=ONE)
+        )
 
     return {
-        "regrid from scans": scans,
-        "regrid of a capture": capture,
+        "regrid from scans": one_frame("grids", FromScans()),
+        "regrid of a capture": one_frame("capture", FromCapture()),
         "Dataset[1]": lambda: dataset[1],
         "evaluate": lambda: carlasc.evaluate(folder / "grids", folder / "grids", run=ONE),
+        "view": into(lambda out: carlasc.view(folder / "grids", out.with_suffix(".html"))),
+        "convert bag": into(_converting_a_bag(folder)),
     }
+
+
+def _converting_a_bag(folder: Path) -> Callable[[Path], object]:
+    drive, store = SimulatedDrive(8, channels=12, columns=120), bags.Messages("mcap")
+    bag = bags.write_bag(folder, "mcap", bags.drive_messages(store, drive, "odometry"), store=store)
+    return lambda out: convert("bag", bag, out, grids=GridOptions(SPEC), run=ONE)
 
 
 def count_case(case: Callable[[], object]) -> Entered:
