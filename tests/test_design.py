@@ -1,4 +1,4 @@
-"""The rooms are in the order that the design says: each imports those above it, never those below."""
+"""The rooms are in the order of the design: each imports those above it, never those below."""
 
 import ast
 import re

@@ -51,7 +51,8 @@ def test_a_source_is_a_mapping_of_paths(world):
     ) as raised:
         source["Town99"]
     assert isinstance(raised.value, MissingDataError)
-    assert source == source and source != carlasc.open(world) and len({source, source}) == 1  # noqa: PLR0124
+    assert source == source  # noqa: PLR0124
+    assert source != carlasc.open(world) and len({source, source}) == 1
 
 
 def test_a_sequence_is_a_collection_of_frames(world):

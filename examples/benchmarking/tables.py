@@ -125,7 +125,8 @@ def difference(
         chosen[0] = range(len(runs))
         means.append(np.take_along_axis(values, chosen, 1).mean(1))
     found = means[0] - means[1]
-    return float(found[0]), *map(float, np.percentile(found[1:], (2.5, 97.5)))  # type: ignore[return-value]
+    low, high = np.percentile(found[1:], (2.5, 97.5))
+    return float(found[0]), float(low), float(high)
 
 
 def with_interval(found: tuple[float, float, float]) -> str:

@@ -261,7 +261,7 @@ def test_a_score_with_certainty_is_the_score_and_its_calibration(data):
 
 
 def test_the_mistakes_of_the_fork_of_js3cnet_are_not_made(data):
-    """Ground stays ground in the labels of points, and class weights are those of the voxel counts."""
+    """Ground stays ground in the labels of points; class weights are those of the voxel counts."""
     from completion.data import class_weights
 
     split = open_split(data, "train", replace(QUICK, network="js3cnet"), training=True)

@@ -135,8 +135,7 @@ _COMMENT = re.compile(r"#.*\bfact: ([a-z0-9-]+)$")
 
 @cache
 def facts() -> dict[str, list[float]]:
-    """Return the numbers of each constant that is beside the name of a fact, in seconds, bytes or as
-    they are.
+    """Return the numbers of each constant beside a fact, in seconds, bytes or as they are.
 
     Raises:
         ValueError: two constants have one name, or a comment stands beside no constant.
