@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, OutputChecker
+from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -211,6 +212,7 @@ def test_commands_in_the_docs_have_the_options_that_they_are_given(page, line):
     command.make_context(name, arguments)  # reads the arguments and runs nothing
 
 
+@cache
 def group():
     from typer.main import get_command
 
@@ -262,6 +264,7 @@ def problems_of(page, text, commands):
     ]
 
 
+@cache
 def options_of_commands():
     return {
         name: options_of(command) | declared_options(name)

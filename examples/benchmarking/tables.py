@@ -5,6 +5,7 @@ seeds.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,10 +51,7 @@ def phantoms(counts: Counts) -> NDArray[np.float64]:
 
 def class_figures() -> dict[str, Figure]:
     """Return the IoU of each class by its name."""
-    return {
-        name: lambda counts, label=label: iou(counts, label)
-        for label, name in CARLASC11.names.items()
-    }  # type: ignore[misc]
+    return {name: partial(iou, label=label) for label, name in CARLASC11.names.items()}
 
 
 MIOU, VEHICLES = "mIoU", "Vehicles"
