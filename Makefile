@@ -19,7 +19,9 @@ help: ## list the targets
 demo: $(DEMO_VENV)/ready ## simulate a town, make its ground truth, check it, draw it
 	$(DEMO_VENV)/bin/carlasc demo demo
 
-test: $(VENV)/ready .system-libraries lint types docs unit ## lint, types, documentation and the quick tests
+# mypy works on one core: side by side with the tests it costs half its time. A test builds the documentation.
+test: $(VENV)/ready .system-libraries lint ## lint, types and the quick tests, which build the documentation
+	$(MAKE) --jobs 2 types unit
 
 test-slow: $(VENV)/ready .system-libraries ## the slow tests: notebooks, browsers, pages of commands, training, benchmarks once
 	$(RUN)/pytest $(SIDE_BY_SIDE) -m slow

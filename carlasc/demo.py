@@ -29,7 +29,7 @@ Step = Callable[[str], AbstractContextManager[Progress]]
 TRAIN, VAL = Path("Train", "Demo_Heavy"), Path("Val", "Demo_Light")
 """The simulated sequences, relative to the folder of the demonstration."""
 _MODULES = ("trimesh", "embreex", "PIL", "imageio_ffmpeg")  # required packages of the extra `demo`
-_EXTRA_MB = 240  # size of the extra `demo`, measured by docs/studies/sizes.py
+_EXTRA_MB = 240  # size of the extra `demo`, measured by docs/studies/sizes.py; fact: demo-size
 _VAL_SHARE = 5  # one in five LiDARs records the drive for validation
 
 

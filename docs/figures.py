@@ -101,12 +101,12 @@ def draw_votes() -> bytes:
     axes.plot(*hit, "o", color=FORWARD, markersize=8)
     axes.text(0.6, 0.28, "sensor", color=INK, ha="center", va="center")
     axes.annotate(
-        "labelled point: a vote for its class", (9.65, 3.35), (10.1, 4.35), color=FORWARD, ha="right",
-        arrowprops={"arrowstyle": "-", "color": FORWARD},
+        "labelled point: a vote for its class", (9.65, 3.35), (10.1, 4.35),
+        color=FORWARD, ha="right", arrowprops={"arrowstyle": "-", "color": FORWARD},
     )  # fmt: skip
     axes.annotate(
-        "free samples, 1.5 m apart: votes for free", tuple(samples[3]), (3.2, 4.35), color=RIGHT, ha="center",
-        arrowprops={"arrowstyle": "-", "color": RIGHT},
+        "free samples, 1.5 m apart: votes for free", tuple(samples[3]), (3.2, 4.35),
+        color=RIGHT, ha="center", arrowprops={"arrowstyle": "-", "color": RIGHT},
     )  # fmt: skip
     axes.text(
         6.0,

@@ -102,7 +102,9 @@ def _runs(groups: Groups) -> str:
     """Return what the runs of a table have in common."""
     runs = next(iter(groups.values()))
     seeds = f"{len(runs)} seeds" if len(runs) > 1 else "one seed"
-    return f"Each row: {seeds}, {runs[0].settings['run']['epochs']} epochs, {len(runs[0].drives)} test drives of {runs[0].frames // len(runs[0].drives)} frames."
+    epochs, drives = runs[0].settings["run"]["epochs"], len(runs[0].drives)
+    frames = runs[0].frames // drives
+    return f"Each row: {seeds}, {epochs} epochs, {drives} test drives of {frames} frames."
 
 
 def _missing(study: str, groups: Groups) -> str:

@@ -1,20 +1,22 @@
-"""The rooms are in the order that the design says: each imports those above it, never those below."""
+"""The rooms are in the order of the design: each imports those above it, never those below."""
 
-import ast
 import re
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 from entered import cases, count_case
+from helpers.sources import modules_of, outline
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
-# Of the package, that one frame of `regrid` from scans enters: see tests/tools/entered.py. 42
-# before scans agreed on classes (consensus.py).
-MOST_FILES, DEEPEST = 43, 16
+# files of both packages that a case of tests/tools/entered.py enters
+MOST_FILES = {"regrid from scans": 40, "view": 20, "convert bag": 60}
+DEEPEST = 16
 
 
+@cache
 def rooms():
     """Return the rooms in the order of the design's table."""
     table = (
@@ -24,18 +26,9 @@ def rooms():
 
 
 def imported(path):
-    """Yield the rooms that a file imports, wherever in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        modules = []
-        if isinstance(node, ast.ImportFrom) and node.module == "carlasc":
-            modules = [f"carlasc.{alias.name}" for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            modules = [node.module or ""]
-        elif isinstance(node, ast.Import):
-            modules = [alias.name for alias in node.names]
-        for module in modules:
-            if (parts := module.split("."))[0] == "carlasc" and len(parts) > 1:
-                yield parts[1]
+    """Return the rooms that a file imports, wherever in it."""
+    parts = (module.split(".") for module in modules_of(path))
+    return {part[1] for part in parts if part[0] == "carlasc" and len(part) > 1}
 
 
 def test_every_room_stands_in_the_table():
@@ -56,17 +49,8 @@ def modules():
 
 
 def test_no_two_modules_import_each_other():
-    graph = {}
-    for name, path in modules().items():
-        nodes = [
-            node
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.ImportFrom)
-        ]
-        wanted = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names} | {
-            n.module for n in nodes
-        }
-        graph[name] = wanted & set(modules())
+    files = modules()
+    graph = {name: modules_of(path) & files.keys() for name, path in files.items()}
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the modules
 
 
@@ -83,23 +67,12 @@ def test_no_room_imports_one_below_it():
             assert not below, f"{path.relative_to(ROOT)} imports {', '.join(below)}"
 
 
-def test_rooms_import_rooms_and_not_the_top_package():
-    for room in ("converting", "inspection", "running", "testing"):
-        for path in (PACKAGE / room).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text())):
-                names = (
-                    {alias.name for alias in node.names}
-                    if isinstance(node, ast.Import | ast.ImportFrom)
-                    else set()
-                )
-                from_top = (
-                    isinstance(node, ast.ImportFrom)
-                    and node.module == "carlasc"
-                    and not names <= set(rooms())
-                )
-                assert not (isinstance(node, ast.Import) and "carlasc" in names) and not from_top, (
-                    path
-                )
+@pytest.mark.parametrize("room", ["converting", "inspection", "running", "testing"])
+def test_rooms_import_rooms_and_not_the_top_package(room):
+    for path in (PACKAGE / room).rglob("*.py"):
+        for module, name, line in outline(path).imports:
+            is_top = module == "carlasc" and name not in rooms()
+            assert not is_top, f"{path.relative_to(ROOT)}, line {line}: {name}"
 
 
 def test_converters_and_examples_use_no_private_name():
@@ -108,31 +81,17 @@ def test_converters_and_examples_use_no_private_name():
         assert not private, f"{path.relative_to(ROOT)}: {private}"
 
 
-@pytest.mark.needs("trimesh", "embreex")
-def test_one_frame_from_scans_passes_through_few_files(tmp_path):
-    found = count_case(cases(tmp_path)["regrid from scans"])
-    assert len(found.files) <= MOST_FILES, sorted(found.files)
+@pytest.fixture(scope="module")
+def counted(tmp_path_factory):
+    return cases(tmp_path_factory.mktemp("entered"))
+
+
+@pytest.mark.needs("trimesh", "embreex", "rosbags")
+@pytest.mark.parametrize("case", MOST_FILES)
+def test_a_frame_passes_through_few_files(counted, case):
+    found = count_case(counted[case])
+    assert len(found.files) <= MOST_FILES[case], sorted(found.files)
     assert found.depth <= DEEPEST, found.deepest
-
-
-def modules_of(path):
-    """Yield the full names of the modules that a file imports, wherever in it; by name too
-    (`import_extra("s3fs", ...)`).
-    """
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom):
-            yield node.module or ""
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Name)
-            and node.func.id in ("import_extra", "import_module")
-            and node.args
-            and isinstance(node.args[0], ast.Constant)
-        ):
-            yield str(node.args[0].value)
 
 
 CLIENTS = (

@@ -1,32 +1,41 @@
-"""The size and the names of the house: what one person must keep in mind."""
+"""The size and the names of the house: what one person must keep in mind.
 
-import ast
+Code is counted in tokens, see tests/tools/rooms.py.
+"""
+
 import re
+import warnings
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
+import rooms
+from helpers.sources import outline
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
 FILES = sorted([*PACKAGE.rglob("*.py"), *(ROOT / "converters").rglob("*.py")])
-MOST_LINES, MOST_PARAMETERS, MOST_FIELDS, MOST_ENTRIES = 400, 12, 12, 15
+MOST_PARAMETERS, MOST_FIELDS, MOST_ENTRIES = 12, 12, 16
+MOST_TOKENS = {"carlasc": 380_000, "converters": 99_000}
+DENSEST = 9.5  # tokens a line of code
+WIDEST = 100  # columns
+LONG = 500  # lines of a module, above which it is named
 # names of classes that hold options
 OPTIONS = re.compile(r"\w*(Options|Settings|Scoring|Details|Address)|From\w+|Voting|Run|Lidar")
 
 
-def parsed():
-    """Yield each file, relative to the repository, and its syntax tree."""
+def outlines():
+    """Yield each file, relative to the repository, and what it defines."""
     for path in FILES:
-        yield path.relative_to(ROOT).as_posix(), ast.parse(path.read_text())
+        yield path.relative_to(ROOT).as_posix(), outline(path)
 
 
-def test_no_two_classes_have_the_same_name():
+def test_no_two_public_classes_have_the_same_name():
     homes = defaultdict(list)
-    for path, tree in parsed():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ClassDef):
-                homes[node.name.strip("_")].append(path)
+    for path, found in outlines():
+        for name, _ in found.classes:
+            if not name.startswith("_"):
+                homes[name].append(path)
     assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
 
 
@@ -38,11 +47,36 @@ def test_no_file_name_occurs_more_than_twice():
     assert {name: paths for name, paths in homes.items() if len(paths) > 2} == {}
 
 
-def test_no_module_is_long():
-    lengths = {
-        path.relative_to(ROOT).as_posix(): len(path.read_text().splitlines()) for path in FILES
+def test_no_room_has_grown():
+    grown = {
+        room: f"{now:,}, docs/design.md says {held:,}"
+        for room, held in rooms.table(rooms.PAGE.read_text()).items()
+        if (now := rooms.mass_of_room(room).tokens) > (1 + rooms.GROWTH) * held
     }
-    assert {path: length for path, length in lengths.items() if length > MOST_LINES} == {}
+    assert grown == {}, "if it is worth it, `python tests/tools/rooms.py` writes the table anew"
+
+
+@pytest.mark.parametrize("package", MOST_TOKENS)
+def test_a_package_has_few_tokens_and_few_in_a_line(package):
+    found = rooms.mass(ROOT / package)
+    assert found.tokens <= MOST_TOKENS[package]
+    assert found.tokens / found.lines <= DENSEST
+
+
+def test_no_line_is_wide():
+    wide = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in FILES
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if len(line) > WIDEST and "://" not in line and not line.lstrip().startswith("|")
+    ]
+    assert wide == []
+
+
+def test_long_modules_are_named():
+    for path in FILES:
+        if (lines := len(path.read_text().splitlines())) > LONG:
+            warnings.warn(f"{path.relative_to(ROOT)} has {lines} lines", stacklevel=1)
 
 
 def is_public(path):
@@ -53,29 +87,24 @@ def is_public(path):
 
 
 def test_no_public_function_has_many_parameters():
-    many = {}
-    for path, tree in parsed():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and is_public(path):
-                arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-                names = [
-                    argument.arg for argument in arguments if argument.arg not in ("self", "cls")
-                ]
-                if len(names) > MOST_PARAMETERS and (
-                    not node.name.startswith("_") or node.name == "__init__"
-                ):
-                    many[f"{path}: {node.name}"] = len(names)
+    many = {
+        f"{path}: {name}": len(parameters)
+        for path, found in outlines()
+        for name, parameters in found.functions
+        if is_public(path)
+        and len(parameters) > MOST_PARAMETERS
+        and (not name.startswith("_") or name == "__init__")
+    }
     assert many == {}
 
 
 def test_no_options_object_has_many_fields():
-    many = {}
-    for path, tree in parsed():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ClassDef) and OPTIONS.fullmatch(node.name):
-                fields = [field for field in node.body if isinstance(field, ast.AnnAssign)]
-                if len(fields) > MOST_FIELDS:
-                    many[f"{path}: {node.name}"] = len(fields)
+    many = {
+        f"{path}: {name}": fields
+        for path, found in outlines()
+        for name, fields in found.classes
+        if OPTIONS.fullmatch(name) and fields > MOST_FIELDS
+    }
     assert many == {}
 
 
@@ -84,19 +113,3 @@ def test_the_package_has_few_entries():
         path.stem for path in PACKAGE.iterdir() if path.name not in ("__pycache__", "py.typed")
     }
     assert len(entries - {"__init__", "__main__"}) <= MOST_ENTRIES, sorted(entries)
-
-
-@pytest.mark.parametrize("room", ["converting", "inspection", "running", "testing"])
-def test_rooms_do_not_import_the_top_package(room):
-    rooms = {path.stem for path in PACKAGE.iterdir()}
-    for path in (PACKAGE / room).rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = (
-                [alias.name for alias in node.names]
-                if isinstance(node, ast.Import | ast.ImportFrom)
-                else []
-            )
-            if isinstance(node, ast.Import):
-                assert "carlasc" not in names, f"{path.relative_to(ROOT)}, line {node.lineno}"
-            elif isinstance(node, ast.ImportFrom) and node.module == "carlasc":
-                assert set(names) <= rooms, f"{path.relative_to(ROOT)}, line {node.lineno}: {names}"

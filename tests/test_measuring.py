@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from measuring import __main__ as command
 from measuring import benchmarks
-from measuring.facts import CONSTANTS, EXCEPTIONS, is_right, value_of
+from measuring.facts import CONSTANTS, EXCEPTIONS, facts, is_right, value_of
 from measuring.figures import FILE, PAGES, ROOT, Figure, Figures, pages, ratio, unwritten, within
 from measuring.places import commands, fill, keys, typed_by_hand
 from measuring.sizes import SIZES, by_turns
@@ -70,6 +70,11 @@ def test_constants_of_pages_are_those_of_the_code(page: str) -> None:
             f"{page} does not hold {text} any more: remove it from tests/tools/measuring/facts.py"
         )
         assert is_right(text, name), f"{page} says {text}, {name} is {value_of(name)}"
+
+
+def test_every_fact_of_the_code_is_on_a_page() -> None:
+    shown = {name.partition("[")[0] for page in CONSTANTS.values() for name in page.values()}
+    assert set(facts()) == shown
 
 
 def test_there_are_few_exceptions_and_all_are_on_their_pages() -> None:

@@ -21,7 +21,8 @@ GOOD = {
         from carlasc import Dataset, Flip, ShardSampler
         from torch.utils.data import DataLoader
 
-        dataset = Dataset("CarlaSC", split="train", history=5, fields=("occupancy", "labels", "known"))
+        fields = ("occupancy", "labels", "known")
+        dataset = Dataset("CarlaSC", split="train", history=5, fields=fields)
         dataset.transform = Flip(dataset.spec, seed=0)
         sampler = ShardSampler(dataset, seed=0)
         position: int = sampler.state_dict(trained=2)["position"]

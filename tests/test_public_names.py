@@ -85,7 +85,10 @@ def test_public_names_work_without_docstrings_and_assertions():
 
 
 def test_all_public_names_are_what_a_star_imports():
-    code = "from carlasc.core import *; from carlasc.storage import *; print(Grid.__name__, pack.__name__)"
+    code = (
+        "from carlasc.core import *; from carlasc.storage import *; "
+        "print(Grid.__name__, pack.__name__)"
+    )
     assert run(code) == "Grid pack"
 
 

@@ -20,18 +20,22 @@ const found = [], width = document.documentElement.clientWidth;
 const main = document.querySelector('.md-main');
 if (main.scrollWidth > width) found.push(`the page is ${main.scrollWidth} wide`);
 for (const table of document.querySelectorAll('.md-content table')) {
-  const place = table.closest('.md-typeset__scrollwrap'), name = table.textContent.trim().slice(0, 40);
+  const place = table.closest('.md-typeset__scrollwrap');
+  const name = table.textContent.trim().slice(0, 40);
   if (!place) { found.push(`no place to scroll: ${name}`); continue; }
   if (table.offsetWidth <= place.clientWidth + 1) continue;
-  const style = getComputedStyle(place), first = getComputedStyle(table.querySelector('tbody tr').children[0]);
+  const style = getComputedStyle(place), cell = table.querySelector('tbody tr').children[0];
   if (!/auto|scroll/.test(style.overflowX)) found.push(`cannot be scrolled: ${name}`);
   if (!style.backgroundImage.includes('gradient')) found.push(`no shadow: ${name}`);
-  if (first.position !== 'sticky' || table.querySelector('tbody tr').children[0].offsetWidth > 0.6 * place.clientWidth)
+  const tooWide = cell.offsetWidth > 0.6 * place.clientWidth;
+  if (getComputedStyle(cell).position !== 'sticky' || tooWide)
     found.push(`the first column is not kept: ${name}`);
 }
 // 8 pixels: the padding of code at the end of a line.
-for (const part of document.querySelectorAll('.md-content :is(pre > code, pre, img, p, li, h1, h2, h3, dd)'))
-  if (!part.closest('table') && !part.querySelector('table') && part.scrollWidth > part.clientWidth + 8 && part.clientWidth && getComputedStyle(part).display !== 'inline')
+const parts = '.md-content :is(pre > code, pre, img, p, li, h1, h2, h3, dd)';
+for (const part of document.querySelectorAll(parts))
+  if (!part.closest('table') && !part.querySelector('table') && part.clientWidth
+      && part.scrollWidth > part.clientWidth + 8 && getComputedStyle(part).display !== 'inline')
     found.push(`${part.localName} is cut: ${part.textContent.trim().slice(0, 40)}`);
 return found;
 """

@@ -17,6 +17,7 @@ from carlasc.errors import ArgumentError, count
 
 _FEW = 8  # fewer voxels along an axis are unusual
 _MOVED_M = 1e-3  # bounds that differ by less are equal up to rounding
+# fact: large-frame
 _VOXEL_BYTES, _LARGE_BYTES = 8, 2e9  # size of a label and a count; a larger frame is unusual
 MOTION_HELP = (
     "How moving points are found. boxes, instances, flow: by the field of that name. evidence: a "

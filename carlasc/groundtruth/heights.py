@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from carlasc.core.grids import GridSpec
 from carlasc.motion import ground_height, ground_points
 
-_BELOW = 0.05  # greatest share of ground points below a grid
+_BELOW = 0.05  # greatest share of ground points below a grid; fact: below-grid
 _LOW = 0.05  # quantile of the heights of ground points that a moved grid contains
 _OF_EACH = 1000  # number of heights that represent one drive
 _REACH_M = 25.0  # greatest horizontal distance of ground points

@@ -24,6 +24,7 @@ from carlasc.running.spreading import Run
 from carlasc.storage import as_source, layout
 
 _NAMED = re.compile(r"(.+)_(\d+(?:\.\d+)?)s")  # name of a forecast grid: a name and a time horizon
+# fact: forecast-time
 _TOLERANCE_S = 0.05  # for the time of the later frame: half the period of most LiDARs
 
 

@@ -28,7 +28,7 @@ from carlasc.metrics.rays import RayScore
 Cell = str | float
 Score = Callable[[ConfusionMatrix], float]
 _FEWEST_SEQUENCES = 5
-_DRAWS, _SEED, _EXACT = 2000, 0, 12
+_DRAWS, _SEED, _EXACT = 2000, 0, 12  # fact: draws
 
 
 @dataclass(frozen=True)

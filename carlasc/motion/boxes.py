@@ -24,6 +24,7 @@ from carlasc.motion.segments import MIN_SPEED_M_S, Segment
 from carlasc.motion.solving import nearest_rotation, resample, smooth
 from carlasc.motion.tracks import Track
 
+# fact: smooth-boxes
 _SMOOTH_S = 0.5  # half width of the window in which an object moves with constant acceleration
 _FILLED_IN = 0.3  # weight of a box that was not annotated in its frame
 _STATIC_M = 1.0  # boxes of a static object may move this far, but not steadily

@@ -25,7 +25,7 @@ from carlasc.errors import FormatError
 from carlasc.motion.ground import ground_points
 from carlasc.motion.visibility import SAME_PLACE_M, SortedReturns, look_up, undecided
 
-HORIZON_S = 5.0
+HORIZON_S = 5.0  # fact: horizon
 """Scans up to this many seconds before and after a scan are looked up."""
 
 _OFFSETS_S = (0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0)

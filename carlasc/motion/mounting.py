@@ -30,6 +30,7 @@ _STEP = np.array([0.05, 0.05, 0.05, 2e-3, 2e-3, 2e-3, 0.01])  # steps of the num
 # greatest error of a known value
 _DETERMINED = np.array([0.2, 0.2, 0.2, *np.deg2rad([1.0, 1.0, 1.0]), 0.03])
 # smaller values need no correction
+# fact: relevant-mounting
 _RELEVANT = np.array([0.15, 0.15, 0.15, *np.deg2rad([0.5, 0.5, 0.5]), 0.02])
 _CERTAIN = 4.0  # values of fewer standard errors need none either
 _LIMITS = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5, 2.0])  # greatest values

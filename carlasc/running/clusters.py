@@ -19,8 +19,8 @@ from carlasc.running.clients import Versions, one_line_if_lost
 from carlasc.running.pools import DEATHS, ONE_THREAD, inherited_by_workers
 from carlasc.running.spreading import DaskClient, LazyClient, Run
 
-_CONNECT_S = "10s"  # the Dask setting carlasc.connect-timeout replaces it
-_WORKERS_S = "10m"  # the Dask setting carlasc.workers-timeout replaces it
+_CONNECT_S = "10s"  # the Dask setting carlasc.connect-timeout replaces it; fact: cluster-connect
+_WORKERS_S = "10m"  # the Dask setting carlasc.workers-timeout replaces it; fact: cluster-workers
 _REFILL_S = 2.0
 _FORMS = "local, local:N, tcp://HOST:PORT, slurm, or the dotted path of a class"
 _SETTINGS = {

@@ -26,10 +26,10 @@ from carlasc.errors import FormatError, MissingDataError, reading
 _LONGEST_HEADER = 1 << 14  # bytes; NumPy refuses headers of more than 10,000
 _PIECE = 1 << 18  # bytes that are unpacked at a time
 # bytes: smaller arrays are unpacked at any compression ratio: zeros compress very well
-_SMALL = 1 << 26
+_SMALL = 1 << 26  # fact: small-array
 _MOST_RATIO = 100  # largest compression ratio of larger arrays; Deflate reaches 1032
 # largest frame of any field but a grid: 20 million points, more than any sensor records
-_MOST_BYTES = 1 << 28
+_MOST_BYTES = 1 << 28  # fact: largest-frame
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the methods that NumPy writes
 _ENCRYPTED = 1  # flag
 _READERS = {

@@ -43,7 +43,7 @@ DERIVED = (
     ".carlasc"  # folder of data derived from a sequence: not a field, never packed, safe to delete
 )
 
-FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz
+FRAME_PERIOD_S = 0.1  # scans are recorded at 10 Hz; fact: frame-period
 # value for a probability of 1, in the column `votes` of `<grid>/classes` and in `probabilities`
 CERTAIN = 65535
 

@@ -36,7 +36,7 @@ _LASERS = 32
 # the origin of the vehicle's frame is the rear axle: measured on the ground points of two logs
 _AXLE_HEIGHT_M = 0.33
 # midway between the two LiDARs, which are 0.11 m apart, as calibrated in log 7fab2350
-_ASSUMED_M = (
+_ASSUMED_M = (  # fact: argoverse2-lidar
     1.35,
     0.0,
     1.58,

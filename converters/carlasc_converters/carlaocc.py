@@ -36,7 +36,7 @@ from carlasc_converters.files import opening, read_text
 from carlasc_converters.ply import PlyVertices
 
 # the simulation runs at 10 frames per second, and the set's own loader gives frame i the time 0.1 i
-_PERIOD_S = 0.1
+_PERIOD_S = 0.1  # fact: carlaocc-period
 _SCANS, _PROPERTIES = "semantic_lidar", ("x", "y", "z", "ObjIdx", "ObjTag")
 
 

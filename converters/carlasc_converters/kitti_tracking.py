@@ -32,6 +32,7 @@ from carlasc_converters.kitti_files import (
 )
 from carlasc_converters.oxts import read_packets, world_T_imu
 
+# fact: kitti-tracking-period
 PERIOD_S = 0.1033  # mean time between the scans of KITTI's raw data: the benchmark has no times
 _SPLITS: tuple[tuple[str, Split, str], ...] = (
     ("training", "Train", ""),

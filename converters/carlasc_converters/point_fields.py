@@ -114,7 +114,7 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "instance": ("instance", "instances", "instance_id", "object_id", "track_id"),
 }
 _NANOSECONDS: dict[TimeUnit, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_SCAN_S = (0.004, 0.6)  # duration of a scan: 2 to 200 Hz
+_SCAN_S = (0.004, 0.6)  # duration of a scan: 2 to 200 Hz; fact: scan-duration
 _ABSOLUTE_S = 1e6  # a time of a clock, not one within a scan
 
 

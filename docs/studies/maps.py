@@ -85,7 +85,8 @@ def by_dynamic_object_removal(points: NDArray[np.float32], drive: Recorded) -> N
     """Return the points of a map that the package's best method (`fusion`) keeps, with its own
     settings.
     """
-    from dynamic_object_removal import clean_map_by_fusion  # noqa: PLC0415 (pip install dynamic-object-removal)
+    # pip install dynamic-object-removal
+    from dynamic_object_removal import clean_map_by_fusion  # noqa: PLC0415
 
     scans = []
     for frame in drive.sequence.frames("points").tolist():

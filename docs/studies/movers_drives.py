@@ -257,7 +257,9 @@ def reference(kind: str, seed: int, work: Path) -> dict[tuple[str, int], Referen
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_name(f"{kind}{seed}.{os.getpid()}.npz")
-        np.savez_compressed(unfinished, **_see(kind, seed))  # type: ignore[arg-type]  # no array is named like the option
+        seen = _see(kind, seed)
+        # mypy: an array could be named like the option; none is
+        np.savez_compressed(unfinished, **seen)  # type: ignore[arg-type]
         unfinished.rename(path)
     kept = np.load(path)
     found = {}

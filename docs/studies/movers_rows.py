@@ -203,7 +203,7 @@ def _turned(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def without_movers(drive: Recorded, frame: int) -> Sequence:
-    """Remove the points of all movers from the scans of other frames: what removal can do at best."""
+    """Remove the points of all movers from the scans of other frames: the best of removal."""
 
     def keep(number: int) -> NDArray[np.bool_]:
         flow = drive.sequence.read("flow", number)
@@ -230,7 +230,7 @@ def find_static(drive: Recorded) -> dict[int, NDArray[np.bool_]]:
     path = drive.folder / "dufomap.npz"
     frames = drive.sequence.frames("points").tolist()
     if not path.exists():
-        from dufomap import dufomap  # noqa: PLC0415 (an optional package: pip install "carlasc[study]")
+        from dufomap import dufomap  # noqa: PLC0415 (pip install "carlasc[study]")
 
         scans = {f: drive.sequence.read("points", f)[:, :3].astype(np.float64) for f in frames}
         poses = {f: np.asarray(drive.sequence.read_pose(f)) for f in frames}

@@ -95,7 +95,7 @@ def settings_of_run(scenes: Scenes, config: Config) -> dict[str, Any]:
 
 
 def on_truth(config: Config) -> Config:
-    """Return the settings with which a run is scored: on capture truth, whatever it was trained on."""
+    """Return the settings that score a run: on capture truth, whatever it learned from."""
     return replace(config, grid="evaluation", soft_labels=False)
 
 

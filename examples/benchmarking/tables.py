@@ -5,6 +5,7 @@ seeds.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,10 +51,7 @@ def phantoms(counts: Counts) -> NDArray[np.float64]:
 
 def class_figures() -> dict[str, Figure]:
     """Return the IoU of each class by its name."""
-    return {
-        name: lambda counts, label=label: iou(counts, label)
-        for label, name in CARLASC11.names.items()
-    }  # type: ignore[misc]
+    return {name: partial(iou, label=label) for label, name in CARLASC11.names.items()}
 
 
 MIOU, VEHICLES = "mIoU", "Vehicles"
@@ -125,7 +123,8 @@ def difference(
         chosen[0] = range(len(runs))
         means.append(np.take_along_axis(values, chosen, 1).mean(1))
     found = means[0] - means[1]
-    return float(found[0]), *map(float, np.percentile(found[1:], (2.5, 97.5)))  # type: ignore[return-value]
+    low, high = np.percentile(found[1:], (2.5, 97.5))
+    return float(found[0]), float(low), float(high)
 
 
 def with_interval(found: tuple[float, float, float]) -> str:

@@ -1,4 +1,4 @@
-"""Training samples per second of the loader and of the network: the slower one limits the training."""
+"""Training samples per second of the loader and of the network: the slower one limits training."""
 
 from __future__ import annotations
 

@@ -326,7 +326,7 @@ class JS3CNet(nn.Module):
         return Prediction(logits, self.complet_head(volume))
 
     def segment(self, points: Sequence[Tensor], cells: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return (N, K - 1) logits and (N, 16) shape features of the points alone, scan after scan."""
+        """Return (N, K - 1) logits and (N, 16) shape features of the points, scan after scan."""
         keyed = [pad(scan, (1, 0), value=item) for item, scan in enumerate(cells)]
         return self.seg_head(torch.cat(list(points))[:, self.channels], torch.cat(keyed))
 

@@ -141,7 +141,7 @@ class PointsAndVoxels(Task):
         return outputs.voxels
 
     def set_epoch(self, network: nn.Module, epoch: int) -> None:
-        """Set the momentum of the norms of points and of neighbours, which falls every ten epochs."""
+        """Set the momentum of the norms of points and neighbours, which falls every ten epochs."""
         for module in network.modules():
             # The norms of the U-Net and of the decoder are of other types, and keep their momentum.
             if isinstance(module, nn.BatchNorm1d):

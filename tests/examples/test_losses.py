@@ -131,7 +131,7 @@ def test_blocks_of_certain_voxels_have_the_label_of_the_block(block):
     assert torch.equal(coarsen_soft(certain(target), block, K), certain(coarsen(target, block, K)))
 
 
-def test_a_block_is_occupied_as_probably_as_its_most_probable_voxel_by_the_class_with_the_largest_sum():
+def test_a_block_has_the_greatest_probability_of_its_voxels_and_the_class_of_the_largest_sum():
     def block(*voxels):
         target = torch.zeros(1, K, 8)
         for place, probabilities in enumerate(voxels):

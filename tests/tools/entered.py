@@ -1,8 +1,8 @@
-"""`python -m entered [CASE ...]`: how many files and functions of `carlasc` make one frame, and how
-deeply they call each other.
+"""`PYTHONPATH=tests:tests/tools python -m entered [CASE ...]`: how many files and functions of
+`carlasc` and its converters make one frame, and how deeply they call each other.
 
 What is loaded or compiled once is left out: each case runs once before it is counted. A call counts
-if its code is in a file of the package, that of a compiled loop too where Numba tells of it.
+if its code is in a file of these packages, that of a compiled loop too where Numba tells of it.
 Comprehensions, generator expressions and lambdas count like functions; from Python 3.12 on, most
 comprehensions are no calls, so a version before it counts more. A generator is as deep as the call
 that resumes it.
@@ -20,17 +20,19 @@ from types import CodeType, FrameType
 from typing import Any
 
 import carlasc_converters
+from helpers.converters import bags
 
 import carlasc
-from carlasc import Dataset, FromCapture, FromScans, GridSpec, Run, Scene, regrid
+from carlasc import Dataset, FromCapture, FromScans, GridSpec, Run, regrid
 from carlasc.captures import Lidar
+from carlasc.converting import convert
 from carlasc.core.compiling import cache_folder
 from carlasc.groundtruth import GridOptions
 from carlasc.testing import SimulatedDrive
 
 PACKAGES = {
-    str(Path(package.__file__ or "").parent) + os.sep: shown
-    for package, shown in ((carlasc, ""), (carlasc_converters, "carlasc_converters/"))
+    str(Path(package.__file__ or "").parent) + os.sep: f"{package.__name__}/"
+    for package in (carlasc, carlasc_converters)
 }
 COMPILED = str(cache_folder()) + os.sep  # here are the copies of the sources of compiled loops
 SPEC = GridSpec.published().with_size((32, 32, 8))
@@ -44,7 +46,7 @@ class Entered:
     """What was entered while a function ran.
 
     Attributes:
-        functions: the functions, as `file:name`, with the paths of files in the package.
+        functions: the functions, as `file:name`, with the paths of files from their package on.
         deepest: the longest chain of them that were in progress at one time, the caller first.
     """
 
@@ -66,19 +68,19 @@ class Entered:
 
 
 def file_of(code: CodeType) -> str | None:
-    """Return the path of the file of some code in its package; None if it is in no package."""
+    """Return the path of the file of some code from its package on; None if it is in no package."""
     path = code.co_filename
     if path.startswith(COMPILED):
         module, _, _ = path.removeprefix(COMPILED).partition(os.sep)[0].rpartition(".")
-        return module.replace(".", "/").removeprefix("carlasc/") + ".py"
-    for root, shown in PACKAGES.items():
+        return module.replace(".", "/") + ".py"
+    for root, package in PACKAGES.items():
         if path.startswith(root):
-            return shown + path.removeprefix(root)
+            return package + path.removeprefix(root)
     return None
 
 
 def entered(function: Callable[[], object]) -> Entered:
-    """Run a function, and return what of the package it entered in this thread."""
+    """Run a function, and return what of the packages it entered in this thread."""
     found, stack = Entered(), list[str]()
 
     def profile(frame: FrameType, event: str, _: Any) -> None:
@@ -107,61 +109,39 @@ def cases(folder: Path) -> dict[str, Callable[[], object]]:
     Each call does the work anew.
 
     One frame of a capture and of scans is made, each with its tracks, its report and all other
-    files of a run. A bag of 8 frames is converted, with grids. A page of one frame is written.
+    files of a run; a bag of 8 frames is converted, with a grid for each.
     """
     carlasc.simulate(folder / "capture", count=FRAMES, sensors=3, lidar=LIDAR, bev=False, run=ONE)
     regrid(folder / "capture", SPEC, folder / "grids", run=ONE)
-    finer = GridSpec.published().with_size((64, 64, 16))
-    regrid(folder / "capture", finer, folder / "finer", run=ONE)
-    middle, observe = FRAMES // 2, FromScans()
+    middle = (FRAMES // 2, FRAMES // 2 + 1)
     dataset = Dataset(folder / "grids", grid="evaluation_32x32x8")
 
-    def scans() -> object:
-        with tempfile.TemporaryDirectory(dir=folder) as out:
-            return regrid(
-                folder / "grids", SPEC, out, observe=observe, frames=(middle, middle + 1), run=ONE
-            )
+    def into(write: Callable[[Path], object]) -> Callable[[], object]:
+        def case() -> object:
+            with tempfile.TemporaryDirectory(dir=folder) as out:
+                return write(Path(out) / "out")
 
-    def capture() -> object:
-        with tempfile.TemporaryDirectory(dir=folder) as out:
-            return regrid(
-                folder / "capture",
-                SPEC,
-                out,
-                observe=FromCapture(),
-                frames=(middle, middle + 1),
-                run=ONE,
-            )
+        return case
 
-    def bag() -> object:
-        with tempfile.TemporaryDirectory(dir=folder) as out:
-            return carlasc.convert("bag", make_bag(folder), out, grids=GridOptions(SPEC), run=ONE)
+    def one_frame(source: str, observe: FromScans | FromCapture) -> Callable[[], object]:
+        return into(
+            lambda out: regrid(folder / source, SPEC, out, observe=observe, frames=middle, run=ONE)
+        )
 
-    def page() -> object:
-        with tempfile.TemporaryDirectory(dir=folder) as out:
-            return carlasc.view(scene, Path(out, "page.html"))
-
-    scene = Scene(folder / "grids", grid="evaluation_32x32x8", frames=(middle, middle + 1))
     return {
-        "convert bag": bag,
-        "view": page,
-        "regrid from scans": scans,
-        "regrid of a capture": capture,
+        "regrid from scans": one_frame("grids", FromScans()),
+        "regrid of a capture": one_frame("capture", FromCapture()),
         "Dataset[1]": lambda: dataset[1],
         "evaluate": lambda: carlasc.evaluate(folder / "grids", folder / "grids", run=ONE),
+        "view": into(lambda out: carlasc.view(folder / "grids", out.with_suffix(".html"))),
+        "convert bag": into(_converting_a_bag(folder)),
     }
 
 
-def make_bag(folder: Path) -> Path:
-    """Write a bag of ROS 1 with 8 scans of a simulated drive, if it does not exist; return it."""
-    from helpers.converters.bags import Messages, drive_messages, write_bag
-
-    bag = folder / "drive.bag"
-    if bag.exists():
-        return bag
-    store = Messages("bag")
-    drive = SimulatedDrive(8, rolling=True, channels=16, columns=120)
-    return write_bag(folder, "bag", drive_messages(store, drive, "odometry"), store=store)
+def _converting_a_bag(folder: Path) -> Callable[[Path], object]:
+    drive, store = SimulatedDrive(8, channels=12, columns=120), bags.Messages("mcap")
+    bag = bags.write_bag(folder, "mcap", bags.drive_messages(store, drive, "odometry"), store=store)
+    return lambda out: convert("bag", bag, out, grids=GridOptions(SPEC), run=ONE)
 
 
 def count_case(case: Callable[[], object]) -> Entered:

@@ -38,10 +38,10 @@ _OWN_PROBABILITY = 0.01
 _RETURNED_PROBABILITY = 0.6  # of a voxel with a return of this scan that other scans saw free
 # Hits per metre of free path in a voxel with a return of the frame's own scan, below which this
 # return is an outlier: with other returns around it, and without.
-_OUTLIER_PER_M, _SINGLE_PER_M = 0.02, 0.05
+_OUTLIER_PER_M, _SINGLE_PER_M = 0.02, 0.05  # fact: outlier-per-m
 # A voxel of a body with a greater probability is not free, and one with a smaller probability is
 # not occupied.
-_DOUBTFUL, _UNSURE = 0.05, 0.75
+_DOUBTFUL, _UNSURE = 0.05, 0.75  # fact: doubtful
 _NO_VOXELS = np.empty(0, np.int64)
 
 

@@ -25,6 +25,7 @@ from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
 
 STATIC = 0  # region of the voxels that belong to no actor
+# fact: deformable
 _DEFORMABLE_S = 0.85  # the shape of a person is used for this time before and after
 _RECENT_S = 0.25  # scans within this time before and after a frame show the scene at the frame
 # Points so near to the body of an actor may belong to it, as paths have errors: metres along,

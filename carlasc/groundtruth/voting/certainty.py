@@ -28,8 +28,8 @@ from carlasc.storage import field_files, layout
 
 # Hits per metre of free path above which a voxel is occupied. Chosen on simulated drives: see
 # docs/studies/movers.md.
-GROUND_PER_M = 0.05  # roads, pavements and other ground, which most rays graze
-SOLID_PER_M = 0.15  # other static objects, and actors within their bodies
+GROUND_PER_M = 0.05  # roads, pavements and other ground, which most rays graze; fact: ground-per-m
+SOLID_PER_M = 0.15  # other static objects, and actors within their bodies; fact: solid-per-m
 MOVABLE_PER_M = 0.5  # movable classes, which may come or leave during the window
 
 

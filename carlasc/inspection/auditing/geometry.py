@@ -24,10 +24,11 @@ from carlasc.inspection.auditing.verdicts import State, Stretches, Verdict
 
 # A correction must raise the share of points in occupied voxels by this much, and lower the share
 # of other points by this factor.
-_GAIN, _FEWER = 0.01, 1.3
-_ALIKE = 0.02  # axes and lags are not distinguished if their shares differ by less
+_GAIN, _FEWER = 0.01, 1.3  # fact: fewer-conflicts
+_ALIKE = 0.02  # axes and lags are not distinguished if their shares differ by less; fact: alike
 _SAME = 0.25  # of the gain: corrections are not distinguished if their gains differ by less
 _FLAT = 0.006  # values are equal if their shares differ by less
+# fact: belongs
 _BELONGS = 0.75  # with a smaller share of points, scans and grids do not belong together
 
 

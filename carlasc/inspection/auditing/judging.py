@@ -20,12 +20,13 @@ from carlasc.inspection.heldout_scores import BANDS_M
 
 # A share is a fault from the first value on; the share of one class is a fault from the second on,
 # if it has at least so many counts.
+# fact: audit-shares
 _FREE, _FREE_OF_CLASS, _PHANTOM, _PHANTOM_OF_CLASS, _LEAST = 0.06, 0.4, 0.03, 0.2, 1000
-_TRAIL, _TRAIL_VOXELS = 0.1, 30  # of the path of an actor
+_TRAIL, _TRAIL_VOXELS = 0.1, 30  # of the path of an actor; fact: trail
 _ERASED, _ERASED_VOXELS = 0.2, 40  # of the voxels in which an actor was seen
-_DOUBLED = 0.05  # of the columns with ground
+_DOUBLED = 0.05  # of the columns with ground; fact: doubled
 # least share of the points of a class under another class, and largest share under its own
-_EXPLAINED, _OWN = (
+_EXPLAINED, _OWN = (  # fact: explained
     0.5,
     0.3,
 )

@@ -34,7 +34,7 @@ from carlasc.storage.files import parse_json
 from carlasc.storage.layout import identity_of
 from carlasc.storage.protocol import Sequence
 
-_SAME_TIME_S = 0.06  # a grid belongs to a scan if their times differ by less
+_SAME_TIME_S = 0.06  # a grid belongs to a scan if their times differ by less; fact: same-time
 _NOISE = 255
 _HEIGHT_M = 1.8  # height of the sensor above the ground in CarlaSC, used if the recording has none
 # table of times beside grids that are named by tokens: lines of a token and seconds

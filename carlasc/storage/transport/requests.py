@@ -66,8 +66,8 @@ class RemoteSettings:
 
     requests: int = 32
     attempts: int = 7
-    backoff_s: float = 0.25
-    longest_wait_s: float = 10.0
+    backoff_s: float = 0.25  # fact: backoff
+    longest_wait_s: float = 10.0  # fact: longest-wait
     timeout_s: float = 30.0
 
     @classmethod

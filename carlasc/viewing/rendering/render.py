@@ -43,7 +43,7 @@ from carlasc.viewing.scene import Scene, SceneReader, SceneSource, as_scene
 
 ORBIT_PICTURES = 120  # of an orbit around a single frame
 # frames are 0.1 s apart, so that a film runs at the speed of the drive
-_DRIVE_FPS, _ORBIT_FPS = (
+_DRIVE_FPS, _ORBIT_FPS = (  # fact: film-rate
     10.0,
     20.0,
 )

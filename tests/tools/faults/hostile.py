@@ -33,8 +33,8 @@ from carlasc.errors import CarlascError
 from faults.commands import MESSAGES, TEMPORARY, start, wait
 from faults.outcome import Outcome
 
-MEMORY = 1 << 30  # bytes above what the child has when it starts
-LIMIT_S = 30.0
+MEMORY = 1 << 30  # bytes above what the child has when it starts; fact: fault-memory
+LIMIT_S = 30.0  # fact: fault-limit
 SECRET = b"this text is of another file"
 _LONGEST = 4000  # characters of a line
 _UNSAFE = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")

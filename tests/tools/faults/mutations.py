@@ -38,7 +38,7 @@ from faults.damage import Changes, Files, damage
 from faults.outcome import Outcome
 from faults.targets import TARGETS, Target
 
-CASE_S = 10.0
+CASE_S = 10.0  # fact: fault-case
 """Seconds that a case may take before it counts as a fault."""
 HANG_S = 30.0
 """Seconds without progress after which a child is ended."""

@@ -161,7 +161,7 @@ def _measure_in_a_process(group: str, size: str) -> tuple[dict[str, Figure], str
 
 
 def _measure_here(group: str, size: Size, out: Path) -> None:
-    """Measure a group in this process; each figure is a line of a file as soon as it is measured."""
+    """Measure a group in this process; each figure becomes a line of a file at once."""
     with (
         tempfile.TemporaryDirectory(prefix="measuring-", dir=out.parent) as folder,
         out.open("w") as file,

@@ -1,92 +1,102 @@
 """Numbers on pages that nothing writes, and why they are right: most are constants of the code, and
 a test compares them.
+
+A constant that a page shows has a comment with the name of the fact, on one of its lines or alone
+on the line before, wherever it stands:
+
+    _BELONGS = 0.75  # with a smaller share they do not belong together; fact: NAME
 """
 
 from __future__ import annotations
 
+import ast
 import math
 import re
-from functools import reduce
-from importlib import import_module
-from typing import Any
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
 
 FACTS = ("docs/format.md", "docs/packed-format.md")
 """Pages that define files: their numbers are the format."""
 
-# page -> number as it stands there -> module:NAME, or module:NAME[place]
+SOURCES = ("carlasc", "converters", "tests/tools")
+"""Folders whose constants may be facts."""
+
+# page -> number as it stands there -> fact, or fact[place] of a constant of several numbers
 CONSTANTS: dict[str, dict[str, str]] = {
     "docs/commands/audit.md": {
-        "0.06 s": "carlasc.inspection.auditing.matching:_SAME_TIME_S",
-        "75%": "carlasc.inspection.auditing.geometry:_BELONGS",
-        "2%": "carlasc.inspection.auditing.geometry:_ALIKE",
-        "1.3 times": "carlasc.inspection.auditing.geometry:_FEWER",
-        "6%": "carlasc.inspection.auditing.judging:_FREE",
-        "40%": "carlasc.inspection.auditing.judging:_FREE_OF_CLASS",
-        "3%": "carlasc.inspection.auditing.judging:_PHANTOM",
-        "20%": "carlasc.inspection.auditing.judging:_PHANTOM_OF_CLASS",
-        "10%": "carlasc.inspection.auditing.judging:_TRAIL",
-        "5%": "carlasc.inspection.auditing.judging:_DOUBLED",
-        "30%": "carlasc.inspection.auditing.judging:_OWN",
+        "0.06 s": "same-time",
+        "75%": "belongs",
+        "2%": "alike",
+        "1.3 times": "fewer-conflicts[1]",
+        "6%": "audit-shares",
+        "40%": "audit-shares[1]",
+        "3%": "audit-shares[2]",
+        "20%": "audit-shares[3]",
+        "10%": "trail",
+        "5%": "doubled",
+        "30%": "explained[1]",
     },
-    "docs/commands/capture.md": {"0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S"},
-    "docs/commands/convert.md": {"5%": "carlasc.groundtruth.heights:_BELOW"},
-    "docs/commands/demo.md": {"240 MB": "carlasc.demo:_EXTRA_MB"},
+    "docs/commands/capture.md": {"0.1 s": "frame-period"},
+    "docs/commands/convert.md": {"5%": "below-grid"},
+    "docs/commands/demo.md": {"240 MB": "demo-size"},
     "docs/commands/evaluate.md": {
-        "0.05 s": "carlasc.metrics.forecasts:_TOLERANCE_S",
-        "2,000 times": "carlasc.metrics.results:_DRAWS",
+        "0.05 s": "forecast-time",
+        "2,000 times": "draws",
     },
-    "docs/commands/regrid.md": {"2 GB": "carlasc.cli.grid_flags:_LARGE_BYTES"},
+    "docs/commands/regrid.md": {"2 GB": "large-frame[1]"},
     "docs/commands/validate.md": {
-        "0.02 s": "carlasc.motion.mounting:_RELEVANT[6]",
+        "0.02 s": "relevant-mounting[6]",
     },
     "docs/commands/view.md": {
-        "10 frames per second": "carlasc.viewing.rendering.render:_DRIVE_FPS",
-        "0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S",
+        "10 frames per second": "film-rate",
+        "0.1 s": "frame-period",
     },
+    "docs/design.md": {"5 %": "room-growth"},
     "docs/ground-truth.md": {
-        "5 s": "carlasc.motion.evidence:HORIZON_S",
-        "0.5 s": "carlasc.motion.boxes:_SMOOTH_S",
-        "0.85 s": "carlasc.groundtruth.from_scans.merging:_DEFORMABLE_S",
-        "0.95": "carlasc.groundtruth.from_scans.frame:_DOUBTFUL",
-        "0.75": "carlasc.groundtruth.from_scans.frame:_UNSURE",
-        "0.05": "carlasc.groundtruth.voting.certainty:GROUND_PER_M",
-        "0.15": "carlasc.groundtruth.voting.certainty:SOLID_PER_M",
-        "0.02": "carlasc.groundtruth.from_scans.frame:_OUTLIER_PER_M",
+        "5 s": "horizon",
+        "0.5 s": "smooth-boxes",
+        "0.85 s": "deformable",
+        "0.95": "doubtful",
+        "0.75": "doubtful[1]",
+        "0.05": "ground-per-m",
+        "0.15": "solid-per-m",
+        "0.02": "outlier-per-m",
     },
-    "docs/howto/converter.md": {"0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S"},
+    "docs/howto/converter.md": {"0.1 s": "frame-period"},
     "docs/howto/many-machines.md": {
-        "10 s": "carlasc.running.clusters:_CONNECT_S",
-        "10 minutes": "carlasc.running.clusters:_WORKERS_S",
+        "10 s": "cluster-connect",
+        "10 minutes": "cluster-workers",
     },
     "docs/reliability.md": {
-        "10 s": "faults.mutations:CASE_S",
-        "1 GiB": "faults.hostile:MEMORY",
-        "30 s": "faults.hostile:LIMIT_S",
-        "256 MiB": "carlasc.storage.arrays:_MOST_BYTES",
-        "64 MiB": "carlasc.storage.arrays:_SMALL",
+        "10 s": "fault-case",
+        "1 GiB": "fault-memory",
+        "30 s": "fault-limit",
+        "256 MiB": "largest-frame",
+        "64 MiB": "small-array",
     },
     "docs/sets/argoverse2.md": {
-        "1.35": "carlasc_converters.argoverse2:_ASSUMED_M[0]",
-        "1.58": "carlasc_converters.argoverse2:_ASSUMED_M[2]",
+        "1.35": "argoverse2-lidar",
+        "1.58": "argoverse2-lidar[2]",
     },
     "docs/sets/bag.md": {
-        "4 ms": "carlasc_converters.point_fields:_SCAN_S[0]",
-        "0.6 s": "carlasc_converters.point_fields:_SCAN_S[1]",
+        "4 ms": "scan-duration",
+        "0.6 s": "scan-duration[1]",
     },
-    "docs/sets/carlaocc.md": {"0.1 s": "carlasc_converters.carlaocc:_PERIOD_S"},
-    "docs/sets/kitti-tracking.md": {"0.1033 s": "carlasc_converters.kitti_tracking:PERIOD_S"},
+    "docs/sets/carlaocc.md": {"0.1 s": "carlaocc-period"},
+    "docs/sets/kitti-tracking.md": {"0.1033 s": "kitti-tracking-period"},
     "docs/sets/scans.md": {
-        "4 ms": "carlasc_converters.point_fields:_SCAN_S[0]",
-        "0.6 s": "carlasc_converters.point_fields:_SCAN_S[1]",
-        "0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S",
+        "4 ms": "scan-duration",
+        "0.6 s": "scan-duration[1]",
+        "0.1 s": "frame-period",
     },
-    "docs/sets/semanticposs.md": {"0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S"},
+    "docs/sets/semanticposs.md": {"0.1 s": "frame-period"},
     "docs/studies/scale.md": {
-        "0.25 s": "carlasc.storage.transport.requests:RemoteSettings.backoff_s",
-        "0.25": "carlasc.storage.transport.requests:RemoteSettings.backoff_s",
-        "10 s": "carlasc.storage.transport.requests:RemoteSettings.longest_wait_s",
+        "0.25 s": "backoff",
+        "0.25": "backoff",
+        "10 s": "longest-wait",
     },
-    "docs/sets/synthcity.md": {"0.1 s": "carlasc.storage.layout:FRAME_PERIOD_S"},
+    "docs/sets/synthcity.md": {"0.1 s": "frame-period"},
 }
 
 # (page, number or heading of a section) -> why it is right; at most 20
@@ -111,8 +121,8 @@ EXCEPTIONS: dict[tuple[str, str], str] = {
 _UNITS = {
     "ms": 1e-3,
     "s": 1,
-    "minutes": 60,
     "m": 60,
+    "minutes": 60,
     "%": 0.01,
     "kB": 1e3,
     "MB": 1e6,
@@ -121,15 +131,56 @@ _UNITS = {
     "MiB": 2**20,
     "GiB": 2**30,
 }
+_COMMENT = re.compile(r"#.*\bfact: ([a-z0-9-]+)$")
 
 
-def value_of(name: str) -> float:
+@cache
+def facts() -> dict[str, list[float]]:
+    """Return the numbers of each constant beside a fact, in seconds, bytes or as they are.
+
+    Raises:
+        ValueError: two constants have one name, or a comment stands beside no constant.
+    """
+    held: dict[str, list[float]] = {}
+    root = Path(__file__).parents[3]
+    for path in (path for folder in SOURCES for path in sorted((root / folder).rglob("*.py"))):
+        lines = path.read_text().splitlines()
+        names = {
+            row: found[1] for row, line in enumerate(lines, 1) if (found := _COMMENT.search(line))
+        }
+        for node in ast.walk(ast.parse("\n".join(lines))) if names else ():
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                last = node.end_lineno or node.lineno
+                for row in [row for row in names if node.lineno - 1 <= row <= last]:
+                    before = lines[row - 1].lstrip().startswith("#")
+                    if row >= node.lineno or before:
+                        name = names.pop(row)
+                        if name in held:
+                            raise ValueError(f"{path}:{row}: a second constant is fact {name}")
+                        held[name] = list(_numbers(node.value))
+        if names:
+            raise ValueError(f"{path}: no constant beside the facts {', '.join(names.values())}")
+    return held
+
+
+def _numbers(node: ast.AST) -> Iterator[float]:
+    """Yield the numbers of an expression, in their order."""
+    if isinstance(node, ast.Constant):
+        yield value_of_text(node.value) if isinstance(node.value, str) else float(node.value)
+    elif isinstance(node, ast.BinOp):
+        yield float(eval(ast.unparse(node), {}))
+    else:
+        for part in ast.iter_child_nodes(node):
+            if isinstance(part, ast.expr | ast.keyword):
+                yield from _numbers(part)
+
+
+def value_of(fact: str) -> float:
     """Return a constant of the code, in seconds, bytes or as it is."""
-    module, _, place = name.partition(":")
-    path, index = re.fullmatch(r"([\w.]+)(?:\[(\d+)\])?", place).groups()  # type: ignore[union-attr]
-    value: Any = reduce(getattr, path.split("."), import_module(module))
-    value = value if index is None else value[int(index)]
-    return value_of_text(value) if isinstance(value, str) else float(value)
+    name, place = re.fullmatch(r"([\w-]+)(?:\[(\d+)\])?", fact).groups()  # type: ignore[union-attr]
+    if name not in facts():
+        raise KeyError(f"no constant has the comment `fact: {name}`")
+    return facts()[name][int(place or 0)]
 
 
 def value_of_text(text: str) -> float:

@@ -47,7 +47,7 @@ class Figure:
 
 
 def _number(value: float) -> str:
-    """Return a number with two digits, or three if it is large, which is as much as a time repeats."""
+    """Return a number with two digits, or three if it is large: times repeat no better."""
     if value >= 99.5:
         return f"{float(f'{value:.3g}'):,.0f}"
     if value >= 0.0995:

@@ -29,7 +29,10 @@ def measure_networks(size: Size, folder: Path) -> Iterator[tuple[str, Figure]]:
             )
             for found in json.loads(ran.stdout):
                 key = f"networks.{found['network']}.{found['history']}.{found['mode']}.{threads}"
-                text = f"{found['network']} T={found['history']}, {found['mode']}, {threads} threads: least wall time per frame of 128 x 128 x 8"
+                text = (
+                    f"{found['network']} T={found['history']}, {found['mode']}, {threads} threads: "
+                    "least wall time per frame of 128 x 128 x 8"
+                )
                 yield key, Figure(found["fastest_ms"], "ms", text)
                 if found["mode"] != "eager":
                     yield f"{key}.ratio", Figure(found["speedup"], "", f"{text}, eager / this")

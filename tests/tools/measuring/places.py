@@ -29,8 +29,8 @@ _MEASURED = re.compile(
     r"|(?<![\w.,/-])[01]\.\d\d+(?![\d.,]*\d| (?:to|and|or) |,? ?(?:m|cm|mm|degrees?|rad|m/s|Hz)\b)"
 )
 _CELL = re.compile(
-    r"[*±~$]*\d[\d,]*(?:\.\d+| ?%| (?:ms|s|MB|GB))(?! ?(?:m|cm|mm|degrees)\b)\**(?: ?(?:±|to |\(|/ "
-    r"?|/s).*)?"
+    r"[*±~$]*\d[\d,]*(?:\.\d+| ?%| (?:ms|s|MB|GB))(?! ?(?:m|cm|mm|degrees)\b)\**"
+    r"(?: ?(?:±|to |\(|/ ?|/s).*)?"
 )
 
 

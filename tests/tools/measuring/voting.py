@@ -41,10 +41,12 @@ from carlasc.groundtruth.voting.ballot import count_votes
 from carlasc.groundtruth.voting.ballot import Observation
 
 held = np.load(sys.argv[1])
-scans = [Observation(*(held[f"{name}{n}"] for name in ("points", "labels", "pose"))) for n in range(len(held) // 3)]
+parts = ("points", "labels", "pose")
+scans = [Observation(*(held[f"{p}{n}"] for p in parts)) for n in range(len(held) // 3)]
 spec = GridSpec.published(sys.argv[2] if sys.argv[2] == "fine" else "coarse")
 count_votes(scans, spec.with_resolution(0.1) if sys.argv[2] == "finest" else spec).to_grid()
-status = Path("/proc/self/status")  # where there is none: getrusage, which counts what the parent held when it started this process
+# where there is none: getrusage, which counts what the parent held when it started this process
+status = Path("/proc/self/status")
 kilobytes = re.search("VmHWM:[^0-9]*([0-9]+)", status.read_text())[1] if status.exists() else 0
 print(int(kilobytes) / 1e3 or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
 """
