@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from carlasc.cli.common import FAILED, INTERRUPTED, WRONG_USAGE, BatchError, echo, fail
-from carlasc.cli.flags import declared_name
+from carlasc.cli.library import SEPARATOR
 from carlasc.errors import ArgumentError, CarlascError
 
 _INTERRUPTED = (
@@ -98,9 +98,12 @@ def write_options(parameters: list[Any], ctx: Any, formatter: Any) -> None:
 @contextmanager
 def _errors_in_one_line(command: Any) -> Iterator[None]:
     """Turn errors of the library and of the arguments into one line on stderr and an exit code."""
-    options = {
-        declared_name(one.name): _typed(one) for one in getattr(command, "params", ()) if one.name
-    }
+    options: dict[str, str] = {}
+    # a library's argument may be called as an option of the command itself, which then counts
+    for one in sorted(getattr(command, "params", ()), key=lambda one: SEPARATOR not in one.name):
+        typed = _typed(one)
+        names = (one.name, one.name.rpartition(SEPARATOR)[2], typed.strip("-").replace("-", "_"))
+        options |= dict.fromkeys(names, typed)
     try:
         yield
     except _UsageError as error:

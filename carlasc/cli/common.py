@@ -37,7 +37,7 @@ FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
-def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None:
+def read_place(parameter: typer.CallbackParam, place: str | None) -> str | None:
     """Return a path with `~` replaced, or a URL as it is.
 
     Raises:
@@ -59,11 +59,11 @@ def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None
 
 
 def _read_places(parameter: typer.CallbackParam, places: list[str]) -> list[str | None]:
-    """Return several paths or URLs, each as `_read_place` does."""
-    return [_read_place(parameter, place) for place in places]
+    """Return several paths or URLs, each as `read_place` does."""
+    return [read_place(parameter, place) for place in places]
 
 
-def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
+def read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
     """Return the path of a file on this machine.
 
     Raises:
@@ -82,7 +82,7 @@ def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None
 def place_argument(text: str, name: str = "SOURCE", default: str | None = None) -> Any:
     """Return an argument for a path or a URL. `text` is its help, `name` its name in the help."""
     return typer.Argument(
-        metavar=name, help=text, callback=_read_place, show_default=default or True
+        metavar=name, help=text, callback=read_place, show_default=default or True
     )
 
 
@@ -96,17 +96,17 @@ def places_argument(text: str, name: str = "SOURCES") -> Any:
 
 def place_option(*flags: str, text: str) -> Any:
     """Return an option for a path or a URL."""
-    return typer.Option(*flags, help=text, callback=_read_place)
+    return typer.Option(*flags, help=text, callback=read_place)
 
 
 def file_argument(text: str, name: str = "OUT") -> Any:
     """Return an argument for a path on this machine, where files of other formats are written."""
-    return typer.Argument(metavar=name, help=text, callback=_read_file)
+    return typer.Argument(metavar=name, help=text, callback=read_file)
 
 
 def file_option(*flags: str, text: str, **settings: Any) -> Any:
     """Return an option for a path on this machine."""
-    return typer.Option(*flags, help=text, callback=_read_file, **settings)
+    return typer.Option(*flags, help=text, callback=read_file, **settings)
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -280,10 +280,29 @@ def parse_numbers(
     return values
 
 
-def _read_frames(text: str | None) -> FrameRange | None:
+def read_frames(text: str | None) -> FrameRange | None:
+    """Return the frames of "A:B"."""
     from carlasc.core.frames import FrameRange
 
     return None if text is None else FrameRange.parse(text)
+
+
+def read_window(parameter: typer.CallbackParam, text: str | None) -> tuple[int, int] | None:
+    """Return the first and the last scan of a window from "A:B"."""
+    if text is None:
+        return None
+    first, _, last = text.partition(":")
+    try:
+        return int(first), int(last)
+    except ValueError:
+        raise ArgumentError(
+            parameter.name or "window",
+            expected="A:B, in frames relative to the current frame, such as -30:30",
+            found=repr(text),
+        ) from None
+
+
+FRAMES_HELP = "Only frames A to B, without B. Also: A: (from A on), :B (before B), A (one frame)."
 
 
 SourceClassesOption = Annotated[
@@ -299,9 +318,9 @@ FramesOption = Annotated[
     typer.Option(
         "--frames",
         metavar="A:B",
-        help="Only frames A to B, without B. Also: A: (from A on), :B (before B), A (one frame).",
+        help=FRAMES_HELP,
         parser=str,
-        callback=_read_frames,
+        callback=read_frames,
     ),
 ]
 

@@ -12,9 +12,7 @@ import typer
 
 import carlasc
 from carlasc.cli.common import (
-    FramesOption,
     Json,
-    SourceClassesOption,
     console,
     echo,
     file_option,
@@ -26,7 +24,8 @@ from carlasc.cli.common import (
     starting_with,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
-from carlasc.core.choices import Around, Voxels
+from carlasc.cli.library import Given, Library
+from carlasc.core.choices import Around
 from carlasc.errors import ArgumentError, count
 
 if TYPE_CHECKING:
@@ -34,36 +33,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GridChoiceFlags(Flags):
-    """The grids and the frames that are compared, and the classes of the predictions."""
-
-    grid: Annotated[
-        str | None,
-        typer.Option(help="Name of the grid with the predictions. Default: as for --truth-grid."),
-    ] = None
-    truth_grid: Annotated[
-        str | None,
-        typer.Option(
-            help="Name of the grid with the ground truth. Default: evaluation, or the only grid."
-        ),
-    ] = None
-    source_classes: SourceClassesOption = None
-    frames: FramesOption = None
-
-
-@dataclass(frozen=True)
-class ScoringFlags(Flags):
-    """What is scored in each frame."""
+class RegionFlags(Flags):
+    """The voxels that are scored."""
 
     heading: ClassVar[str] = "What is scored"
 
-    voxels: Annotated[
-        Voxels,
-        typer.Option(
-            help="known: score only voxels that are known in the ground truth. all: score all "
-            "voxels."
-        ),
-    ] = "known"
     near_m: Annotated[
         float,
         typer.Option(
@@ -85,36 +59,11 @@ class ScoringFlags(Flags):
             max=360,
         ),
     ] = 360.0
-    by: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PART",
-            help="Also score by distance, height, visibility, motion or seen (by a camera). Repeat "
-            "it for several.",
-        ),
-    ] = None
-    rays: Annotated[
-        bool,
-        typer.Option(
-            "--rays",
-            help="Also score the first occupied voxel on each ray: RayIoU. Needs poses and a "
-            "Cartesian grid.",
-        ),
-    ] = False
 
-    actors: Annotated[
-        bool,
-        typer.Option(
-            "--actors",
-            help="Also score actors: panoptic quality (PQ), tracking (LSTQ), and velocities.",
-        ),
-    ] = False
-
-    def options(self) -> carlasc.Scoring:
-        """Return the scoring that the options describe."""
+    def region(self) -> _Region | None:
+        """Return the region that the options describe; None for all voxels."""
         whole = (self.near_m, self.far_m, self.fov) == (0.0, None, 360.0)
-        region = None if whole else _Region(self.near_m, self.far_m, self.fov)
-        return carlasc.Scoring(self.voxels, region, self.by or (), self.rays, self.actors)
+        return None if whole else _Region(self.near_m, self.far_m, self.fov)
 
 
 @dataclass(frozen=True)
@@ -139,8 +88,10 @@ class OutputFlags(Flags):
 
 
 def evaluate(
-    choice: GridChoiceFlags,
-    scoring: ScoringFlags,
+    *,
+    choice: Annotated[Given, Library("carlasc.evaluate")],
+    scored: Annotated[Given, Library("carlasc.Scoring")],
+    region: RegionFlags,
     output: OutputFlags,
     work: OneWorkerFlags,
     source: Annotated[
@@ -199,7 +150,8 @@ def evaluate(
         from carlasc.inspection.charts import check_plot
 
         check_plot(output.plot)  # before anything is counted
-    name, common = name or Path(source).name, vars(choice)
+    name, common = name or Path(source).name, dict(choice.values)
+    scoring: carlasc.Scoring = scored.make(region=region.region())
     if forecast is not None:
         alone = {
             "all_conventions": all_conventions,
@@ -217,7 +169,7 @@ def evaluate(
         common |= {"convention": convention, "around": forecast}
         with work.spread("Scoring", usual=1) as run:
             by_time = carlasc.metrics.evaluate_forecasts(
-                source, truth, scoring=scoring.options(), run=run, **common
+                source, truth, scoring=scoring, run=run, **common
             )
         _print_forecasts(by_time, name, output)
         return
@@ -230,12 +182,10 @@ def evaluate(
         return
     common = {**common, "convention": convention}
     with work.spread("Scoring", usual=1) as run:
-        result = carlasc.evaluate(
-            source, truth, scoring=scoring.options(), name=name, run=run, **common
-        )
+        result = carlasc.evaluate(source, truth, scoring=scoring, name=name, run=run, **common)
     other = None
     if compare is not None:
-        whole = replace(scoring, by=None, rays=False, actors=False).options()
+        whole = replace(scoring, by=(), rays=False, actors=False)
         with work.spread("Scoring --compare", usual=1) as run:
             other = carlasc.evaluate(
                 compare, truth, scoring=whole, name=Path(compare).name, run=run, **common

@@ -7,11 +7,12 @@ from typing import Annotated, Literal
 
 import typer
 
-import carlasc
 from carlasc.cli.common import Overwrite, console, echo
+from carlasc.cli.library import Given, Library
 
 
 def scores(
+    *,
     files: Annotated[
         list[Path], typer.Argument(help="JSON files that `carlasc evaluate --json` printed.")
     ],
@@ -22,18 +23,13 @@ def scores(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write. Default: print the table.")
     ] = None,
-    mixed: Annotated[
-        bool,
-        typer.Option(
-            "--mixed", help="Allow results by different conventions, which cannot be compared."
-        ),
-    ] = False,
+    options: Annotated[Given, Library("carlasc.scores")],
     overwrite: Overwrite = False,
 ) -> None:
     """Put the results of several evaluations into one table."""
     from carlasc.errors import ConflictError
 
-    table = carlasc.scores(files, mixed=mixed)
+    table = options.make(files)
     if format is None and out is not None:
         endings = {".md": "markdown", ".tex": "latex", ".html": "html", ".htm": "html"}
         format = endings.get(out.suffix.lower(), "text")  # type: ignore[assignment]

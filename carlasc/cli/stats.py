@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-import carlasc
 from carlasc.cli.common import (
     Json,
     console,
@@ -19,6 +18,7 @@ from carlasc.cli.common import (
     report_failures,
 )
 from carlasc.cli.flags import OneWorkerFlags
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ _KINDS: tuple[Kind, ...] = ("points", "voxels")
 
 
 def stats(
+    *,
     work: OneWorkerFlags,
     source: Annotated[
         str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
@@ -39,12 +40,6 @@ def stats(
             help="Print shares of the whole (total), and also of each split or of each sequence."
         ),
     ] = "split",
-    grid: Annotated[
-        str,
-        typer.Option(
-            help="Grid whose voxels are counted. A sequence that has only one grid uses that one."
-        ),
-    ] = "evaluation",
     remap: Annotated[
         str,
         typer.Option(
@@ -52,7 +47,7 @@ def stats(
             "..."
         ),
     ] = "auto",
-    every: Annotated[int, typer.Option(metavar="N", help="Count only every N-th frame.")] = 1,
+    options: Annotated[Given, Library("carlasc.stats")],
     plot: Annotated[
         Path | None,
         file_option("--plot", text="Also draw the histograms to this .png, .svg or .pdf file."),
@@ -67,9 +62,7 @@ def stats(
     if plot is not None:  # before counting, which may take hours
         check_plot(plot)
     with work.spread("Counting", usual=1) as run:
-        result = carlasc.stats(
-            source, grid=grid, remap=None if remap == "none" else remap, every=every, run=run
-        )
+        result: Statistics = options.make(source, remap=None if remap == "none" else remap, run=run)
     if plot is not None:
         draw_histograms(result, plot)
     if as_json:

@@ -18,7 +18,8 @@ from carlasc.cli.common import (
     report_failures,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
-from carlasc.cli.grid_flags import GridFlags, WindowFlags
+from carlasc.cli.grid_flags import GridFlags, MotionGiven
+from carlasc.cli.library import Given, Library
 from carlasc.errors import ArgumentError, count
 
 if TYPE_CHECKING:
@@ -61,13 +62,7 @@ def validate(
     source: Annotated[
         str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
     ] = ".",
-    every: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Read the contents of every N-th frame. Default: about forty frames per sequence.",
-        ),
-    ] = None,
+    options: Annotated[Given, Library("carlasc.validate")],
     full: Annotated[bool, typer.Option("--full", help="Read the contents of all frames.")] = False,
     everything: Annotated[
         bool,
@@ -76,7 +71,8 @@ def validate(
     as_json: Json = False,
     holdout: HoldoutFlags,
     grid: HoldoutGridFlags,
-    scans: WindowFlags,
+    scans: Annotated[Given, Library("carlasc.FromScans", "window dynamic")],
+    motion: MotionGiven,
     work: OneWorkerFlags,
 ) -> None:
     """Check a data set: files, poses, times, and whether scans agree with poses and grids.
@@ -87,21 +83,24 @@ def validate(
     rigid or jump, and gaps. By comparing scans with poses and grids, it recognizes a mirrored y
     axis, poses of a camera, transposed rotations, and a grid shifted by one voxel.
     """
-    if full and every is not None:
+    if full and options.is_given:
         raise ArgumentError(
             "every", expected="only one of --every and --full", found="both", advice="leave one out"
         )
-    if not holdout.holdout and (holdout.is_given or grid.is_given or scans.is_given):
+    if not holdout.holdout and (
+        holdout.is_given or grid.is_given or scans.is_given or motion.is_given
+    ):
         raise ArgumentError(
             "holdout",
             expected="--holdout, because its options are given",
             found="none",
             advice="give `holdout`",
         )
-    spec, observe = grid.spec_or_published(), scans.from_scans(carlasc.motion.PoseOptions("file"))
+    spec = grid.spec_or_published()
+    observe = scans.make(motion=motion.make(), poses=carlasc.motion.PoseOptions("file"))
     rays = None
     with work.spread("Validating", "steps", usual=1) as run:
-        result = carlasc.validate(source, every=1 if full else every, run=run)
+        result = options.make(source, **({"every": 1} if full else {}), run=run)
     if holdout.holdout:
         left_out = holdout.holdout_every or carlasc.inspection.EVERY
         with work.spread("Leaving scans out") as run:
