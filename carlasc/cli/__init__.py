@@ -9,7 +9,7 @@ import importlib.util
 import sys
 from collections.abc import Iterator, MutableMapping, Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -95,8 +95,12 @@ def make_command(name: str, declared: Sequence[OptionDeclaration] = ()) -> Any:
     takes_declared = hasattr(module, "declared_options")
     single = typer.Typer(add_completion=False, **_SETTINGS)
     cls = _DeclaringCommand if takes_declared and not declared else Command
-    single.command(name, cls=cls)(flatten(getattr(module, name), declared))
-    return typer.main.get_command(single)
+    function = flatten(getattr(module, name), declared)
+    single.command(name, cls=cls)(function)
+    made: Any = typer.main.get_command(single)
+    kinds = {name: get_args(hint)[0] for name, hint in function.__annotations__.items()}
+    made.texts = [name for name, kind in kinds.items() if kind in (str, str | None)]
+    return made
 
 
 def _module(name: str) -> ModuleType:

@@ -7,8 +7,9 @@ from __future__ import annotations
 import copy
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import typer
@@ -27,7 +28,27 @@ _OPTIONS = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOpt
 _UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
 
 
-class Command(TyperCommand):
+class _Converting:
+    """Lets options without a value, and texts, skip typer's conversion of values, which loads
+    pydantic: 0.1 s, as long as it takes to load what most commands need.
+
+    Attributes:
+        texts: names of the parameters whose values are taken as they are typed.
+    """
+
+    texts: Container[str] = ()
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters, with the option `--help`."""
+        parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for one in parameters:
+            if not isinstance(one.process_value, partial):
+                is_text = one.name in self.texts
+                one.process_value = partial(_process, one, one.process_value, is_text)
+        return parameters
+
+
+class Command(_Converting, TyperCommand):
     """A command whose help is plain text, and whose errors are one line on stderr and an exit code."""
 
     def make_context(
@@ -50,7 +71,7 @@ class Command(TyperCommand):
         write_options(self.get_params(ctx), ctx, formatter)
 
 
-class CommandGroup(TyperGroup):
+class CommandGroup(_Converting, TyperGroup):
     """The commands. An unknown name prints one line on stderr."""
 
     def make_context(
@@ -75,6 +96,13 @@ class CommandGroup(TyperGroup):
     def summary(self, name: str) -> str:
         """Return what a command does, in a sentence or two: the first paragraph of its help."""
         return " ".join((self.commands[name].help or "").partition("\n\n")[0].split())
+
+
+def _process(parameter: Any, convert: Any, is_text: bool, ctx: Any, value: Any) -> Any:
+    needs_none = is_text or value in (None, parameter.default)
+    if not needs_none or (value is None and parameter.required):
+        return convert(ctx, value)
+    return value if parameter.callback is None else parameter.callback(ctx, parameter, value)
 
 
 def write_options(parameters: list[Any], ctx: Any, formatter: Any) -> None:

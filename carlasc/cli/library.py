@@ -55,6 +55,7 @@ TABLE = {
     "carlasc.StyleOptions": Shown("Style", renamed={"name": "--style", "captions": "--caption"}),
     "carlasc.Voting": Shown("Votes", renamed={"rule": "--voting", "keep": "--keep-votes"}),
     "carlasc.audit": Shown(files="keep"),
+    "carlasc.captures.Lidar": Shown("Traffic and sensors", renamed={"range_m": "--range"}),
     "carlasc.convert": Shown(hidden="sequences"),
     "carlasc.evaluate": Shown(hidden="convention name"),
     "carlasc.export": Shown(hidden="sequences"),
@@ -63,6 +64,7 @@ TABLE = {
         "Scans merged over time", hidden="min_speed_m_s", renamed={"source": "--motion"}
     ),
     "carlasc.motion.PoseOptions": Shown("Poses", renamed={"source": "--poses"}),
+    "carlasc.simulate": Shown("Traffic and sensors"),
     "carlasc.stats": Shown(hidden="remap"),
     "carlasc.view": Shown(renamed={"thin_m": "--thin"}),
 }
@@ -194,7 +196,7 @@ def make_option(
         typed, default = f"{typed}/--no-{typed[2:]}", {True: "yes"}.get(default)
     info = typer.Option(
         typed,
-        help=text if default in (None, False, "") else f"{text}  [default: {default}]".strip(),
+        help=text if default in (None, "", ()) or default is False else f"{text}  [default: {default}]".strip(),
         metavar=kind.metavar,
         callback=kind.reader,
         rich_help_panel=heading or None,
