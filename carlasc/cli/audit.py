@@ -11,12 +11,11 @@ import carlasc
 from carlasc.cli.common import (
     FAILED,
     Json,
-    console,
     echo,
     file_option,
-    line,
     place_argument,
     print_json,
+    show,
 )
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.library import Given, Library
@@ -77,7 +76,6 @@ def audit(
 
 
 def _print(result: AuditResult, *, everything: bool) -> None:
-    out = console()
     for note in result.notes:
         echo(f"note: {note}", err=True)
     if not result.verdicts:
@@ -85,14 +83,14 @@ def _print(result: AuditResult, *, everything: bool) -> None:
         return
     for path, verdicts in result.verdicts.items():
         title = f"{path}: {count(result.frames[path], 'frame')}, grids in the coordinate frame of {result.placed[path]}"
-        out.print(line(title, "bold"), soft_wrap=True)
+        show(title, "bold")
         for verdict in verdicts:
             if everything or verdict.state != "sound":
                 text = f"  {verdict.state:<12} {verdict.sentence}"
-                out.print(line(text, _COLORS[verdict.state]), soft_wrap=True)
+                show(text, _COLORS[verdict.state])
     state = (
         "sound, as far as the drives tell"
         if result.ok
         else f"not sound ({count(len(result.faults), 'fault')})"
     )
-    out.print(line(f"{result.grids}: {state}", "bold"), soft_wrap=True)
+    show(f"{result.grids}: {state}", "bold")

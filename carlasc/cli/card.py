@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import carlasc
-from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, report_failures
+from carlasc.cli.common import (
+    Json,
+    SourceArgument,
+    echo,
+    file_option,
+    print_json,
+    report_failures,
+)
 from carlasc.cli.flags import OneWorkerFlags
 from carlasc.cli.library import Given, Library
 from carlasc.errors import MissingDataError, count
@@ -28,9 +35,7 @@ def card(
     *,
     details: Annotated[Given, Library("carlasc.CardDetails")],
     work: OneWorkerFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: SourceArgument = ".",
     out: Annotated[
         Path | None,
         file_option(

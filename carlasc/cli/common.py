@@ -109,6 +109,9 @@ def file_option(*flags: str, text: str, **settings: Any) -> Any:
     return typer.Option(*flags, help=text, callback=read_file, **settings)
 
 
+SourceArgument = Annotated[
+    str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")
@@ -133,6 +136,11 @@ def line(text: str, style: str = "") -> Text:
     from rich.text import Text
 
     return Text(printable(text), style)
+
+
+def show(text: str, style: str = "") -> None:
+    """Print a line on stdout, which the width of the terminal does not break."""
+    console().print(line(text, style), soft_wrap=True)
 
 
 def fail(message: str, code: int = FAILED) -> None:

@@ -16,11 +16,11 @@ from carlasc.cli.common import (
     console,
     echo,
     file_option,
-    line,
     place_argument,
     place_option,
     print_json,
     report_failures,
+    show,
     starting_with,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RegionFlags(Flags):
-    """The voxels that are scored."""
+    """The voxels between two distances, and within an angle about the forward axis."""
 
     heading: ClassVar[str] = "What is scored"
 
@@ -60,10 +60,12 @@ class RegionFlags(Flags):
         ),
     ] = 360.0
 
-    def region(self) -> _Region | None:
-        """Return the region that the options describe; None for all voxels."""
-        whole = (self.near_m, self.far_m, self.fov) == (0.0, None, 360.0)
-        return None if whole else _Region(self.near_m, self.far_m, self.fov)
+    def __call__(self, spec: Any) -> Any:
+        """Return which voxels of a grid are scored. Workers get the object, which pickles."""
+        from carlasc.metrics import distance_band, field_of_view
+
+        band = distance_band(spec, self.near_m, math.inf if self.far_m is None else self.far_m)
+        return band & field_of_view(spec, math.radians(self.fov))
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ def evaluate(
 
         check_plot(output.plot)  # before anything is counted
     name, common = name or Path(source).name, dict(choice.values)
-    scoring: carlasc.Scoring = scored.make(region=region.region())
+    scoring: carlasc.Scoring = scored.make(region=region if region.is_given else None)
     if forecast is not None:
         alone = {
             "all_conventions": all_conventions,
@@ -202,23 +204,6 @@ def evaluate(
     report_failures(result.failures, result.frames + len(result.failures))
 
 
-@dataclass(frozen=True)
-class _Region:
-    """The voxels between two distances, metres, and within an angle about the forward axis,
-    degrees. It pickles into workers.
-    """
-
-    near_m: float
-    far_m: float | None
-    fov: float
-
-    def __call__(self, spec: Any) -> Any:
-        from carlasc.metrics import distance_band, field_of_view
-
-        band = distance_band(spec, self.near_m, math.inf if self.far_m is None else self.far_m)
-        return band & field_of_view(spec, math.radians(self.fov))
-
-
 def _print_tables(tables: Sequence[FigureTable], remark: str, output: OutputFlags) -> None:
     from carlasc.cli.tables import print_table
 
@@ -247,33 +232,25 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
     )
     if output.latex or output.csv:
         return
-    out = console()
     if (interval := result.interval()) is not None:
-        out.print(
-            line(
-                f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to "
-                f"{100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
-            )
+        show(
+            f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to "
+            f"{100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
         )
     if comparison is not None and other is not None:
         found = comparison.difference
-        out.print(
-            line(
-                f"mIoU minus that of {other.name}: {100 * found.value:+.2f}, 95 % interval "
-                f"{100 * found.low:+.2f} to {100 * found.high:+.2f}, p = {comparison.p_value:.3g} "
-                f"({count(len(comparison.sequences), 'sequence')})"
-            )
+        show(
+            f"mIoU minus that of {other.name}: {100 * found.value:+.2f}, 95 % interval "
+            f"{100 * found.low:+.2f} to {100 * found.high:+.2f}, p = {comparison.p_value:.3g} "
+            f"({count(len(comparison.sequences), 'sequence')})"
         )
     if result.actors is not None and not math.isnan(result.actors.velocity_m_s):
         speeds = result.actors.velocity_by_speed.items()
         bands = ", ".join(
             f"from {low:g} m/s {value:.2f}" for low, value in speeds if not math.isnan(value)
         )
-        out.print(
-            line(
-                f"mean velocity error of moving voxels: {result.actors.velocity_m_s:.2f} m/s "
-                f"({bands})"
-            )
+        show(
+            f"mean velocity error of moving voxels: {result.actors.velocity_m_s:.2f} m/s ({bands})"
         )
     for note in result.notes:
         echo(f"note: {note}", err=True)

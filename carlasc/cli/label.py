@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import carlasc
-from carlasc.cli.common import Json, echo, place_argument, place_option, print_json
+from carlasc.cli.common import Json, SourceArgument, echo, place_option, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import MotionGiven
 from carlasc.cli.library import Given, Library
@@ -19,9 +19,7 @@ _REFUSED = {"motion": "logits frames classes by", "images": "logits frames"}  # 
 def label(
     *,
     run: RunFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ],
+    source: SourceArgument,
     out: Annotated[str, place_option("-o", "--out", text="Folder of the labelled data set.")],
     predictions: Annotated[
         str,

@@ -196,13 +196,15 @@ def make_option(
         typed, default = f"{typed}/--no-{typed[2:]}", {True: "yes"}.get(default)
     info = typer.Option(
         typed,
-        help=text if default in (None, "", ()) or default is False else f"{text}  [default: {default}]".strip(),
+        help=text
+        if default in (None, "", ()) or default is False
+        else f"{text}  [default: {default}]".strip(),
         metavar=kind.metavar,
         callback=kind.reader,
         rich_help_panel=heading or None,
         show_default=False,
     )
-    annotation: Any = Annotated[kind.type | None, info]  # type: ignore[name-defined]
+    annotation: Any = Annotated[kind.type | None, info]
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from carlasc.cli.common import Json, echo, place_argument, place_option, print_json
+from carlasc.cli.common import Json, SourceArgument, echo, place_option, print_json
 from carlasc.cli.flags import RunFlags
 from carlasc.cli.grid_flags import PosesGiven
 from carlasc.cli.library import Given, Library
@@ -14,9 +14,7 @@ from carlasc.errors import count
 def refine(
     poses: PosesGiven,
     run: RunFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ],
+    source: SourceArgument,
     out: Annotated[
         str, place_option("-o", "--out", text="Folder of the data set with refined poses.")
     ],

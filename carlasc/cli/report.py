@@ -9,13 +9,13 @@ import typer
 
 from carlasc.cli.common import (
     Json,
+    SourceArgument,
     console,
     echo,
     file_option,
-    line,
-    place_argument,
     print_json,
     report_failures,
+    show,
 )
 from carlasc.cli.flags import WorkFlags
 from carlasc.cli.library import Given, Library
@@ -30,9 +30,7 @@ _SHOWN = 12
 def report(
     *,
     work: WorkFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: SourceArgument = ".",
     options: Annotated[Given, Library("carlasc.report")],
     html: Annotated[
         Path | None,
@@ -70,13 +68,12 @@ def report(
 def _print(result: ReportResult, *, everything: bool) -> None:
     from carlasc.inspection.report_page import describe
 
-    out = console()
     for name, one in result.reports.items():
-        out.print(line(name, "bold"), soft_wrap=True)
+        show(name, "bold")
         rows = describe(one)
         width = max(len(label) for label, _ in rows)
         for label, text in rows:
-            out.print(line(f"  {label:<{width}}  {text}"), soft_wrap=True)
+            show(f"  {label:<{width}}  {text}")
         if one.actors:
             _print_actors(one.actors, everything=everything)
 

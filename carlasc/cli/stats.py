@@ -9,13 +9,13 @@ import typer
 
 from carlasc.cli.common import (
     Json,
+    SourceArgument,
     console,
     echo,
     file_option,
-    line,
-    place_argument,
     print_json,
     report_failures,
+    show,
 )
 from carlasc.cli.flags import OneWorkerFlags
 from carlasc.cli.library import Given, Library
@@ -31,9 +31,7 @@ _KINDS: tuple[Kind, ...] = ("points", "voxels")
 def stats(
     *,
     work: OneWorkerFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: SourceArgument = ".",
     by: Annotated[
         Literal["total", "split", "sequence"],
         typer.Option(
@@ -92,16 +90,13 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
             print_table(out, header, rows, title=f"{kind}, % by sequence")
     total = result.total
     if total.grids:
-        out.print(line(f"{total.known_share:.1%} of voxels known ({count(total.grids, 'grid')})"))
-        out.print(line("voxels % is of the known voxels; class 0 of points is unlabelled"))
+        show(f"{total.known_share:.1%} of voxels known ({count(total.grids, 'grid')})")
+        show("voxels % is of the known voxels; class 0 of points is unlabelled")
     else:
-        out.print(line("no voxels counted: choose a grid with --grid (`carlasc info` lists them)"))
+        show("no voxels counted: choose a grid with --grid (`carlasc info` lists them)")
     if total.actor_voxels:
-        out.print(
-            line(
-                f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} of them "
-                f"move"
-            )
+        show(
+            f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} of them move"
         )
 
 

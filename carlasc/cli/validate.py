@@ -11,11 +11,11 @@ import carlasc
 from carlasc.cli.common import (
     FAILED,
     Json,
+    SourceArgument,
     console,
-    line,
-    place_argument,
     print_json,
     report_failures,
+    show,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
 from carlasc.cli.grid_flags import GridFlags, MotionGiven
@@ -59,9 +59,7 @@ class HoldoutGridFlags(GridFlags):
 
 def validate(
     *,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: SourceArgument = ".",
     options: Annotated[Given, Library("carlasc.validate")],
     full: Annotated[bool, typer.Option("--full", help="Read the contents of all frames.")] = False,
     everything: Annotated[
@@ -126,14 +124,13 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     """Print the findings by kind, errors first; `carlasc demo` uses it too."""
     from carlasc.inspection.findings import SEVERITIES
 
-    out = console()
     for (severity, check), findings in result.grouped().items():
-        out.print(line(f"{severity}: {check} ({len(findings)})", _COLORS[severity]))
+        show(f"{severity}: {check} ({len(findings)})", _COLORS[severity])
         shown = findings if everything else findings[:_SHOWN]
         for finding in shown:
-            out.print(line(f"  {finding}"), soft_wrap=True)
+            show(f"  {finding}")
         if len(findings) > len(shown):
-            out.print(line(f"  ... and {len(findings) - len(shown)} more (--all prints them)"))
+            show(f"  ... and {len(findings) - len(shown)} more (--all prints them)")
     for report in result.sequences:
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})"
@@ -149,21 +146,16 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
                 f"({100 * report.refined_m:.1f} cm with refined poses)"
             )
         name = report.path or result.location
-        out.print(
-            line(f"{name}: {count(report.frames, 'frame')}, {report.sampled} read"), soft_wrap=True
-        )
+        show(f"{name}: {count(report.frames, 'frame')}, {report.sampled} read")
         for figure in figures:
-            out.print(line(f"  {figure}"), soft_wrap=True)
+            show(f"  {figure}")
         if report.mounting:
             mounting = ", ".join(f"{axis} {value}" for axis, value in report.mounting.items())
-            out.print(line(f"  sensor in the frame of the poses: {mounting}"), soft_wrap=True)
+            show(f"  sensor in the frame of the poses: {mounting}")
         for camera, agreement in report.images.items():
-            out.print(line(f"  images of {camera} on the scans: {agreement}"), soft_wrap=True)
+            show(f"  images of {camera} on the scans: {agreement}")
     counts = ", ".join(count(result.count(severity), severity) for severity in SEVERITIES)
-    out.print(
-        line(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold"),
-        soft_wrap=True,
-    )
+    show(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold")
 
 
 def print_held_out(result: HoldoutResult) -> None:
@@ -182,10 +174,7 @@ def print_held_out(result: HoldoutResult) -> None:
         shares = scores.all
         figures = {"free": shares.free, "unknown": shares.unknown, "occupied": shares.occupied}
         text = ", ".join(f"{100 * (share or 0):.2f} % {where}" for where, share in figures.items())
-        console().print(
-            line(f"{name or result.location}: under the given poses: returns in {text} voxels"),
-            soft_wrap=True,
-        )
+        show(f"{name or result.location}: under the given poses: returns in {text} voxels")
 
 
 def _print_scores(title: str, scores: HeldOutScores) -> None:
@@ -209,7 +198,7 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
     )
     if scores.swept_share is not None:
         text = f"{scores.swept_share:.2%} of the {scores.swept_voxels} voxels that the vehicle itself drove through are occupied"
-        out.print(line(text))
+        show(text)
 
 
 def _row(name: str, shares: RayShares) -> list[str]:
