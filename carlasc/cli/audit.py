@@ -82,8 +82,8 @@ def _print(result: AuditResult, *, everything: bool) -> None:
         echo("this part is counted; the part that ends last prints the verdicts")
         return
     for path, verdicts in result.verdicts.items():
-        title = f"{path}: {count(result.frames[path], 'frame')}, grids in the coordinate frame of {result.placed[path]}"
-        show(title, "bold")
+        frames = count(result.frames[path], "frame")
+        show(f"{path}: {frames}, grids in the coordinate frame of {result.placed[path]}", "bold")
         for verdict in verdicts:
             if everything or verdict.state != "sound":
                 text = f"  {verdict.state:<12} {verdict.sentence}"

@@ -22,12 +22,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from carlasc.core.frames import FrameRange
-else:
-    FrameRange = (
-        object  # used in annotations only: importing it loads NumPy, which would slow down `--help`
-    )
-
 _Number = TypeVar("_Number", int, float)
 
 _LINE_S = 10.0  # time between two lines of progress without a terminal, seconds
@@ -167,7 +161,10 @@ def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str =
         what: what these are, in the plural.
     """
     if failures:
-        summary = f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the command again"
+        summary = (
+            f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the "
+            "command again"
+        )
         raise BatchError(summary, [message for _, message in failures])
 
 
@@ -288,8 +285,8 @@ def parse_numbers(
     return values
 
 
-def read_frames(text: str | None) -> FrameRange | None:
-    """Return the frames of "A:B"."""
+def read_frames(text: str | None) -> Any:
+    """Return the FrameRange of "A:B"; typer reads the annotations, and the class loads NumPy."""
     from carlasc.core.frames import FrameRange
 
     return None if text is None else FrameRange.parse(text)
@@ -311,26 +308,6 @@ def read_window(parameter: typer.CallbackParam, text: str | None) -> tuple[int, 
 
 
 FRAMES_HELP = "Only frames A to B, without B. Also: A: (from A on), :B (before B), A (one frame)."
-
-
-SourceClassesOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Class table of the labels in SOURCE, if its metadata do not name it: carla, "
-        "carlasc11, ..."
-    ),
-]
-# read in a callback: typer would replace the message of a parser's ValueError
-FramesOption = Annotated[
-    FrameRange | None,
-    typer.Option(
-        "--frames",
-        metavar="A:B",
-        help=FRAMES_HELP,
-        parser=str,
-        callback=read_frames,
-    ),
-]
 
 
 def _plain(value: Any) -> Any:

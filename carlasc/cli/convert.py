@@ -37,10 +37,10 @@ def _print_list(wanted: bool) -> None:
 
 
 def _print_preview(
-    found: tuple[carlasc.converting.RecordingPreview, ...], out: str, grids: str
+    previews: tuple[carlasc.converting.RecordingPreview, ...], out: str, grids: str
 ) -> None:
     """Print what a conversion would read and write."""
-    for one in found:
+    for one in previews:
         rate = "no times" if one.rate_hz is None else f"{one.rate_hz:g} Hz"
         echo(f"{one.location}: {count(one.frames, 'scan')}, {rate}, of {', '.join(one.sensors)}")
         bounds = " ".join(
@@ -58,10 +58,8 @@ def _print_preview(
             f"  {ground}"
             + (f"; up is {one.up}, so the axes are not x forward, y left, z up" if wrong else "")
         )
-        echo(
-            f"  poses: "
-            f"{'those of the recording' if one.poses == 'file' else 'estimated from the scans with KISS-ICP'}"
-        )
+        estimated = "estimated from the scans with KISS-ICP"
+        echo(f"  poses: {'those of the recording' if one.poses == 'file' else estimated}")
         for note in one.notes:
             echo(f"  {note}")
         echo(
@@ -129,7 +127,7 @@ def convert(
     """
     chosen = None if sequences is None else sequences.split(",")
     if dry_run:
-        found = carlasc.converting.preview(
+        previews = carlasc.converting.preview(
             name,
             source,
             sequences=chosen,
@@ -138,9 +136,9 @@ def convert(
             options=options.values,
         )
         if json:
-            print_json(found)
+            print_json(previews)
         else:
-            _print_preview(found, out, grids)
+            _print_preview(previews, out, grids)
         return
     if making.is_given and grids != "scans":
         raise ArgumentError(

@@ -134,7 +134,8 @@ def evaluate(
         str | None,
         place_option(
             "--compare",
-            text="Other predictions of the same sequences, to compare SOURCE with by a paired test.",
+            text="Other predictions of the same sequences, to compare SOURCE with by a paired "
+            "test.",
         ),
     ] = None,
     name: Annotated[
@@ -177,10 +178,10 @@ def evaluate(
         return
     if all_conventions:
         with work.spread("Scoring", usual=1) as run:
-            found = carlasc.metrics.evaluate_by_all_conventions(
+            results = carlasc.metrics.evaluate_by_all_conventions(
                 source, truth, name=name, run=run, **common
             )
-        _print_conventions(found, output.as_json)
+        _print_conventions(results, output.as_json)
         return
     common = {**common, "convention": convention}
     with work.spread("Scoring", usual=1) as run:
@@ -238,10 +239,10 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
             f"{100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
         )
     if comparison is not None and other is not None:
-        found = comparison.difference
+        gain = comparison.difference
         show(
-            f"mIoU minus that of {other.name}: {100 * found.value:+.2f}, 95 % interval "
-            f"{100 * found.low:+.2f} to {100 * found.high:+.2f}, p = {comparison.p_value:.3g} "
+            f"mIoU minus that of {other.name}: {100 * gain.value:+.2f}, 95 % interval "
+            f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}, p = {comparison.p_value:.3g} "
             f"({count(len(comparison.sequences), 'sequence')})"
         )
     if result.actors is not None and not math.isnan(result.actors.velocity_m_s):
@@ -283,7 +284,7 @@ def _print_forecasts(by_time: Mapping[float, Evaluation], name: str, output: Out
     report_failures(failures, sum(result.frames for result in results) + len(failures))
 
 
-def _print_conventions(found: Any, as_json: bool) -> None:
+def _print_conventions(results: Mapping[str, Any], as_json: bool) -> None:
     """Print a row per convention: its mean IoU and completeness, or why there is none."""
     from carlasc.cli.tables import print_table
     from carlasc.errors import CarlascError
@@ -292,12 +293,12 @@ def _print_conventions(found: Any, as_json: bool) -> None:
         print_json(
             {
                 n: {"impossible": str(r)} if isinstance(r, CarlascError) else r.to_dict()
-                for n, r in found.items()
+                for n, r in results.items()
             }
         )
     else:
         rows, reasons = [], []
-        for name, result in found.items():
+        for name, result in results.items():
             if isinstance(result, CarlascError):
                 rows.append([name, "-", "-", "-", "-", "-"])
                 reasons.append(f"{name}: {result}")
@@ -316,7 +317,7 @@ def _print_conventions(found: Any, as_json: bool) -> None:
         )
         for reason in reasons:
             echo(f"no score: {reason}")
-    for result in found.values():
+    for result in results.values():
         # a frame that cannot be read fails by every convention
         if not isinstance(result, CarlascError):
             report_failures(result.failures, result.frames + len(result.failures))

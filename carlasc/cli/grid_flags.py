@@ -79,14 +79,17 @@ class GridFlags(Flags):
         """
         spec, asked = self._spec()
         unusual = [*unusual_of(spec, asked)]
-        found = "; ".join(text for text, _ in unusual)
+        remark = "; ".join(text for text, _ in unusual)
         if any(mistake for _, mistake in unusual) and not self.yes:
-            expected = f"{_FEW} voxels or more along x and y, the bounds asked for, {_LARGE_BYTES / 1e9:g} GB per frame at most"
+            expected = (
+                f"{_FEW} voxels or more along x and y, the bounds asked for, "
+                f"{_LARGE_BYTES / 1e9:g} GB per frame at most"
+            )
             raise ArgumentError(
-                "grid", expected=expected, found=found, advice="give --yes to make it all the same"
+                "grid", expected=expected, found=remark, advice="give --yes to make it all the same"
             )
         if unusual:
-            echo(f"note: the grid has {found}", err=True)
+            echo(f"note: the grid has {remark}", err=True)
         return spec
 
     def _spec(self) -> tuple[carlasc.GridSpec, carlasc.GridSpec]:
@@ -94,11 +97,10 @@ class GridFlags(Flags):
         three = (("--res", self.res), ("--size", self.size), ("--preset", self.preset))
         given = [option for option, value in three if value is not None]
         if len(given) != 1:
-            found = " and ".join(given) or "none of them"
             raise ArgumentError(
                 "grid",
                 expected="one of --res, --size and --preset",
-                found=found,
+                found=" and ".join(given) or "none of them",
                 advice="try --res 0.2",
             )
         if self.preset == "cylindrical" and self.coordinates == "cartesian":

@@ -75,8 +75,8 @@ def _print(overview: Overview) -> None:
         span = f"{capture.first}..{capture.last}" + (
             f" with {count(capture.gaps, 'gap')}" if capture.gaps else ""
         )
-        text = f"raw capture {capture.path or '.'}: {count(capture.sensors, 'sensor')}, {count(capture.frames, 'frame')} ({span})"
-        show(text)
+        size = f"{count(capture.sensors, 'sensor')}, {count(capture.frames, 'frame')}"
+        show(f"raw capture {capture.path or '.'}: {size} ({span})")
 
 
 def _row(sequence: SequenceOverview) -> list[str]:

@@ -217,17 +217,17 @@ def declarations(name: str) -> dict[str, Declaration]:
     section = re.split(r"^(?:Args|Attributes):\n", ast.get_docstring(node) or "", flags=re.M)[-1]
     texts = dict(_ENTRY.findall(section))
     if isinstance(node, ast.ClassDef):
-        found: list[tuple[str, ast.expr | None, ast.expr | None]] = [
+        declared: list[tuple[str, ast.expr | None, ast.expr | None]] = [
             (field.target.id, field.annotation, field.value)
             for field in node.body
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
         ]
     else:
         arguments = zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)
-        found = [(one.arg, one.annotation, default) for one, default in arguments]
+        declared = [(one.arg, one.annotation, default) for one, default in arguments]
     return {
         name: Declaration(ast.unparse(annotation).split(" | "), _value(default), texts[name])
-        for name, annotation, default in found
+        for name, annotation, default in declared
         if annotation is not None and name in texts
     }
 

@@ -33,15 +33,14 @@ def scores(
     if format is None and out is not None:
         endings = {".md": "markdown", ".tex": "latex", ".html": "html", ".htm": "html"}
         format = endings.get(out.suffix.lower(), "text")  # type: ignore[assignment]
-    if format in (None, "text") and out is None:
+    plain = format in (None, "text")
+    if plain and out is None:
         from carlasc.cli.tables import print_table
 
-        found = table.table()
-        print_table(console(), found.header, found.texts(), title=found.title)
+        figures = table.table()
+        print_table(console(), figures.header, figures.texts(), title=figures.title)
         return
-    text = {
-        "markdown": table.to_markdown, "latex": table.to_latex, "html": table.to_html, "text": table.table().to_csv,
-    }[format or "text"]()  # fmt: skip
+    text = table.table().to_csv() if plain else getattr(table, f"to_{format}")()
     if out is None:
         echo(text, nl=False)
         return

@@ -197,8 +197,10 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
         out, header, [_row(name, shares) for name, shares in parts.items()], title=title, turn=False
     )
     if scores.swept_share is not None:
-        text = f"{scores.swept_share:.2%} of the {scores.swept_voxels} voxels that the vehicle itself drove through are occupied"
-        show(text)
+        show(
+            f"{scores.swept_share:.2%} of the {scores.swept_voxels} voxels that the vehicle itself "
+            "drove through are occupied"
+        )
 
 
 def _row(name: str, shares: RayShares) -> list[str]:
