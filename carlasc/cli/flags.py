@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args, g
 import typer
 
 from carlasc.cli.common import progress_bar
-from carlasc.cli.library import SEPARATOR, Given, Kind, Library, make_option
+from carlasc.cli.library import SEPARATOR, Given, Library, ValueKind, make_option
 
 if TYPE_CHECKING:
     from carlasc.converting import OptionDeclaration
@@ -154,7 +154,7 @@ def _declared(option: OptionDeclaration) -> inspect.Parameter:
     """Return the parameter of a declared option."""
     return make_option(
         _DECLARED + option.name,
-        Kind(Literal[option.choices] if option.choices else option.type),
+        ValueKind(Literal[option.choices] if option.choices else option.type),
         f"--{option.name.replace('_', '-')}",
         option.help,
         default=option.default,

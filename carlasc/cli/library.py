@@ -71,7 +71,7 @@ TABLE = {
 """What commands rename and hide of the library's functions and option objects."""
 
 
-class Kind(NamedTuple):
+class ValueKind(NamedTuple):
     """How a value of an annotation is given on the command line."""
 
     type: Any
@@ -85,13 +85,13 @@ def _read_viewpoint(text: str | None) -> Any:
 
 # an argument that may be several things is what comes first here
 _KINDS = {
-    **dict.fromkeys(("Collection[str]", "Sequence[str]"), Kind(list[str])),
-    **{name: Kind(value) for name, value in vars(choices).items() if get_args(value)},
-    **{kind.__name__: Kind(kind) for kind in (bool, float, int, str)},
-    "Frames": Kind(str, read_frames, "A:B"),
-    "SceneSource": Kind(str, read_place),
-    "Viewpoint": Kind(str, _read_viewpoint),
-    "tuple[int, int]": Kind(str, read_window, "A:B"),
+    **dict.fromkeys(("Collection[str]", "Sequence[str]"), ValueKind(list[str])),
+    **{name: ValueKind(value) for name, value in vars(choices).items() if get_args(value)},
+    **{kind.__name__: ValueKind(kind) for kind in (bool, float, int, str)},
+    "Frames": ValueKind(str, read_frames, "A:B"),
+    "SceneSource": ValueKind(str, read_place),
+    "Viewpoint": ValueKind(str, _read_viewpoint),
+    "tuple[int, int]": ValueKind(str, read_window, "A:B"),
 }
 # of a section of a docstring: a name, and a text that may continue in indented lines
 _ENTRY = re.compile(r"^    (\w+): (.*(?:\n {5,}.*)*)", re.MULTILINE)
@@ -152,7 +152,7 @@ class Library:
             text = FRAMES_HELP if kind.metavar and kind.reader is read_frames else ""
             yield make_option(
                 self._parameter(name),
-                Kind(Path, read_file, "FILE") if name in shown.files.split() else kind,
+                ValueKind(Path, read_file, "FILE") if name in shown.files.split() else kind,
                 typed[name],
                 text or _help(declaration.text, typed),
                 default=declaration.default,
@@ -167,7 +167,7 @@ class Library:
     def _parameter(self, name: str) -> str:
         return f"{self.name.rpartition('.')[2]}{SEPARATOR}{name}"
 
-    def _options(self) -> Iterator[tuple[str, tuple[Declaration, Kind]]]:
+    def _options(self) -> Iterator[tuple[str, tuple[Declaration, ValueKind]]]:
         hidden = TABLE.get(self.name, Shown()).hidden.split()
         for name, declaration in declarations(self.name).items():
             known = next(
@@ -178,7 +178,7 @@ class Library:
 
 
 def make_option(
-    name: str, kind: Kind, typed: str, text: str, *, default: Any = None, heading: str = ""
+    name: str, kind: ValueKind, typed: str, text: str, *, default: Any = None, heading: str = ""
 ) -> inspect.Parameter:
     """Return an option whose value is None if it is not given, so that the library decides.
 
