@@ -154,7 +154,9 @@ def _parameters(function: Callable[..., None]) -> Iterator[tuple[str, str]]:
         option = f"`{'`, `'.join(_names(name, annotation, info))}`"
         if values := _values(annotation):
             option += f" {values}"
-        row = f"| {option} | {_default(parameter.default, info)} | {_escape(info.help or '')} |"
+        text, _, default = (info.help or "").removesuffix("]").partition("  [default: ")
+        default = f"`{default}`" if default else _default(parameter.default, info)
+        row = f"| {option} | {default} | {_escape(text)} |"
         yield row, info.rich_help_panel or ""
 
 

@@ -56,9 +56,9 @@ class Lidar:
     The defaults are those of the data set (see the format page, `docs/format.md#raw-capture`).
 
     Attributes:
-        channels: number of channels, one above the other.
-        points: number of rays per scan over all channels. All channels have the same number.
-        range_m: maximum distance of a return, metres.
+        channels: number of channels of each LiDAR, one above the other.
+        points: number of rays per scan, over all channels. All channels have the same number.
+        range_m: range of each LiDAR, in metres.
         upper_deg: elevation of the highest channel, degrees.
         lower_deg: elevation of the lowest channel, degrees.
         noise_m: maximum error of a coordinate, metres. Errors are uniform.

@@ -210,11 +210,12 @@ def simulate(
         count: number of frames, 0.1 s apart.
         first_frame: number of the first frame. The drive starts at rest in frame 0.
         sensors: number of LiDARs. The first is the ego sensor.
-        seed: seed of the town, its traffic, the sensors' offsets and the noise.
-        traffic: "light", "medium" or "heavy": 25, 50 or 100 moving vehicles, and as many
-            pedestrians.
+        seed: seed of all random choices: the town, its traffic, the offsets of the sensors, and the
+            noise.
+        traffic: amount of traffic: "light", "medium" or "heavy", which are 25, 50 or 100 moving
+            vehicles, and as many pedestrians.
         lidar: model of the LiDARs. None: the data set's.
-        bev: whether to write bird's-eye pictures.
+        bev: write bird's-eye-view pictures.
         cameras: names of the cameras on the roof of the vehicle, from "front", "front_left",
             "front_right", "left", "right", "back_left", "back_right" and "back". Each has images of
             colour, class, instance and depth; see the format page, `docs/format.md#cameras`.

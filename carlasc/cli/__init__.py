@@ -7,9 +7,10 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Iterator, MutableMapping, Sequence
+from collections import UserDict
+from collections.abc import Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -55,33 +56,16 @@ _SETTINGS: dict[str, Any] = {
 }
 
 
-class _Commands(MutableMapping[str, Any]):
+class _Commands(UserDict[str, Any]):
     """The commands by name.
 
     The file of a command is imported on first use, so that `carlasc COMMAND` imports only one.
     """
 
-    def __init__(self) -> None:
-        self._loaded: dict[str, Any] = {
-            name: None for name in _COMMANDS if importlib.util.find_spec(f"carlasc.cli.{name}")
-        }
-
     def __getitem__(self, name: str) -> Any:
-        if self._loaded[name] is None:
-            self._loaded[name] = make_command(name)
-        return self._loaded[name]
-
-    def __setitem__(self, name: str, command: Any) -> None:
-        self._loaded[name] = command
-
-    def __delitem__(self, name: str) -> None:
-        del self._loaded[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._loaded)
-
-    def __len__(self) -> int:
-        return len(self._loaded)
+        if self.data[name] is None:
+            self.data[name] = make_command(name)
+        return self.data[name]
 
 
 def make_command(name: str, declared: Sequence[OptionDeclaration] = ()) -> Any:
@@ -95,8 +79,12 @@ def make_command(name: str, declared: Sequence[OptionDeclaration] = ()) -> Any:
     takes_declared = hasattr(module, "declared_options")
     single = typer.Typer(add_completion=False, **_SETTINGS)
     cls = _DeclaringCommand if takes_declared and not declared else Command
-    single.command(name, cls=cls)(flatten(getattr(module, name), declared))
-    return typer.main.get_command(single)
+    function = flatten(getattr(module, name), declared)
+    single.command(name, cls=cls)(function)
+    made: Any = typer.main.get_command(single)
+    kinds = {name: get_args(hint)[0] for name, hint in function.__annotations__.items()}
+    made.texts = [name for name, kind in kinds.items() if kind in (str, str | None)]
+    return made
 
 
 def _module(name: str) -> ModuleType:
@@ -122,7 +110,8 @@ class _DeclaringCommand(Command):
 class _Group(CommandGroup):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.commands = _Commands()
+        installed = (name for name in _COMMANDS if importlib.util.find_spec(f"carlasc.cli.{name}"))
+        self.commands = _Commands(dict.fromkeys(installed))
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.commands)

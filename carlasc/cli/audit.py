@@ -10,17 +10,15 @@ import typer
 import carlasc
 from carlasc.cli.common import (
     FAILED,
-    FramesOption,
     Json,
-    console,
     echo,
     file_option,
-    line,
     place_argument,
     print_json,
+    show,
 )
 from carlasc.cli.flags import RunFlags
-from carlasc.cli.grid_flags import parse_window
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 if TYPE_CHECKING:
@@ -30,6 +28,7 @@ _COLORS = {"fault": "red", "undetermined": "yellow", "sound": "green"}
 
 
 def audit(
+    *,
     work: RunFlags,
     grids: Annotated[
         str,
@@ -42,25 +41,7 @@ def audit(
     scans: Annotated[
         str, place_argument("The recording that the grids belong to, in CarlaSC's layout.", "SCANS")
     ],
-    grid: Annotated[
-        str | None, typer.Option(help="Name of the grids. Default: evaluation, or the only grid.")
-    ] = None,
-    made_from: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A:B",
-            help="First and last scan that each grid was made from, in frames relative to its "
-            "frame. Default: not known.",
-        ),
-    ] = None,
-    frames: FramesOption = None,
-    keep: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for intermediate counts: an interrupted audit continues there, and --part "
-            "needs it to join the parts."
-        ),
-    ] = None,
+    options: Annotated[Given, Library("carlasc.audit")],
     html: Annotated[
         Path | None,
         file_option(
@@ -80,11 +61,8 @@ def audit(
     The exit code is 0 if no fault was found, and 1 if there is a fault or a frame that cannot be
     read.
     """
-    window = None if made_from is None else parse_window(made_from, "made_from")
     with work.spread("Auditing", usual=1) as run:
-        result = carlasc.audit(
-            grids, scans, grid=grid, made_from=window, frames=frames, keep=keep, run=run
-        )
+        result: AuditResult = options.make(grids, scans, run=run)
     if html is not None and result.verdicts:
         carlasc.inspection.write_audit_page(result, html)
     if as_json:
@@ -98,22 +76,21 @@ def audit(
 
 
 def _print(result: AuditResult, *, everything: bool) -> None:
-    out = console()
     for note in result.notes:
         echo(f"note: {note}", err=True)
     if not result.verdicts:
         echo("this part is counted; the part that ends last prints the verdicts")
         return
     for path, verdicts in result.verdicts.items():
-        title = f"{path}: {count(result.frames[path], 'frame')}, grids in the coordinate frame of {result.placed[path]}"
-        out.print(line(title, "bold"), soft_wrap=True)
+        frames = count(result.frames[path], "frame")
+        show(f"{path}: {frames}, grids in the coordinate frame of {result.placed[path]}", "bold")
         for verdict in verdicts:
             if everything or verdict.state != "sound":
                 text = f"  {verdict.state:<12} {verdict.sentence}"
-                out.print(line(text, _COLORS[verdict.state]), soft_wrap=True)
+                show(text, _COLORS[verdict.state])
     state = (
         "sound, as far as the drives tell"
         if result.ok
         else f"not sound ({count(len(result.faults), 'fault')})"
     )
-    out.print(line(f"{result.grids}: {state}", "bold"), soft_wrap=True)
+    show(f"{result.grids}: {state}", "bold")

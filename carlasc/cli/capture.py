@@ -11,7 +11,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json, progress_bar
 from carlasc.cli.flags import Flags
-from carlasc.core.choices import TrafficLevel
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count as counted
 
 OutArgument = Annotated[
@@ -39,42 +39,12 @@ def camera_names(cameras: str) -> tuple[str, ...]:
 class SensorFlags(Flags):
     """The traffic and the sensors of a drive: the same options in `simulate` and in `capture`."""
 
-    heading: ClassVar[str] = "Traffic and sensors"
-
-    sensors: Annotated[
-        int, typer.Option(help="Number of LiDARs. The first is the ego sensor.", min=1)
-    ] = 20
-    seed: Annotated[
-        int,
-        typer.Option(help="Seed of all random choices: traffic, sensor positions, noise.", min=0),
-    ] = 0
-    traffic: Annotated[
-        TrafficLevel,
-        typer.Option(
-            help="Amount of traffic: 25, 50 or 100 moving vehicles, and as many pedestrians."
-        ),
-    ] = "medium"
-    channels: Annotated[int, typer.Option(help="Number of channels of each LiDAR.", min=1)] = 64
-    points: Annotated[
-        int, typer.Option(help="Number of rays per scan, over all channels.", min=1)
-    ] = 130_000
-    range_m: Annotated[float, typer.Option("--range", help="Range of each LiDAR, in metres.")] = (
-        50.0
-    )
-    bev: Annotated[bool, typer.Option("--bev/--no-bev", help="Write bird's-eye-view pictures.")] = (
-        True
-    )
+    drive: Annotated[Given, Library("carlasc.simulate", "sensors seed traffic bev")]
+    lidar: Annotated[Given, Library("carlasc.captures.Lidar", "channels points range_m")]
 
     def arguments(self) -> dict[str, Any]:
         """Return them as arguments of `carlasc.simulate` and `carlasc.record`."""
-        lidar = carlasc.captures.Lidar(self.channels, self.points, self.range_m)
-        return {
-            "sensors": self.sensors,
-            "seed": self.seed,
-            "traffic": self.traffic,
-            "lidar": lidar,
-            "bev": self.bev,
-        }
+        return {**self.drive.values, "lidar": self.lidar.make()}
 
 
 @dataclass(frozen=True)

@@ -2,82 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
-
-import typer
+from typing import Annotated
 
 import carlasc
-from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, report_failures
-from carlasc.cli.flags import Flags, OneWorkerFlags
+from carlasc.cli.common import (
+    Json,
+    SourceArgument,
+    echo,
+    file_option,
+    print_json,
+    report_failures,
+)
+from carlasc.cli.flags import OneWorkerFlags
+from carlasc.cli.library import Given, Library
 from carlasc.errors import MissingDataError, count
 
 
-@dataclass(frozen=True)
-class DetailFlags(Flags):
-    """Details that the data do not contain."""
-
-    heading: ClassVar[str] = "Details of the publication"
-
-    name: Annotated[
-        str | None, typer.Option(help="Name of the data set. Default: the name of SOURCE.")
-    ] = None
-    description: Annotated[
-        str | None,
-        typer.Option(help="Description in a sentence or two. Default: one made from the data."),
-    ] = None
-    authors: Annotated[
-        list[str] | None,
-        typer.Option("--author", help="Author or group that publishes it. Repeat it for several."),
-    ] = None
-    license: Annotated[
-        str | None,
-        typer.Option(
-            help="Licence of the sequences whose carlasc.json names none: a name such as "
-            "cc-by-4.0, or the URL of its text."
-        ),
-    ] = None
-    citation: Annotated[
-        Path | None,
-        file_option(
-            "--citation", metavar="FILE", text="A BibTeX file that says how to cite the data."
-        ),
-    ] = None
-    url: Annotated[
-        str | None,
-        typer.Option(
-            help="URL where the data are published, such as "
-            "https://huggingface.co/datasets/ORG/NAME."
-        ),
-    ] = None
-    contact: Annotated[
-        str | None, typer.Option(help="Contact for questions, such as an e-mail address.")
-    ] = None
-    version: Annotated[str, typer.Option("--data-version", help="Version of the data.")] = "1.0.0"
-    published: Annotated[
-        str | None,
-        typer.Option(metavar="YYYY-MM-DD", help="Date of the publication. Default: today."),
-    ] = None
-
-    def details(self) -> carlasc.CardDetails:
-        """Return the details of the card."""
-        if self.citation is not None and not self.citation.is_file():
-            raise MissingDataError(
-                self.citation, expected="a BibTeX file", found="nothing", advice="check the path"
-            )
-        citation = None if self.citation is None else self.citation.read_text(errors="replace")
-        return carlasc.CardDetails(
-            **{**vars(self), "authors": self.authors or (), "citation": citation}
+def _details(given: Given) -> carlasc.CardDetails:
+    """Return the details of the card, with the text of the BibTeX file."""
+    file: Path | None = given.values.get("citation")
+    if file is None:
+        return given.make()
+    if not file.is_file():
+        raise MissingDataError(
+            file, expected="a BibTeX file", found="nothing", advice="check the path"
         )
+    return given.make(citation=file.read_text(errors="replace"))
 
 
 def card(
-    details: DetailFlags,
+    *,
+    details: Annotated[Given, Library("carlasc.CardDetails")],
     work: OneWorkerFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: SourceArgument = ".",
     out: Annotated[
         Path | None,
         file_option(
@@ -88,18 +46,7 @@ def card(
             "is a folder or a Parquet store; otherwise the folder that contains SOURCE.",
         ),
     ] = None,
-    pictures: Annotated[
-        bool,
-        typer.Option(
-            "--pictures/--no-pictures", help="Draw a grid and a scan (needs the extra `render`)."
-        ),
-    ] = True,
-    every: Annotated[
-        int, typer.Option(metavar="N", help="Count the classes of every N-th frame.")
-    ] = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing card.")
-    ] = False,
+    options: Annotated[Given, Library("carlasc.card")],
     as_json: Json = False,
 ) -> None:
     """Write the card of a data set: README.md for the Hugging Face Hub, and croissant.json with the
@@ -108,11 +55,9 @@ def card(
     Converted data keep the licence of their source. The command fails if that licence forbids
     publishing what is made from the data.
     """
-    about = details.details()
+    about = _details(details)
     with work.spread("Counting", usual=1) as run:
-        result = carlasc.card(
-            source, out, about=about, pictures=pictures, every=every, overwrite=overwrite, run=run
-        )
+        result: carlasc.inspection.CardResult = options.make(source, out, about=about, run=run)
     if as_json:
         print_json(result.to_dict())
     else:

@@ -7,15 +7,16 @@ from __future__ import annotations
 import copy
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from carlasc.cli.common import FAILED, INTERRUPTED, WRONG_USAGE, BatchError, echo, fail
-from carlasc.cli.flags import declared_name
+from carlasc.cli.library import SEPARATOR
 from carlasc.errors import ArgumentError, CarlascError
 
 _INTERRUPTED = (
@@ -27,7 +28,27 @@ _OPTIONS = re.compile(r"\w+Options\((.*)\)")  # the value of one: `poses=PoseOpt
 _UsageError: Any = typer.BadParameter.__mro__[1]  # typer does not export it
 
 
-class Command(TyperCommand):
+class _Converting:
+    """Lets options without a value, and texts, skip typer's conversion of values, which loads
+    pydantic: 0.1 s, as long as it takes to load what most commands need.
+
+    Attributes:
+        texts: names of the parameters whose values are taken as they are typed.
+    """
+
+    texts: Container[str] = ()
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters, with the option `--help`."""
+        parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for one in parameters:
+            if not isinstance(one.process_value, partial):
+                is_text = one.name in self.texts
+                one.process_value = partial(_process, one, one.process_value, is_text)
+        return parameters
+
+
+class Command(_Converting, TyperCommand):
     """A command whose help is plain text, and whose errors are one line on stderr and an exit code."""
 
     def make_context(
@@ -50,7 +71,7 @@ class Command(TyperCommand):
         write_options(self.get_params(ctx), ctx, formatter)
 
 
-class CommandGroup(TyperGroup):
+class CommandGroup(_Converting, TyperGroup):
     """The commands. An unknown name prints one line on stderr."""
 
     def make_context(
@@ -77,6 +98,13 @@ class CommandGroup(TyperGroup):
         return " ".join((self.commands[name].help or "").partition("\n\n")[0].split())
 
 
+def _process(parameter: Any, convert: Any, is_text: bool, ctx: Any, value: Any) -> Any:
+    needs_none = is_text or value in (None, parameter.default)
+    if not needs_none or (value is None and parameter.required):
+        return convert(ctx, value)
+    return value if parameter.callback is None else parameter.callback(ctx, parameter, value)
+
+
 def write_options(parameters: list[Any], ctx: Any, formatter: Any) -> None:
     """Write parameters under their headings: arguments first, then the options of the command, then
     those of its groups.
@@ -98,9 +126,12 @@ def write_options(parameters: list[Any], ctx: Any, formatter: Any) -> None:
 @contextmanager
 def _errors_in_one_line(command: Any) -> Iterator[None]:
     """Turn errors of the library and of the arguments into one line on stderr and an exit code."""
-    options = {
-        declared_name(one.name): _typed(one) for one in getattr(command, "params", ()) if one.name
-    }
+    options: dict[str, str] = {}
+    # a library's argument may be called as an option of the command itself, which then counts
+    for one in sorted(getattr(command, "params", ()), key=lambda one: SEPARATOR not in one.name):
+        typed = _typed(one)
+        names = (one.name, one.name.rpartition(SEPARATOR)[2], typed.strip("-").replace("-", "_"))
+        options |= dict.fromkeys(names, typed)
     try:
         yield
     except _UsageError as error:

@@ -22,12 +22,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from carlasc.core.frames import FrameRange
-else:
-    FrameRange = (
-        object  # used in annotations only: importing it loads NumPy, which would slow down `--help`
-    )
-
 _Number = TypeVar("_Number", int, float)
 
 _LINE_S = 10.0  # time between two lines of progress without a terminal, seconds
@@ -37,7 +31,7 @@ FAILED, WRONG_USAGE, INTERRUPTED = 1, 2, 130
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
-def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None:
+def read_place(parameter: typer.CallbackParam, place: str | None) -> str | None:
     """Return a path with `~` replaced, or a URL as it is.
 
     Raises:
@@ -59,11 +53,11 @@ def _read_place(parameter: typer.CallbackParam, place: str | None) -> str | None
 
 
 def _read_places(parameter: typer.CallbackParam, places: list[str]) -> list[str | None]:
-    """Return several paths or URLs, each as `_read_place` does."""
-    return [_read_place(parameter, place) for place in places]
+    """Return several paths or URLs, each as `read_place` does."""
+    return [read_place(parameter, place) for place in places]
 
 
-def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
+def read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None:
     """Return the path of a file on this machine.
 
     Raises:
@@ -82,7 +76,7 @@ def _read_file(parameter: typer.CallbackParam, file: Path | None) -> Path | None
 def place_argument(text: str, name: str = "SOURCE", default: str | None = None) -> Any:
     """Return an argument for a path or a URL. `text` is its help, `name` its name in the help."""
     return typer.Argument(
-        metavar=name, help=text, callback=_read_place, show_default=default or True
+        metavar=name, help=text, callback=read_place, show_default=default or True
     )
 
 
@@ -96,19 +90,22 @@ def places_argument(text: str, name: str = "SOURCES") -> Any:
 
 def place_option(*flags: str, text: str) -> Any:
     """Return an option for a path or a URL."""
-    return typer.Option(*flags, help=text, callback=_read_place)
+    return typer.Option(*flags, help=text, callback=read_place)
 
 
 def file_argument(text: str, name: str = "OUT") -> Any:
     """Return an argument for a path on this machine, where files of other formats are written."""
-    return typer.Argument(metavar=name, help=text, callback=_read_file)
+    return typer.Argument(metavar=name, help=text, callback=read_file)
 
 
 def file_option(*flags: str, text: str, **settings: Any) -> Any:
     """Return an option for a path on this machine."""
-    return typer.Option(*flags, help=text, callback=_read_file, **settings)
+    return typer.Option(*flags, help=text, callback=read_file, **settings)
 
 
+SourceArgument = Annotated[
+    str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace what an earlier run with other settings wrote.")
@@ -135,6 +132,11 @@ def line(text: str, style: str = "") -> Text:
     return Text(printable(text), style)
 
 
+def show(text: str, style: str = "") -> None:
+    """Print a line on stdout, which the width of the terminal does not break."""
+    console().print(line(text, style), soft_wrap=True)
+
+
 def fail(message: str, code: int = FAILED) -> None:
     """Print one line on stderr and end the command with an exit code."""
     echo(f"carlasc: {message}", err=True)
@@ -159,7 +161,10 @@ def report_failures(failures: Sequence[tuple[Any, str]], total: int, what: str =
         what: what these are, in the plural.
     """
     if failures:
-        summary = f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the command again"
+        summary = (
+            f"{len(failures)} of {total} {what} failed; the others are done: fix these and run the "
+            "command again"
+        )
         raise BatchError(summary, [message for _, message in failures])
 
 
@@ -280,30 +285,29 @@ def parse_numbers(
     return values
 
 
-def _read_frames(text: str | None) -> FrameRange | None:
+def read_frames(text: str | None) -> Any:
+    """Return the FrameRange of "A:B"; typer reads the annotations, and the class loads NumPy."""
     from carlasc.core.frames import FrameRange
 
     return None if text is None else FrameRange.parse(text)
 
 
-SourceClassesOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Class table of the labels in SOURCE, if its metadata do not name it: carla, "
-        "carlasc11, ..."
-    ),
-]
-# read in a callback: typer would replace the message of a parser's ValueError
-FramesOption = Annotated[
-    FrameRange | None,
-    typer.Option(
-        "--frames",
-        metavar="A:B",
-        help="Only frames A to B, without B. Also: A: (from A on), :B (before B), A (one frame).",
-        parser=str,
-        callback=_read_frames,
-    ),
-]
+def read_window(parameter: typer.CallbackParam, text: str | None) -> tuple[int, int] | None:
+    """Return the first and the last scan of a window from "A:B"."""
+    if text is None:
+        return None
+    first, _, last = text.partition(":")
+    try:
+        return int(first), int(last)
+    except ValueError:
+        raise ArgumentError(
+            parameter.name or "window",
+            expected="A:B, in frames relative to the current frame, such as -30:30",
+            found=repr(text),
+        ) from None
+
+
+FRAMES_HELP = "Only frames A to B, without B. Also: A: (from A on), :B (before B), A (one frame)."
 
 
 def _plain(value: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,54 +18,10 @@ from carlasc.cli.common import (
     print_json,
     starting_with,
 )
-from carlasc.cli.flags import DeclaredOptions, Flags, RunFlags, declared_by
-from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
-from carlasc.core.choices import Axes, FlowSource, Images, SplitName
+from carlasc.cli.flags import DeclaredOptions, RunFlags, declared_by
+from carlasc.cli.grid_flags import GroundTruthFlags, PosesGiven
+from carlasc.cli.library import Given, Library
 from carlasc.errors import ArgumentError, count
-
-
-@dataclass(frozen=True)
-class LayoutFlags(Flags):
-    """Classes, axes, scene flow and images of the written sequences."""
-
-    classes: Annotated[
-        str,
-        typer.Option(
-            help="Classes of the labels. carla: CarlaSC's classes. The name of the data set's own "
-            "class table, such as semantickitti: its ids are kept. auto: the ids of SemanticKITTI "
-            "are kept, all others become carla."
-        ),
-    ] = "auto"
-    axes: Annotated[
-        Axes,
-        typer.Option(
-            help="Axes of the output. left: y is mirrored, as in CarlaSC, which is left-handed. "
-            "right: right-handed, as in the data set."
-        ),
-    ] = "left"
-    flow: Annotated[
-        FlowSource,
-        typer.Option(
-            help="Scene flow. auto: the velocity of each actor, from its tracked boxes, or from "
-            "its points without boxes. none: no flow."
-        ),
-    ] = "auto"
-    allow_unknown: Annotated[
-        bool, typer.Option("--allow-unknown", help="Treat unknown class ids as unlabelled.")
-    ] = False
-    images: Annotated[
-        Images,
-        typer.Option(
-            help="Images of cameras. copy: copied into the output. link: only their paths are "
-            "written. none: left out. Calibrations are always written."
-        ),
-    ] = "none"
-
-    def options(self) -> carlasc.converting.LayoutOptions:
-        """Return how sequences are written."""
-        return carlasc.converting.LayoutOptions(
-            self.classes, self.axes, self.flow, self.allow_unknown, self.images
-        )
 
 
 def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
@@ -82,10 +37,10 @@ def _print_list(wanted: bool) -> None:
 
 
 def _print_preview(
-    found: tuple[carlasc.converting.RecordingPreview, ...], out: str, grids: str
+    previews: tuple[carlasc.converting.RecordingPreview, ...], out: str, grids: str
 ) -> None:
     """Print what a conversion would read and write."""
-    for one in found:
+    for one in previews:
         rate = "no times" if one.rate_hz is None else f"{one.rate_hz:g} Hz"
         echo(f"{one.location}: {count(one.frames, 'scan')}, {rate}, of {', '.join(one.sensors)}")
         bounds = " ".join(
@@ -103,10 +58,8 @@ def _print_preview(
             f"  {ground}"
             + (f"; up is {one.up}, so the axes are not x forward, y left, z up" if wrong else "")
         )
-        echo(
-            f"  poses: "
-            f"{'those of the recording' if one.poses == 'file' else 'estimated from the scans with KISS-ICP'}"
-        )
+        estimated = "estimated from the scans with KISS-ICP"
+        echo(f"  poses: {'those of the recording' if one.poses == 'file' else estimated}")
         for note in one.notes:
             echo(f"  {note}")
         echo(
@@ -117,9 +70,10 @@ def _print_preview(
 
 
 def convert(
+    *,
     options: DeclaredOptions,
-    layout: LayoutFlags,
-    poses: PoseFlags,
+    layout: Annotated[Given, Library("carlasc.LayoutOptions")],
+    poses: PosesGiven,
     making: GroundTruthFlags,
     run: RunFlags,
     name: Annotated[
@@ -144,7 +98,7 @@ def convert(
             "Default: all."
         ),
     ] = None,
-    split: Annotated[SplitName, typer.Option(help="Only sequences of this split.")] = "all",
+    written: Annotated[Given, Library("carlasc.convert")],
     grids: Annotated[
         Literal["scans", "voxels", "none"],
         typer.Option(
@@ -173,18 +127,18 @@ def convert(
     """
     chosen = None if sequences is None else sequences.split(",")
     if dry_run:
-        found = carlasc.converting.preview(
+        previews = carlasc.converting.preview(
             name,
             source,
             sequences=chosen,
-            split=split,
-            poses=poses.options(),
+            **written.values,
+            poses=poses.make(),
             options=options.values,
         )
         if json:
-            print_json(found)
+            print_json(previews)
         else:
-            _print_preview(found, out, grids)
+            _print_preview(previews, out, grids)
         return
     if making.is_given and grids != "scans":
         raise ArgumentError(
@@ -200,19 +154,18 @@ def convert(
         )
     made = carlasc.groundtruth.GridOptions(
         making.grid.spec_or_published(),
-        making.scans.from_scans(poses.options()),
-        making.votes.voting(),
+        making.from_scans(poses),
+        making.votes.make(),
         follow_ground=not bounded,
     )
     with run.spread(f"convert {name}") as spread:
-        result = carlasc.convert(
+        result = written.make(
             name,
             source,
             out,
             sequences=chosen,
-            split=split,
-            layout=layout.options(),
-            poses=poses.options(),
+            layout=layout.make(),
+            poses=poses.make(),
             grids=made if grids == "scans" else "voxels" if grids == "voxels" else None,
             options=options.values,
             run=spread,

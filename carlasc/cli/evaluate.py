@@ -12,21 +12,20 @@ import typer
 
 import carlasc
 from carlasc.cli.common import (
-    FramesOption,
     Json,
-    SourceClassesOption,
     console,
     echo,
     file_option,
-    line,
     place_argument,
     place_option,
     print_json,
     report_failures,
+    show,
     starting_with,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
-from carlasc.core.choices import Around, Voxels
+from carlasc.cli.library import Given, Library
+from carlasc.core.choices import Around
 from carlasc.errors import ArgumentError, count
 
 if TYPE_CHECKING:
@@ -34,36 +33,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GridChoiceFlags(Flags):
-    """The grids and the frames that are compared, and the classes of the predictions."""
-
-    grid: Annotated[
-        str | None,
-        typer.Option(help="Name of the grid with the predictions. Default: as for --truth-grid."),
-    ] = None
-    truth_grid: Annotated[
-        str | None,
-        typer.Option(
-            help="Name of the grid with the ground truth. Default: evaluation, or the only grid."
-        ),
-    ] = None
-    source_classes: SourceClassesOption = None
-    frames: FramesOption = None
-
-
-@dataclass(frozen=True)
-class ScoringFlags(Flags):
-    """What is scored in each frame."""
+class RegionFlags(Flags):
+    """The voxels between two distances, and within an angle about the forward axis."""
 
     heading: ClassVar[str] = "What is scored"
 
-    voxels: Annotated[
-        Voxels,
-        typer.Option(
-            help="known: score only voxels that are known in the ground truth. all: score all "
-            "voxels."
-        ),
-    ] = "known"
     near_m: Annotated[
         float,
         typer.Option(
@@ -85,36 +59,13 @@ class ScoringFlags(Flags):
             max=360,
         ),
     ] = 360.0
-    by: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PART",
-            help="Also score by distance, height, visibility, motion or seen (by a camera). Repeat "
-            "it for several.",
-        ),
-    ] = None
-    rays: Annotated[
-        bool,
-        typer.Option(
-            "--rays",
-            help="Also score the first occupied voxel on each ray: RayIoU. Needs poses and a "
-            "Cartesian grid.",
-        ),
-    ] = False
 
-    actors: Annotated[
-        bool,
-        typer.Option(
-            "--actors",
-            help="Also score actors: panoptic quality (PQ), tracking (LSTQ), and velocities.",
-        ),
-    ] = False
+    def __call__(self, spec: Any) -> Any:
+        """Return which voxels of a grid are scored. Workers get the object, which pickles."""
+        from carlasc.metrics import distance_band, field_of_view
 
-    def options(self) -> carlasc.Scoring:
-        """Return the scoring that the options describe."""
-        whole = (self.near_m, self.far_m, self.fov) == (0.0, None, 360.0)
-        region = None if whole else _Region(self.near_m, self.far_m, self.fov)
-        return carlasc.Scoring(self.voxels, region, self.by or (), self.rays, self.actors)
+        band = distance_band(spec, self.near_m, math.inf if self.far_m is None else self.far_m)
+        return band & field_of_view(spec, math.radians(self.fov))
 
 
 @dataclass(frozen=True)
@@ -139,8 +90,10 @@ class OutputFlags(Flags):
 
 
 def evaluate(
-    choice: GridChoiceFlags,
-    scoring: ScoringFlags,
+    *,
+    choice: Annotated[Given, Library("carlasc.evaluate")],
+    scored: Annotated[Given, Library("carlasc.Scoring")],
+    region: RegionFlags,
     output: OutputFlags,
     work: OneWorkerFlags,
     source: Annotated[
@@ -181,7 +134,8 @@ def evaluate(
         str | None,
         place_option(
             "--compare",
-            text="Other predictions of the same sequences, to compare SOURCE with by a paired test.",
+            text="Other predictions of the same sequences, to compare SOURCE with by a paired "
+            "test.",
         ),
     ] = None,
     name: Annotated[
@@ -199,7 +153,8 @@ def evaluate(
         from carlasc.inspection.charts import check_plot
 
         check_plot(output.plot)  # before anything is counted
-    name, common = name or Path(source).name, vars(choice)
+    name, common = name or Path(source).name, dict(choice.values)
+    scoring: carlasc.Scoring = scored.make(region=region if region.is_given else None)
     if forecast is not None:
         alone = {
             "all_conventions": all_conventions,
@@ -217,25 +172,23 @@ def evaluate(
         common |= {"convention": convention, "around": forecast}
         with work.spread("Scoring", usual=1) as run:
             by_time = carlasc.metrics.evaluate_forecasts(
-                source, truth, scoring=scoring.options(), run=run, **common
+                source, truth, scoring=scoring, run=run, **common
             )
         _print_forecasts(by_time, name, output)
         return
     if all_conventions:
         with work.spread("Scoring", usual=1) as run:
-            found = carlasc.metrics.evaluate_by_all_conventions(
+            results = carlasc.metrics.evaluate_by_all_conventions(
                 source, truth, name=name, run=run, **common
             )
-        _print_conventions(found, output.as_json)
+        _print_conventions(results, output.as_json)
         return
     common = {**common, "convention": convention}
     with work.spread("Scoring", usual=1) as run:
-        result = carlasc.evaluate(
-            source, truth, scoring=scoring.options(), name=name, run=run, **common
-        )
+        result = carlasc.evaluate(source, truth, scoring=scoring, name=name, run=run, **common)
     other = None
     if compare is not None:
-        whole = replace(scoring, by=None, rays=False, actors=False).options()
+        whole = replace(scoring, by=(), rays=False, actors=False)
         with work.spread("Scoring --compare", usual=1) as run:
             other = carlasc.evaluate(
                 compare, truth, scoring=whole, name=Path(compare).name, run=run, **common
@@ -250,23 +203,6 @@ def evaluate(
         draw_frame_scores(result, output.plot)
     _print(result, other, output)
     report_failures(result.failures, result.frames + len(result.failures))
-
-
-@dataclass(frozen=True)
-class _Region:
-    """The voxels between two distances, metres, and within an angle about the forward axis,
-    degrees. It pickles into workers.
-    """
-
-    near_m: float
-    far_m: float | None
-    fov: float
-
-    def __call__(self, spec: Any) -> Any:
-        from carlasc.metrics import distance_band, field_of_view
-
-        band = distance_band(spec, self.near_m, math.inf if self.far_m is None else self.far_m)
-        return band & field_of_view(spec, math.radians(self.fov))
 
 
 def _print_tables(tables: Sequence[FigureTable], remark: str, output: OutputFlags) -> None:
@@ -297,33 +233,25 @@ def _print(result: Evaluation, other: Evaluation | None, output: OutputFlags) ->
     )
     if output.latex or output.csv:
         return
-    out = console()
     if (interval := result.interval()) is not None:
-        out.print(
-            line(
-                f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to "
-                f"{100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
-            )
+        show(
+            f"mIoU {100 * interval.value:.2f}, 95 % interval {100 * interval.low:.2f} to "
+            f"{100 * interval.high:.2f} ({count(len(result.sequences), 'sequence')})"
         )
     if comparison is not None and other is not None:
-        found = comparison.difference
-        out.print(
-            line(
-                f"mIoU minus that of {other.name}: {100 * found.value:+.2f}, 95 % interval "
-                f"{100 * found.low:+.2f} to {100 * found.high:+.2f}, p = {comparison.p_value:.3g} "
-                f"({count(len(comparison.sequences), 'sequence')})"
-            )
+        gain = comparison.difference
+        show(
+            f"mIoU minus that of {other.name}: {100 * gain.value:+.2f}, 95 % interval "
+            f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}, p = {comparison.p_value:.3g} "
+            f"({count(len(comparison.sequences), 'sequence')})"
         )
     if result.actors is not None and not math.isnan(result.actors.velocity_m_s):
         speeds = result.actors.velocity_by_speed.items()
         bands = ", ".join(
             f"from {low:g} m/s {value:.2f}" for low, value in speeds if not math.isnan(value)
         )
-        out.print(
-            line(
-                f"mean velocity error of moving voxels: {result.actors.velocity_m_s:.2f} m/s "
-                f"({bands})"
-            )
+        show(
+            f"mean velocity error of moving voxels: {result.actors.velocity_m_s:.2f} m/s ({bands})"
         )
     for note in result.notes:
         echo(f"note: {note}", err=True)
@@ -356,7 +284,7 @@ def _print_forecasts(by_time: Mapping[float, Evaluation], name: str, output: Out
     report_failures(failures, sum(result.frames for result in results) + len(failures))
 
 
-def _print_conventions(found: Any, as_json: bool) -> None:
+def _print_conventions(results: Mapping[str, Any], as_json: bool) -> None:
     """Print a row per convention: its mean IoU and completeness, or why there is none."""
     from carlasc.cli.tables import print_table
     from carlasc.errors import CarlascError
@@ -365,12 +293,12 @@ def _print_conventions(found: Any, as_json: bool) -> None:
         print_json(
             {
                 n: {"impossible": str(r)} if isinstance(r, CarlascError) else r.to_dict()
-                for n, r in found.items()
+                for n, r in results.items()
             }
         )
     else:
         rows, reasons = [], []
-        for name, result in found.items():
+        for name, result in results.items():
             if isinstance(result, CarlascError):
                 rows.append([name, "-", "-", "-", "-", "-"])
                 reasons.append(f"{name}: {result}")
@@ -389,7 +317,7 @@ def _print_conventions(found: Any, as_json: bool) -> None:
         )
         for reason in reasons:
             echo(f"no score: {reason}")
-    for result in found.values():
+    for result in results.values():
         # a frame that cannot be read fails by every convention
         if not isinstance(result, CarlascError):
             report_failures(result.failures, result.frames + len(result.failures))

@@ -18,6 +18,7 @@ from carlasc.cli.common import (
     starting_with,
 )
 from carlasc.cli.flags import DeclaredOptions, RunFlags, declared_by
+from carlasc.cli.library import Given, Library
 
 
 def declared_options(arguments: Sequence[str]) -> tuple[carlasc.converting.OptionDeclaration, ...]:
@@ -37,6 +38,7 @@ def _print_list(wanted: bool) -> None:
 
 
 def export(
+    *,
     options: DeclaredOptions,
     run: RunFlags,
     name: Annotated[
@@ -55,9 +57,7 @@ def export(
     sequences: Annotated[
         str | None, typer.Option(help="Names of sequences, separated by commas. Default: all.")
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write existing frames again.")
-    ] = False,
+    written: Annotated[Given, Library("carlasc.export")],
     json: Json = False,
     _list: Annotated[
         bool,
@@ -74,12 +74,11 @@ def export(
     Run it again to continue where it stopped: existing frames are skipped.
     """
     with run.spread(f"export {name}") as spread:
-        result = carlasc.export(
+        result = written.make(
             name,
             source,
             out,
             sequences=None if sequences is None else sequences.split(","),
-            overwrite=overwrite,
             options=options.values,
             run=spread,
         )

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
-import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 
 def finish(
     out: Annotated[str, place_argument("The .zarr store that was written in parts.", "OUT")],
-    incomplete: Annotated[
-        bool, typer.Option("--incomplete", help="Finish the store even if frames are missing.")
-    ] = False,
+    options: Annotated[Given, Library("carlasc.finish")],
     json: Json = False,
 ) -> None:
     """Finish a .zarr store that was written in parts, so that it can be opened.
@@ -23,7 +19,7 @@ def finish(
     The last part of a run does this automatically. Use this command if a part failed, or was never
     run.
     """
-    result = carlasc.finish(out, incomplete=incomplete)
+    result = options.make(out)
     if json:
         print_json(result)
         return

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args, g
 import typer
 
 from carlasc.cli.common import progress_bar
+from carlasc.cli.library import SEPARATOR, Given, Library, ValueKind, make_option
 
 if TYPE_CHECKING:
     from carlasc.converting import OptionDeclaration
     from carlasc.running import Engine, Run
 
-# prefix of parameters of declared options, so that no parameter of the command has the same name
-_DECLARED = "declared_"
+_DECLARED = f"declared{SEPARATOR}"  # prefix of the parameters of declared options
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Flags:
         """Whether an option of the group has another value than its default."""
         values = ((field, getattr(self, field.name)) for field in dataclasses.fields(self))
         return any(
-            value.is_given if isinstance(value, Flags) else value != field.default
+            value.is_given if isinstance(value, Flags | Given) else value != field.default
             for field, value in values
         )
 
@@ -67,17 +67,14 @@ def flatten(
     """
     hints = get_type_hints(function, include_extras=True)
     parameters: list[inspect.Parameter] = []
-    groups: dict[str, type[Flags]] = {}
+    groups: dict[str, Any] = {}
     for name, parameter in inspect.signature(function).parameters.items():
-        if not _is_group(hints[name]):
-            parameters.append(
-                parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY)
-            )
+        if (group := _group(hints[name])) is None:
+            annotated = parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY)
+            parameters.append(annotated)
             continue
-        groups[name] = hints[name]
-        parameters += (
-            map(_declared, declared) if hints[name] is DeclaredOptions else _parameters(hints[name])
-        )
+        groups[name] = group
+        parameters += map(_declared, declared) if group is DeclaredOptions else _parameters(group)
 
     def command(**given: Any) -> None:
         function(**{name: _make(group, given) for name, group in groups.items()}, **given)
@@ -108,22 +105,24 @@ def declared_by(
     return () if name is None else converting.option_declarations(load(name))
 
 
-def declared_name(parameter: str) -> str:
-    """Return the name of the option that a parameter stands for."""
-    return parameter.removeprefix(_DECLARED)
+def _group(hint: Any) -> type[Flags] | Library | None:
+    """Return the group of options that an annotation stands for; None for a single option."""
+    if isinstance(hint, type):
+        return hint if issubclass(hint, Flags) else None
+    mark = get_args(hint)[-1]
+    return mark if isinstance(mark, Library) else None
 
 
-def _is_group(hint: Any) -> bool:
-    return isinstance(hint, type) and issubclass(hint, Flags)
-
-
-def _parameters(group: type[Flags]) -> Iterator[inspect.Parameter]:
+def _parameters(group: type[Flags] | Library) -> Iterator[inspect.Parameter]:
     """Yield the options of a group, each under the heading of the group."""
+    if isinstance(group, Library):
+        yield from group.parameters()
+        return
     hints = get_type_hints(group, include_extras=True)
     for field in dataclasses.fields(group):
         hint = hints[field.name]
-        if _is_group(hint):
-            yield from _parameters(hint)
+        if (inner := _group(hint)) is not None:
+            yield from _parameters(inner)
             continue
         kind: Any
         kind, info = get_args(hint)
@@ -136,46 +135,30 @@ def _parameters(group: type[Flags]) -> Iterator[inspect.Parameter]:
         )
 
 
-def _make(group: type[Flags], given: dict[str, Any]) -> Flags:
+def _make(group: type[Flags] | Library, given: dict[str, Any]) -> Flags | Given:
     """Take the values of a group's options out of those that are given."""
+    if isinstance(group, Library):
+        return group.take(given)
     if group is DeclaredOptions:
         names = [name for name in given if name.startswith(_DECLARED)]
-        values = {declared_name(name): given.pop(name) for name in names}
+        values = {name.removeprefix(_DECLARED): given.pop(name) for name in names}
         return DeclaredOptions({name: value for name, value in values.items() if value is not None})
-    hints = get_type_hints(group)
-    return group(**{
-        field.name: _make(hints[field.name], given) if _is_group(hints[field.name]) else given.pop(field.name)
-        for field in dataclasses.fields(group)
-    })  # fmt: skip
+    hints = get_type_hints(group, include_extras=True)
+    inner = {field.name: _group(hints[field.name]) for field in dataclasses.fields(group)}
+    return group(
+        **{name: _make(one, given) if one else given.pop(name) for name, one in inner.items()}
+    )
 
 
 def _declared(option: OptionDeclaration) -> inspect.Parameter:
-    """Return the parameter of a declared option.
-
-    Without a value it is None, and the library takes the default.
-    """
-    dashed = option.name.replace("_", "-")
-    is_switch = option.type is bool
-    shown = option.default is not None and option.default is not False
-    info = typer.Option(
-        f"--{dashed}/--no-{dashed}" if is_switch else f"--{dashed}",
-        help=f"{option.help}{f'  [default: {_shown(option.default)}]' if shown else ''}".strip(),
-        rich_help_panel="Options of this data set",
-        show_default=False,
-    )
-    kind: Any = Literal[option.choices] if option.choices else option.type
-    annotation = Annotated[kind | None, info]
-    name = f"{_DECLARED}{option.name}"
-    return inspect.Parameter(
-        name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
-    )
-
-
-def _shown(default: object) -> str:
-    return (
-        {True: "yes", False: "no"}.get(default, str(default))
-        if isinstance(default, bool)
-        else str(default)
+    """Return the parameter of a declared option."""
+    return make_option(
+        _DECLARED + option.name,
+        ValueKind(Literal[option.choices] if option.choices else option.type),
+        f"--{option.name.replace('_', '-')}",
+        option.help,
+        default=option.default,
+        heading="Options of this data set",
     )
 
 

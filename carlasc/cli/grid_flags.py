@@ -5,25 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import typer
 
 import carlasc
 from carlasc.cli.common import echo, parse_numbers
 from carlasc.cli.flags import Flags
-from carlasc.core.choices import Complete, Coordinates, Dynamic, Preset, Rays, VoteRule
+from carlasc.cli.library import Given, Library
+from carlasc.core.choices import Coordinates, Preset
 from carlasc.errors import ArgumentError, count
 
 _FEW = 8  # fewer voxels along an axis are unusual
 _MOVED_M = 1e-3  # bounds that differ by less are equal up to rounding
 # fact: large-frame
 _VOXEL_BYTES, _LARGE_BYTES = 8, 2e9  # size of a label and a count; a larger frame is unusual
-MOTION_HELP = (
-    "How moving points are found. boxes, instances, flow: by the field of that name. evidence: a "
-    "point moves if rays of other scans passed through its position. none: only classes that "
-    "always move. auto: the best field that exists, and evidence for what it misses"
-)
+
+MotionGiven = Annotated[Given, Library("carlasc.motion.MotionOptions")]
+PosesGiven = Annotated[Given, Library("carlasc.motion.PoseOptions")]
 
 
 @dataclass(frozen=True)
@@ -81,14 +80,17 @@ class GridFlags(Flags):
         """
         spec, asked = self._spec()
         unusual = [*unusual_of(spec, asked)]
-        found = "; ".join(text for text, _ in unusual)
+        remark = "; ".join(text for text, _ in unusual)
         if any(mistake for _, mistake in unusual) and not self.yes:
-            expected = f"{_FEW} voxels or more along x and y, the bounds asked for, {_LARGE_BYTES / 1e9:g} GB per frame at most"
+            expected = (
+                f"{_FEW} voxels or more along x and y, the bounds asked for, "
+                f"{_LARGE_BYTES / 1e9:g} GB per frame at most"
+            )
             raise ArgumentError(
-                "grid", expected=expected, found=found, advice="give --yes to make it all the same"
+                "grid", expected=expected, found=remark, advice="give --yes to make it all the same"
             )
         if unusual:
-            echo(f"note: the grid has {found}", err=True)
+            echo(f"note: the grid has {remark}", err=True)
         return spec
 
     def _spec(self) -> tuple[carlasc.GridSpec, carlasc.GridSpec]:
@@ -96,11 +98,10 @@ class GridFlags(Flags):
         three = (("--res", self.res), ("--size", self.size), ("--preset", self.preset))
         given = [option for option, value in three if value is not None]
         if len(given) != 1:
-            found = " and ".join(given) or "none of them"
             raise ArgumentError(
                 "grid",
                 expected="one of --res, --size and --preset",
-                found=found,
+                found=" and ".join(given) or "none of them",
                 advice="try --res 0.2",
             )
         if self.preset == "cylindrical" and self.coordinates == "cartesian":
@@ -156,217 +157,15 @@ def unusual_of(spec: carlasc.GridSpec, asked: carlasc.GridSpec) -> Iterator[tupl
 
 
 @dataclass(frozen=True)
-class VoteFlags(Flags):
-    """How votes are counted, and what is written about them."""
-
-    heading: ClassVar[str] = "Votes"
-
-    rule: Annotated[
-        VoteRule | None,
-        typer.Option(
-            "--voting",
-            help="How votes are counted. sensor: one vote per sensor, voxel and class, as in the "
-            "published files (default for captures). sample: one vote per sample, as in the "
-            "paper. ray: a voxel is occupied if enough of the rays that enter it end in it "
-            "(default for scans).",
-        ),
-    ] = None
-    free_step_m: Annotated[
-        float, typer.Option(help="Distance between free-space samples on a ray, in metres.")
-    ] = 1.5
-    keep: Annotated[
-        bool, typer.Option("--keep-votes", help="Also write the votes of each class per voxel.")
-    ] = False
-    keep_evidence: Annotated[
-        bool,
-        typer.Option(
-            "--keep-evidence",
-            help="Also write how certain each voxel is: probabilities, flags and number of scans "
-            "(only for grids from scans).",
-        ),
-    ] = False
-    keep_actors: Annotated[
-        bool,
-        typer.Option(
-            "--keep-actors",
-            help="Also write the actor that each voxel belongs to, and its velocity.",
-        ),
-    ] = False
-    min_confidence: Annotated[
-        float,
-        typer.Option(
-            help="Set a voxel to unknown if it is neither free nor occupied with at least this "
-            "probability, 0 to below 1 (only for grids from scans)."
-        ),
-    ] = 0.0
-    keep_seen: Annotated[
-        bool,
-        typer.Option(
-            "--keep-seen",
-            help="Also write which cameras see each voxel (only for data with cameras).",
-        ),
-    ] = False
-
-    def voting(self) -> carlasc.Voting:
-        """Return how votes are counted."""
-        return carlasc.Voting(
-            self.rule,
-            self.free_step_m,
-            self.keep,
-            self.keep_evidence,
-            self.min_confidence,
-            self.keep_actors,
-            self.keep_seen,
-        )
-
-
-@dataclass(frozen=True)
-class PoseFlags(Flags):
-    """Where poses come from."""
-
-    heading: ClassVar[str] = "Poses"
-
-    poses: Annotated[
-        carlasc.motion.PoseSource,
-        typer.Option(
-            help="Where poses come from. file: the poses of the data. kiss-icp: estimated from the "
-            "scans. auto: the file if it exists, otherwise estimated."
-        ),
-    ] = "auto"
-    refine: Annotated[
-        carlasc.motion.RefineMode,
-        typer.Option(
-            help="Refine poses, so that neighbouring scans agree. auto: only where scans then "
-            "agree clearly better. always: all poses. never: none."
-        ),
-    ] = "auto"
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force",
-            help="Accept poses even if they jump between frames, if scans do not overlap under "
-            "them, or if their calibration is missing.",
-        ),
-    ] = False
-
-    def options(self) -> carlasc.motion.PoseOptions:
-        """Return where poses come from."""
-        return carlasc.motion.PoseOptions(self.poses, self.refine, self.force)
-
-
-@dataclass(frozen=True)
-class WindowFlags(Flags):
-    """Which scans are merged, and what happens to moving points."""
-
-    heading: ClassVar[str] = "Scans merged over time"
-
-    window: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A:B",
-            help="First and last scan to merge, in frames relative to the current frame. Default: "
-            "-30:30.",
-        ),
-    ] = None
-    dynamic: Annotated[
-        Dynamic | None,
-        typer.Option(
-            help="What happens to moving points. align: each actor is completed from all scans "
-            "(default). current: only points of the frame itself are used. drop: they are left "
-            "out. tube: they stay where they were seen, which leaves ghost trails, as in "
-            "SemanticKITTI."
-        ),
-    ] = None
-    motion: Annotated[
-        carlasc.motion.MotionSource | None, typer.Option(help=f"{MOTION_HELP} (default).")
-    ] = None
-
-    def from_scans(self, poses: carlasc.motion.PoseOptions) -> carlasc.FromScans:
-        """Return how scans are merged, with the defaults of `FromScans` for what is not given."""
-        given = {name: value for name, value in self._given().items() if value is not None}
-        return carlasc.FromScans(**given, poses=poses)
-
-    def _given(self) -> dict[str, Any]:
-        motion = None if self.motion is None else carlasc.motion.MotionOptions(self.motion)
-        window = None if self.window is None else parse_window(self.window)
-        return {"window": window, "dynamic": self.dynamic, "motion": motion}
-
-
-@dataclass(frozen=True)
-class ScanFlags(WindowFlags):
-    """How scans are merged."""
-
-    window_m: Annotated[
-        float | None,
-        typer.Option(
-            help="Merge only scans within this driven distance, in metres. Default: no limit."
-        ),
-    ] = None
-    stride: Annotated[
-        int | None,
-        typer.Option(help="Merge every N-th scan of the window. Default: 1.", metavar="N"),
-    ] = None
-    complete: Annotated[
-        Complete | None,
-        typer.Option(
-            help="What happens to the parts of a moving vehicle that no scan saw. seen: they stay "
-            "unknown. mirror: one side is copied from the other. body: like mirror, and the rest "
-            "is copied from similar vehicles (default)."
-        ),
-    ] = None
-    no_own_path: Annotated[
-        bool,
-        typer.Option(
-            "--no-own-path",
-            help="Do not count the space that the recording vehicle drove through as free. By "
-            "default it counts as free, which removes ghost trails there.",
-        ),
-    ] = False
-    rays: Annotated[
-        Rays | None,
-        typer.Option(
-            help="Which rays of other scans are followed. all: every ray (default). enough: near "
-            "the sensor, where rays are dense, only some of them."
-        ),
-    ] = None
-    min_range_m: Annotated[
-        float | None,
-        typer.Option(
-            help="Leave out nearer points, in metres. Default: the range in carlasc.json."
-        ),
-    ] = None
-    max_range_m: Annotated[
-        float | None,
-        typer.Option(
-            help="Leave out farther points, in metres. Default: the range in carlasc.json."
-        ),
-    ] = None
-
-    def _given(self) -> dict[str, Any]:
-        others = {
-            name: getattr(self, name)
-            for name in ("window_m", "stride", "complete", "rays", "min_range_m", "max_range_m")
-        }
-        return super()._given() | others | {"own_path": False if self.no_own_path else None}
-
-
-def parse_window(text: str, option: str = "window") -> tuple[int, int]:
-    """Return the first and the last scan of a window from "A:B"; `option` is named in errors."""
-    first, _, last = text.partition(":")
-    try:
-        return int(first), int(last)
-    except ValueError:
-        raise ArgumentError(
-            option,
-            expected="A:B, in frames relative to the current frame, such as -30:30",
-            found=repr(text),
-        ) from None
-
-
-@dataclass(frozen=True)
 class GroundTruthFlags(Flags):
     """The options for making grids, the same in `regrid` and in `convert`."""
 
     grid: GridFlags
-    votes: VoteFlags
-    scans: ScanFlags
+    votes: Annotated[Given, Library("carlasc.Voting")]
+    scans: Annotated[Given, Library("carlasc.FromScans")]
+    motion: MotionGiven
+
+    def from_scans(self, poses: Given) -> carlasc.FromScans:
+        """Return how scans are merged."""
+        made: carlasc.FromScans = self.scans.make(motion=self.motion.make(), poses=poses.make())
+        return made

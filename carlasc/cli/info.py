@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import carlasc
-from carlasc.cli.common import Json, console, line, place_argument, print_json
+from carlasc.cli.common import Json, console, line, place_argument, print_json, show
 from carlasc.errors import count
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def _print(overview: Overview) -> None:
     out.print(line(overview.location, "bold") + line(f": {overview.level} ({overview.store})"))
     if overview.sequences:
         size = f", {_size(overview.bytes)}" if overview.bytes is not None else ""
-        out.print(line(f"{count(len(overview.sequences), 'sequence')}{splits}{size}"))
+        show(f"{count(len(overview.sequences), 'sequence')}{splits}{size}")
         header = (
             "Sequence",
             "Frames",
@@ -57,7 +57,7 @@ def _print(overview: Overview) -> None:
         print_table(out, header, [_row(sequence) for sequence in overview.sequences], turn=False)
     for sequence in overview.sequences:
         if sequence.problem:
-            out.print(line(f"{sequence.path or sequence.name}: {sequence.problem}"))
+            show(f"{sequence.path or sequence.name}: {sequence.problem}")
     if kinds := _kinds_of_grids(overview):
         header = (
             "Grid",
@@ -75,8 +75,8 @@ def _print(overview: Overview) -> None:
         span = f"{capture.first}..{capture.last}" + (
             f" with {count(capture.gaps, 'gap')}" if capture.gaps else ""
         )
-        text = f"raw capture {capture.path or '.'}: {count(capture.sensors, 'sensor')}, {count(capture.frames, 'frame')} ({span})"
-        out.print(line(text))
+        size = f"{count(capture.sensors, 'sensor')}, {count(capture.frames, 'frame')}"
+        show(f"raw capture {capture.path or '.'}: {size} ({span})")
 
 
 def _row(sequence: SequenceOverview) -> list[str]:

@@ -7,17 +7,19 @@ from typing import Annotated
 import typer
 
 import carlasc
-from carlasc.cli.common import FramesOption, Json, echo, place_argument, place_option, print_json
+from carlasc.cli.common import Json, SourceArgument, echo, place_option, print_json
 from carlasc.cli.flags import RunFlags
-from carlasc.cli.grid_flags import MOTION_HELP
+from carlasc.cli.grid_flags import MotionGiven
+from carlasc.cli.library import Given, Library
 from carlasc.errors import ArgumentError, count
+
+_REFUSED = {"motion": "logits frames classes by", "images": "logits frames"}  # by --from
 
 
 def label(
+    *,
     run: RunFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ],
+    source: SourceArgument,
     out: Annotated[str, place_option("-o", "--out", text="Folder of the labelled data set.")],
     predictions: Annotated[
         str,
@@ -37,30 +39,8 @@ def label(
             "SEQUENCE/CAMERA/000000.png or .npy. Default: image_labels of SOURCE.",
         ),
     ] = None,
-    motion: Annotated[
-        carlasc.motion.MotionSource | None,
-        typer.Option(help=f"With --from motion. {MOTION_HELP} (default)."),
-    ] = None,
-    classes: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TABLE", help="Class table of the predictions: its name, or a JSON file."
-        ),
-    ] = None,
-    logits: Annotated[
-        bool,
-        typer.Option(
-            "--logits", help="The predicted class scores are logits (before the softmax)."
-        ),
-    ] = False,
-    by: Annotated[
-        str | None,
-        typer.Option(help="Name of the network, for the metadata. Default: the name of FILES."),
-    ] = None,
-    frames: FramesOption = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")
-    ] = False,
+    options: Annotated[Given, Library("carlasc.label")],
+    motion: MotionGiven,
     json: Json = False,
 ) -> None:
     """Write a copy of SOURCE with labels that a network predicted for its points or images, or with
@@ -70,36 +50,23 @@ def label(
     """
     if pixels is not None and predictions != "images":
         raise ArgumentError("pixels", expected="--from images", found=f"--from {predictions}")
-    others: dict[str, object] = {"--logits": logits, "--frames": frames}
-    others |= {"--classes": classes, "--by": by} if predictions == "motion" else {}
-    if predictions in ("motion", "images") and (
-        given := [name for name, value in others.items() if value]
-    ):
-        raise ArgumentError(
-            "predictions", expected=f"no {given[0]} with --from {predictions}", found=given[0]
-        )
+    for name in _REFUSED.get(predictions, "").split():
+        if name in options.values:
+            raise ArgumentError(
+                "predictions",
+                expected=f"no --{name} with --from {predictions}",
+                found=f"--{name}",
+            )
     if predictions == "motion":
-        _label_motion(source, out, motion or "auto", overwrite, run, json)
+        _label_motion(source, out, motion, options, run, json)
         return
-    if motion is not None:
+    if motion.is_given:
         raise ArgumentError("motion", expected="--from motion", found=f"--from {predictions}")
     with run.spread("Labelling", "files") as spread:
         if predictions == "images":
-            result = carlasc.label_images(
-                source, out, pixels=pixels, classes=classes, by=by, overwrite=overwrite, run=spread
-            )
+            result = carlasc.label_images(source, out, pixels=pixels, **options.values, run=spread)
         else:
-            result = carlasc.label(
-                source,
-                out,
-                predictions,
-                classes=classes,
-                logits=logits,
-                by=by,
-                frames=frames,
-                overwrite=overwrite,
-                run=spread,
-            )
+            result = options.make(source, out, predictions, run=spread)
     if json:
         print_json(result)
         return
@@ -115,15 +82,15 @@ def label(
 def _label_motion(
     source: str,
     out: str,
-    motion: carlasc.motion.MotionSource,
-    overwrite: bool,
+    motion: Given,
+    options: Given,
     run: RunFlags,
     json: bool,
 ) -> None:
     """Write the moving actors as instances and flow, and print their number."""
-    observe = carlasc.FromScans(motion=carlasc.motion.MotionOptions(motion))
+    observe = carlasc.FromScans(motion=motion.make())
     with run.spread("Finding moving actors", "scans and files") as spread:
-        result = carlasc.label_motion(source, out, observe=observe, overwrite=overwrite, run=spread)
+        result = carlasc.label_motion(source, out, observe=observe, **options.values, run=spread)
     if json:
         print_json(result)
         return

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
 import carlasc
 from carlasc.cli.common import Json, console, echo, line, place_argument, print_json
 from carlasc.cli.flags import RunFlags
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 
@@ -18,23 +17,7 @@ def pack(
     out: Annotated[
         str, place_argument("Store to write. Its name ends in .zarr, .h5 or .parquet.", "OUT")
     ],
-    small: Annotated[
-        bool,
-        typer.Option(
-            "--small",
-            help="Compress points with PCodec (only .zarr): smaller, but fewer programs can read "
-            "it.",
-        ),
-    ] = False,
-    lossy_mm: Annotated[
-        float | None,
-        typer.Option(
-            help="Round coordinates of points to this step, in millimetres. Default: exact."
-        ),
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an existing store.")
-    ] = False,
+    options: Annotated[Given, Library("carlasc.pack")],
     json: Json = False,
 ) -> None:
     """Pack all sequences of SOURCE into one store, which is several times smaller.
@@ -44,9 +27,7 @@ def pack(
     If it is interrupted, run the same command again to finish it.
     """
     with run.spread("Packing", "files") as spread:
-        result = carlasc.pack(
-            source, out, small=small, lossy_mm=lossy_mm, overwrite=overwrite, run=spread
-        )
+        result = options.make(source, out, run=spread)
     if json:
         print_json(result)
     elif result.is_finished:

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
-import carlasc
-from carlasc.cli.common import Json, echo, place_argument, place_option, print_json
+from carlasc.cli.common import Json, SourceArgument, echo, place_option, print_json
 from carlasc.cli.flags import RunFlags
-from carlasc.cli.grid_flags import PoseFlags
+from carlasc.cli.grid_flags import PosesGiven
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 
 def refine(
-    poses: PoseFlags,
+    poses: PosesGiven,
     run: RunFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ],
+    source: SourceArgument,
     out: Annotated[
         str, place_option("-o", "--out", text="Folder of the data set with refined poses.")
     ],
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")
-    ] = False,
+    options: Annotated[Given, Library("carlasc.refine")],
     json: Json = False,
 ) -> None:
     """Write a copy of SOURCE with refined poses, so that neighbouring scans agree.
@@ -33,9 +27,8 @@ def refine(
 
     Unchanged files are hard links. If it is interrupted, run the same command again to finish it.
     """
-    options = poses.options()
     with run.spread("Refining poses", "scans and files") as spread:
-        result = carlasc.refine(source, out, poses=options, overwrite=overwrite, run=spread)
+        result = options.make(source, out, poses=poses.make(), run=spread)
     if json:
         print_json(result)
         return

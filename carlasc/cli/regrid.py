@@ -8,15 +8,14 @@ import typer
 
 import carlasc
 from carlasc.cli.common import (
-    FramesOption,
     Json,
-    Overwrite,
     place_argument,
     place_option,
     print_frames,
 )
 from carlasc.cli.flags import RunFlags
-from carlasc.cli.grid_flags import GroundTruthFlags, PoseFlags
+from carlasc.cli.grid_flags import GroundTruthFlags, PosesGiven
+from carlasc.cli.library import Given, Library
 from carlasc.errors import ArgumentError
 
 Observed = Literal["capture", "scans", "grid"]
@@ -24,8 +23,9 @@ Observed = Literal["capture", "scans", "grid"]
 
 
 def regrid(
+    *,
     making: GroundTruthFlags,
-    poses: PoseFlags,
+    poses: PosesGiven,
     run: RunFlags,
     source: Annotated[
         str,
@@ -56,11 +56,7 @@ def regrid(
         str | None,
         typer.Option(help="With --observe grid: name of the finer grid. Default: the finest grid."),
     ] = None,
-    frames: FramesOption = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the grid's folder. Default: a name with its size.")
-    ] = None,
-    overwrite: Overwrite = False,
+    written: Annotated[Given, Library("carlasc.regrid")],
     json: Json = False,
 ) -> None:
     """Make ground truth at any resolution: from a raw capture, from the scans of one sensor merged
@@ -69,34 +65,21 @@ def regrid(
     Existing frames are skipped, so the same command continues an interrupted run. In the folder of
     a sequence, `carlasc regrid --res 0.2` is enough.
     """
-    voting, chosen, spec = (
-        making.votes.voting(),
-        _observe(observe, making, poses, from_grid),
-        making.grid.spec(),
-    )
+    voting, chosen = making.votes.make(), _observe(observe, making, poses, from_grid)
+    spec = making.grid.spec()
     with run.spread("regrid") as spread:
-        result = carlasc.regrid(
-            source,
-            spec,
-            out,
-            observe=chosen,
-            voting=voting,
-            frames=frames,
-            name=name,
-            overwrite=overwrite,
-            run=spread,
-        )
+        result = written.make(source, spec, out, observe=chosen, voting=voting, run=spread)
     print_frames(result, result.grids, f"{spec}: made", json=json)
 
 
 def _observe(
-    kind: Observed | None, making: GroundTruthFlags, poses: PoseFlags, grid: str | None
+    kind: Observed | None, making: GroundTruthFlags, poses: Given, grid: str | None
 ) -> carlasc.groundtruth.Observe | None:
     """Return the `observe` argument.
 
     Without --observe, given options for scans or for a finer grid decide.
     """
-    for_scans = making.scans.is_given or poses.is_given
+    for_scans = making.scans.is_given or making.motion.is_given or poses.is_given
     if kind is None and (for_scans or grid is not None):
         kind = "scans" if for_scans else "grid"
     if for_scans and kind != "scans":
@@ -111,7 +94,7 @@ def _observe(
         case "capture":
             return carlasc.FromCapture()
         case "scans":
-            return making.scans.from_scans(poses.options())
+            return making.from_scans(poses)
         case "grid":
             return carlasc.FromGrid(grid)
     return None

@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-import carlasc
 from carlasc.cli.common import (
     Json,
+    SourceArgument,
     console,
     echo,
     file_option,
-    line,
-    place_argument,
     print_json,
     report_failures,
+    show,
 )
 from carlasc.cli.flags import WorkFlags
+from carlasc.cli.library import Given, Library
 
 if TYPE_CHECKING:
     from carlasc.groundtruth.reporting.facts import ActorTrack
@@ -28,37 +28,16 @@ _SHOWN = 12
 
 
 def report(
+    *,
     work: WorkFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
-    grid: Annotated[
-        str | None, typer.Option(help="Only the grid of this name. Default: all grids.")
-    ] = None,
+    source: SourceArgument = ".",
+    options: Annotated[Given, Library("carlasc.report")],
     html: Annotated[
         Path | None,
         file_option(
             "--html", metavar="FILE", text="Also write the reports as one page for a browser."
         ),
     ] = None,
-    remake: Annotated[
-        bool,
-        typer.Option("--remake", help="Make all reports from the files, also where reports exist."),
-    ] = False,
-    holdout: Annotated[
-        bool,
-        typer.Option(
-            "--holdout", help="Also measure held-out rays (see `carlasc validate --holdout`)."
-        ),
-    ] = False,
-    save: Annotated[
-        bool,
-        typer.Option(
-            "--save",
-            help="Write the reports into the folders of the grids (only of grids that carlasc "
-            "made).",
-        ),
-    ] = False,
     everything: Annotated[
         bool, typer.Option("--all", help="Print all actors, not only the first twelve.")
     ] = False,
@@ -73,9 +52,7 @@ def report(
     from carlasc.inspection.report_page import write_report_page
 
     with work.spread("report", "steps") as run:
-        result = carlasc.report(
-            source, grid=grid, remake=remake, holdout=holdout, save=save, run=run
-        )
+        result: ReportResult = options.make(source, run=run)
     if html is not None:
         write_report_page(result, html)
     if as_json:
@@ -91,13 +68,12 @@ def report(
 def _print(result: ReportResult, *, everything: bool) -> None:
     from carlasc.inspection.report_page import describe
 
-    out = console()
     for name, one in result.reports.items():
-        out.print(line(name, "bold"), soft_wrap=True)
+        show(name, "bold")
         rows = describe(one)
         width = max(len(label) for label, _ in rows)
         for label, text in rows:
-            out.print(line(f"  {label:<{width}}  {text}"), soft_wrap=True)
+            show(f"  {label:<{width}}  {text}")
         if one.actors:
             _print_actors(one.actors, everything=everything)
 

@@ -7,11 +7,12 @@ from typing import Annotated, Literal
 
 import typer
 
-import carlasc
 from carlasc.cli.common import Overwrite, console, echo
+from carlasc.cli.library import Given, Library
 
 
 def scores(
+    *,
     files: Annotated[
         list[Path], typer.Argument(help="JSON files that `carlasc evaluate --json` printed.")
     ],
@@ -22,30 +23,24 @@ def scores(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write. Default: print the table.")
     ] = None,
-    mixed: Annotated[
-        bool,
-        typer.Option(
-            "--mixed", help="Allow results by different conventions, which cannot be compared."
-        ),
-    ] = False,
+    options: Annotated[Given, Library("carlasc.scores")],
     overwrite: Overwrite = False,
 ) -> None:
     """Put the results of several evaluations into one table."""
     from carlasc.errors import ConflictError
 
-    table = carlasc.scores(files, mixed=mixed)
+    table = options.make(files)
     if format is None and out is not None:
         endings = {".md": "markdown", ".tex": "latex", ".html": "html", ".htm": "html"}
         format = endings.get(out.suffix.lower(), "text")  # type: ignore[assignment]
-    if format in (None, "text") and out is None:
+    plain = format in (None, "text")
+    if plain and out is None:
         from carlasc.cli.tables import print_table
 
-        found = table.table()
-        print_table(console(), found.header, found.texts(), title=found.title)
+        figures = table.table()
+        print_table(console(), figures.header, figures.texts(), title=figures.title)
         return
-    text = {
-        "markdown": table.to_markdown, "latex": table.to_latex, "html": table.to_html, "text": table.table().to_csv,
-    }[format or "text"]()  # fmt: skip
+    text = table.table().to_csv() if plain else getattr(table, f"to_{format}")()
     if out is None:
         echo(text, nl=False)
         return

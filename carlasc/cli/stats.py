@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-import carlasc
 from carlasc.cli.common import (
     Json,
+    SourceArgument,
     console,
     echo,
     file_option,
-    line,
-    place_argument,
     print_json,
     report_failures,
+    show,
 )
 from carlasc.cli.flags import OneWorkerFlags
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 if TYPE_CHECKING:
@@ -29,22 +29,15 @@ _KINDS: tuple[Kind, ...] = ("points", "voxels")
 
 
 def stats(
+    *,
     work: OneWorkerFlags,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
+    source: SourceArgument = ".",
     by: Annotated[
         Literal["total", "split", "sequence"],
         typer.Option(
             help="Print shares of the whole (total), and also of each split or of each sequence."
         ),
     ] = "split",
-    grid: Annotated[
-        str,
-        typer.Option(
-            help="Grid whose voxels are counted. A sequence that has only one grid uses that one."
-        ),
-    ] = "evaluation",
     remap: Annotated[
         str,
         typer.Option(
@@ -52,7 +45,7 @@ def stats(
             "..."
         ),
     ] = "auto",
-    every: Annotated[int, typer.Option(metavar="N", help="Count only every N-th frame.")] = 1,
+    options: Annotated[Given, Library("carlasc.stats")],
     plot: Annotated[
         Path | None,
         file_option("--plot", text="Also draw the histograms to this .png, .svg or .pdf file."),
@@ -67,9 +60,7 @@ def stats(
     if plot is not None:  # before counting, which may take hours
         check_plot(plot)
     with work.spread("Counting", usual=1) as run:
-        result = carlasc.stats(
-            source, grid=grid, remap=None if remap == "none" else remap, every=every, run=run
-        )
+        result: Statistics = options.make(source, remap=None if remap == "none" else remap, run=run)
     if plot is not None:
         draw_histograms(result, plot)
     if as_json:
@@ -99,16 +90,13 @@ def print_statistics(result: Statistics, by: str = "split") -> None:
             print_table(out, header, rows, title=f"{kind}, % by sequence")
     total = result.total
     if total.grids:
-        out.print(line(f"{total.known_share:.1%} of voxels known ({count(total.grids, 'grid')})"))
-        out.print(line("voxels % is of the known voxels; class 0 of points is unlabelled"))
+        show(f"{total.known_share:.1%} of voxels known ({count(total.grids, 'grid')})")
+        show("voxels % is of the known voxels; class 0 of points is unlabelled")
     else:
-        out.print(line("no voxels counted: choose a grid with --grid (`carlasc info` lists them)"))
+        show("no voxels counted: choose a grid with --grid (`carlasc info` lists them)")
     if total.actor_voxels:
-        out.print(
-            line(
-                f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} of them "
-                f"move"
-            )
+        show(
+            f"{total.actor_voxels:,} voxels belong to actors, {total.moving_voxels:,} of them move"
         )
 
 

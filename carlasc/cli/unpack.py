@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
-import carlasc
 from carlasc.cli.common import Json, echo, place_argument, print_json
 from carlasc.cli.flags import RunFlags
+from carlasc.cli.library import Given, Library
 from carlasc.errors import count
 
 
@@ -16,13 +14,7 @@ def unpack(
     run: RunFlags,
     source: Annotated[str, place_argument("Packed store, zip or URL.")],
     out: Annotated[str, place_argument("Folder to write.", "OUT")],
-    overwrite: Annotated[
-        bool,
-        typer.Option(
-            "--overwrite",
-            help="Write into an existing folder, and replace files of the same names.",
-        ),
-    ] = False,
+    options: Annotated[Given, Library("carlasc.unpack")],
     json: Json = False,
 ) -> None:
     """Write all sequences of SOURCE as files in CarlaSC's layout, with the bytes that were packed.
@@ -30,7 +22,7 @@ def unpack(
     If it is interrupted, run the same command again to finish it.
     """
     with run.spread("Unpacking", "files") as spread:
-        result = carlasc.unpack(source, out, overwrite=overwrite, run=spread)
+        result = options.make(source, out, run=spread)
     if json:
         print_json(result)
     else:

@@ -11,14 +11,15 @@ import carlasc
 from carlasc.cli.common import (
     FAILED,
     Json,
+    SourceArgument,
     console,
-    line,
-    place_argument,
     print_json,
     report_failures,
+    show,
 )
 from carlasc.cli.flags import Flags, OneWorkerFlags
-from carlasc.cli.grid_flags import GridFlags, WindowFlags
+from carlasc.cli.grid_flags import GridFlags, MotionGiven
+from carlasc.cli.library import Given, Library
 from carlasc.errors import ArgumentError, count
 
 if TYPE_CHECKING:
@@ -58,16 +59,8 @@ class HoldoutGridFlags(GridFlags):
 
 def validate(
     *,
-    source: Annotated[
-        str, place_argument("A data set, a split, a sequence, a zip, a packed store, or a URL.")
-    ] = ".",
-    every: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Read the contents of every N-th frame. Default: about forty frames per sequence.",
-        ),
-    ] = None,
+    source: SourceArgument = ".",
+    options: Annotated[Given, Library("carlasc.validate")],
     full: Annotated[bool, typer.Option("--full", help="Read the contents of all frames.")] = False,
     everything: Annotated[
         bool,
@@ -76,7 +69,8 @@ def validate(
     as_json: Json = False,
     holdout: HoldoutFlags,
     grid: HoldoutGridFlags,
-    scans: WindowFlags,
+    scans: Annotated[Given, Library("carlasc.FromScans", "window dynamic")],
+    motion: MotionGiven,
     work: OneWorkerFlags,
 ) -> None:
     """Check a data set: files, poses, times, and whether scans agree with poses and grids.
@@ -87,21 +81,24 @@ def validate(
     rigid or jump, and gaps. By comparing scans with poses and grids, it recognizes a mirrored y
     axis, poses of a camera, transposed rotations, and a grid shifted by one voxel.
     """
-    if full and every is not None:
+    if full and options.is_given:
         raise ArgumentError(
             "every", expected="only one of --every and --full", found="both", advice="leave one out"
         )
-    if not holdout.holdout and (holdout.is_given or grid.is_given or scans.is_given):
+    if not holdout.holdout and (
+        holdout.is_given or grid.is_given or scans.is_given or motion.is_given
+    ):
         raise ArgumentError(
             "holdout",
             expected="--holdout, because its options are given",
             found="none",
             advice="give `holdout`",
         )
-    spec, observe = grid.spec_or_published(), scans.from_scans(carlasc.motion.PoseOptions("file"))
+    spec = grid.spec_or_published()
+    observe = scans.make(motion=motion.make(), poses=carlasc.motion.PoseOptions("file"))
     rays = None
     with work.spread("Validating", "steps", usual=1) as run:
-        result = carlasc.validate(source, every=1 if full else every, run=run)
+        result = options.make(source, **({"every": 1} if full else {}), run=run)
     if holdout.holdout:
         left_out = holdout.holdout_every or carlasc.inspection.EVERY
         with work.spread("Leaving scans out") as run:
@@ -127,14 +124,13 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
     """Print the findings by kind, errors first; `carlasc demo` uses it too."""
     from carlasc.inspection.findings import SEVERITIES
 
-    out = console()
     for (severity, check), findings in result.grouped().items():
-        out.print(line(f"{severity}: {check} ({len(findings)})", _COLORS[severity]))
+        show(f"{severity}: {check} ({len(findings)})", _COLORS[severity])
         shown = findings if everything else findings[:_SHOWN]
         for finding in shown:
-            out.print(line(f"  {finding}"), soft_wrap=True)
+            show(f"  {finding}")
         if len(findings) > len(shown):
-            out.print(line(f"  ... and {len(findings) - len(shown)} more (--all prints them)"))
+            show(f"  ... and {len(findings) - len(shown)} more (--all prints them)")
     for report in result.sequences:
         figures = [
             f"{share:.1%} of points in voxels of their class ({grid})"
@@ -150,21 +146,16 @@ def print_result(result: ValidationResult, *, everything: bool = False) -> None:
                 f"({100 * report.refined_m:.1f} cm with refined poses)"
             )
         name = report.path or result.location
-        out.print(
-            line(f"{name}: {count(report.frames, 'frame')}, {report.sampled} read"), soft_wrap=True
-        )
+        show(f"{name}: {count(report.frames, 'frame')}, {report.sampled} read")
         for figure in figures:
-            out.print(line(f"  {figure}"), soft_wrap=True)
+            show(f"  {figure}")
         if report.mounting:
             mounting = ", ".join(f"{axis} {value}" for axis, value in report.mounting.items())
-            out.print(line(f"  sensor in the frame of the poses: {mounting}"), soft_wrap=True)
+            show(f"  sensor in the frame of the poses: {mounting}")
         for camera, agreement in report.images.items():
-            out.print(line(f"  images of {camera} on the scans: {agreement}"), soft_wrap=True)
+            show(f"  images of {camera} on the scans: {agreement}")
     counts = ", ".join(count(result.count(severity), severity) for severity in SEVERITIES)
-    out.print(
-        line(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold"),
-        soft_wrap=True,
-    )
+    show(f"{result.location}: {'sound' if result.ok else 'not sound'} ({counts})", "bold")
 
 
 def print_held_out(result: HoldoutResult) -> None:
@@ -183,10 +174,7 @@ def print_held_out(result: HoldoutResult) -> None:
         shares = scores.all
         figures = {"free": shares.free, "unknown": shares.unknown, "occupied": shares.occupied}
         text = ", ".join(f"{100 * (share or 0):.2f} % {where}" for where, share in figures.items())
-        console().print(
-            line(f"{name or result.location}: under the given poses: returns in {text} voxels"),
-            soft_wrap=True,
-        )
+        show(f"{name or result.location}: under the given poses: returns in {text} voxels")
 
 
 def _print_scores(title: str, scores: HeldOutScores) -> None:
@@ -209,8 +197,10 @@ def _print_scores(title: str, scores: HeldOutScores) -> None:
         out, header, [_row(name, shares) for name, shares in parts.items()], title=title, turn=False
     )
     if scores.swept_share is not None:
-        text = f"{scores.swept_share:.2%} of the {scores.swept_voxels} voxels that the vehicle itself drove through are occupied"
-        out.print(line(text))
+        show(
+            f"{scores.swept_share:.2%} of the {scores.swept_voxels} voxels that the vehicle itself "
+            "drove through are occupied"
+        )
 
 
 def _row(name: str, shares: RayShares) -> list[str]:

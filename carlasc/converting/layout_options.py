@@ -28,15 +28,16 @@ class LayoutOptions:
     """How a conversion writes sequences.
 
     Attributes:
-        classes: "carla" maps class ids to CarlaSC's; the name of the data set's own class table
-            ("semantickitti") keeps its ids; "auto" keeps those of SemanticKITTI, because its tools
-            need them, and maps those of other data sets.
-        axes: "left" mirrors y into CarlaSC's left-handed axes; "right" keeps the right-handed ones.
-        flow: "auto" gives points the velocity of their actor: from tracked boxes if the data set
-            has them, otherwise estimated from the points of numbered actors; "none" writes no flow.
+        classes: classes of the labels. "carla": CarlaSC's classes. The name of the data set's own
+            class table, such as "semantickitti": its ids are kept. "auto": the ids of SemanticKITTI
+            are kept, because its tools need them, and all others become "carla".
+        axes: axes of the output. "left": y is mirrored, as in CarlaSC, which is left-handed.
+            "right": right-handed, as in the data set.
+        flow: scene flow. "auto": the velocity of each actor, from its tracked boxes, otherwise
+            estimated from the points of numbered actors. "none": no flow.
         allow_unknown: treat class ids that the table does not have as unlabelled.
-        images: images of cameras: "copy" copies them into the output, "link" writes their paths,
-            "none" leaves them out. The calibration of the cameras is always written.
+        images: images of cameras. "copy": copied into the output. "link": only their paths are
+            written. "none": left out. The calibration of the cameras is always written.
 
     Raises:
         ArgumentError: an unknown value of `axes`, `flow` or `images`.

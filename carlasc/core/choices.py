@@ -26,6 +26,15 @@ Complete = Literal["seen", "mirror", "body"]
 Rays = Literal["all", "enough"]
 """Which rays are traced when scans are merged."""
 
+PoseSource = Literal["auto", "file", "kiss-icp"]
+"""Where the poses of scans come from."""
+
+RefineMode = Literal["auto", "always", "never"]
+"""When poses are refined."""
+
+MotionSource = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
+"""How moving points are found."""
+
 TrafficLevel = Literal["light", "medium", "heavy"]
 """Amount of simulated traffic."""
 

@@ -29,25 +29,27 @@ class FromScans:
     Attributes:
         window: first and last scan that are merged into a frame, relative to it, in frames; the
             range contains 0.
-        window_m: use only those scans of the window that lie within this driven distance, in
-            metres, and skip scans from nearly the same place; None for no limit.
-        stride: use every N-th scan of the window, counted from the frame itself.
+        window_m: merge only the scans of the window that lie within this driven distance, in
+            metres, and skip scans from nearly the same place. None: no limit.
+        stride: merge every N-th scan of the window, counted from the frame itself.
         dynamic: what happens to moving points. "align": each moving actor is completed from all
-            scans, at its position in the frame; "current": only the frame's own moving points are
-            used; "drop": none; "tube": all points stay where they were seen, as in SemanticKITTI,
-            and moving actors leave ghost trails.
-        complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown;
-            "mirror": an unseen side of a vehicle is taken from its other side; "body": all other
-            unseen parts are taken from similar vehicles of the same drive, or from the usual shape
-            of vehicles. These voxels are marked as inferred.
-        own_path: count the space that the recording vehicle drove through as free.
+            scans, at its position in the frame. "current": only the moving points of the frame
+            itself are used. "drop": they are left out. "tube": they stay where they were seen,
+            which leaves ghost trails, as in SemanticKITTI.
+        complete: what happens to the parts of an actor that no scan saw. "seen": they stay unknown.
+            "mirror": an unseen side of a vehicle is taken from its other side. "body": like
+            "mirror", and all other unseen parts are taken from similar vehicles of the same drive,
+            or from the usual shape of vehicles. These voxels are marked as inferred.
+        own_path: count the space that the recording vehicle drove through as free, which removes
+            ghost trails there.
         motion: how moving points are found.
         poses: where poses come from. Missing poses are estimated from the scans, unless
             `PoseOptions("file")` is given.
-        rays: which rays of other frames' scans vote. "all"; "enough": near the sensor, where rays
-            are dense, one of up to four votes, with their weight. With the rule "ray" only.
-        min_range_m: leave out nearer points, in metres; None for the value of carlasc.json, or 0.
-        max_range_m: leave out farther points, in metres; None for the value of carlasc.json, or no
+        rays: which rays of the scans of other frames vote. "all": every ray. "enough": near the
+            sensor, where rays are dense, one of up to four, with their weight; only for the rule
+            "ray".
+        min_range_m: leave out nearer points, in metres. None: the range in carlasc.json, or 0.
+        max_range_m: leave out farther points, in metres. None: the range in carlasc.json, or no
             limit.
 
     Raises:
@@ -125,18 +127,19 @@ class Voting:
     """How votes are counted.
 
     Attributes:
-        rule: "sensor": at most one vote per sensor (scan), voxel and class, as in the published
-            files; "sample": every sample counts; "ray": a voxel is occupied where enough of the
-            rays that enter it end in it. None: "ray" for scans, otherwise "sensor".
-        free_step_m: distance between two free samples on a ray, in metres.
-        keep: also write the votes of every class.
-        keep_evidence: also write the certainty of each voxel: the fields `occupied`, `classes`,
-            `flags` and `views` of the grid. For scans with the rule "ray" only.
-        keep_actors: also write the actor and the velocity of each voxel: the fields `instance` and
-            `velocity` of the grid. Not for grids from a finer grid; for scans with
-            `dynamic="align"` only.
-        min_confidence: voxels that are neither free nor occupied with at least this probability
-            become unknown; 0 to 0.5 keeps all. For scans with the rule "ray" only.
+        rule: how votes are counted. "sensor": at most one vote per sensor (scan), voxel and class,
+            as in the published files. "sample": one vote per sample, as in the paper. "ray": a
+            voxel is occupied if enough of the rays that enter it end in it. None: "ray" for scans,
+            otherwise "sensor".
+        free_step_m: distance between free-space samples on a ray, in metres.
+        keep: also write the votes of each class per voxel.
+        keep_evidence: also write how certain each voxel is: the fields `occupied`, `classes`,
+            `flags` and `views` of the grid. Only for scans with the rule "ray".
+        keep_actors: also write the actor that each voxel belongs to, and its velocity: the fields
+            `instance` and `velocity` of the grid. Not for grids from a finer grid; for scans, only
+            if moving points are aligned.
+        min_confidence: set a voxel to unknown if it is neither free nor occupied with at least this
+            probability, 0 to below 1; 0 to 0.5 keeps all. Only for scans with the rule "ray".
         keep_seen: also write which cameras see each voxel: the field `seen` of the grid. For
             Cartesian grids and up to eight cameras.
 

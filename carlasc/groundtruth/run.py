@@ -104,8 +104,8 @@ def regrid(
         voting: how votes are counted.
         frames: range of the source's frame numbers; None for all. A capture's frames are renumbered
             from 0.
-        name: name of the grid's folder; None for a name by its size.
-        overwrite: replace a grid that `regrid` made with other settings.
+        name: name of the grid's folder. None: a name with its size.
+        overwrite: replace what an earlier run with other settings wrote.
         run: how the work is spread, whether this is only a part of it, and what shows its progress.
             The last part to finish writes the report, and finishes a packed store.
 

@@ -72,11 +72,11 @@ def report(
 
     Args:
         source: anything that `carlasc.open` takes.
-        grid: name of one grid; None for all.
+        grid: only the grid of this name. None: all grids.
         remake: make all reports from the files, also where reports exist.
-        holdout: add held-out scores (see `carlasc.inspection.holdout`) if they are missing, for
-            Cartesian grids that were made from scans.
-        save: write the reports beside their grids: folders only, and only grids that carlasc made.
+        holdout: also measure held-out rays, as `carlasc validate --holdout` does, of Cartesian
+            grids that were made from scans.
+        save: write the reports into the folders of the grids (only of grids that carlasc made).
         run: how the work is spread, with a callback for the progress of reports that are made.
 
     Raises:

@@ -212,11 +212,10 @@ def stats(
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
-        grid: the grid whose voxels are counted. In a sequence that has only one grid, of another
-            name, that one is counted.
+        grid: grid whose voxels are counted. A sequence that has only one grid uses that one.
         remap: the remap to the classes of a second table: a remap or its name, None for no second
             table, or "auto", which takes the paper's 11 classes or SemanticKITTI's 19.
-        every: count every N-th frame.
+        every: count only every N-th frame.
         run: how the work is spread, with a callback for progress.
 
     Returns:

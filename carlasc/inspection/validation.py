@@ -159,7 +159,7 @@ def validate(
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source.
-        every: read the contents of every N-th frame; 1 reads all, None about forty frames per
+        every: read the contents of every N-th frame; 1 reads all. None: about forty frames per
             sequence.
         run: how the work is spread over the sequences, with a callback for progress.
 

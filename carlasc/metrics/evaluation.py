@@ -310,14 +310,15 @@ def evaluate(
             "own" scores the unchanged classes of the data. None takes the benchmark of the ground
             truth files; for other data "carlasc" if it has a map for the class table, otherwise
             "own".
-        grid: name of the predicted grid; None takes the name of the true grid, or the only grid of
-            a sequence.
-        truth_grid: name of the true grid; None takes `evaluation`, or the only grid of a sequence.
-        source_classes: name of the class table of the predictions, for data that do not name one.
-            None takes the default table of the convention.
+        grid: name of the grid with the predictions. None: the name of the true grid, or the only
+            grid of a sequence.
+        truth_grid: name of the grid with the ground truth. None: evaluation, or the only grid of a
+            sequence.
+        source_classes: class table of the predictions, for data whose metadata name none. None: the
+            default table of the convention.
         scoring: voxels to score, and additional scores.
         frames: frames to score; None scores all frames of the ground truth.
-        name: name of the predictions in tables; None takes a name from `source`.
+        name: name of the predictions in the tables. None: the name of the source.
         run: how the work is distributed, and the progress callback.
 
     Returns:

@@ -129,7 +129,8 @@ def scores(files: Iterable[str | os.PathLike[str]], *, mixed: bool = False) -> S
 
     Args:
         files: JSON files.
-        mixed: allow different conventions, and show the convention of each result.
+        mixed: allow results by different conventions, which cannot be compared, and show the
+            convention of each.
 
     Raises:
         ArgumentError: the conventions differ, so the results cannot be compared, and `mixed` is not

@@ -22,16 +22,17 @@ class Scoring:
     """Voxels to score, and additional scores.
 
     Attributes:
-        voxels: "known" scores the voxels of the convention; "all" also scores unknown voxels of the
-            ground truth.
+        voxels: "known": score the voxels of the convention, which are known in the ground truth.
+            "all": also score unknown voxels of the ground truth.
         region: function that returns an (X, Y, Z) bool mask for a GridSpec, such as `lambda spec:
             distance_band(spec, 0, 10)`. Only voxels in the mask are scored. With several processes,
             it must be picklable. None scores all voxels.
-        by: separate scores by any of "distance", "height", "visibility" (from the sensor in the
-            frame), "motion" and "seen" (by any camera).
-        rays: also compute RayIoU, which needs poses and a Cartesian grid.
-        actors: also score actors and velocities. Prediction and ground truth need the field
-            `instance`, for velocities also `velocity`.
+        by: also score by distance, height, visibility (from the sensor in the frame), motion or
+            seen (by any camera).
+        rays: also score the first occupied voxel on each ray: RayIoU. Needs poses and a Cartesian
+            grid.
+        actors: also score actors: panoptic quality (PQ), tracking (LSTQ), and velocities.
+            Prediction and ground truth need the field `instance`, for velocities also `velocity`.
 
     Raises:
         ArgumentError: a value is not valid.

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
+from carlasc.core.choices import MotionSource as MotionSource  # noqa: PLC0414 (part of this module)
+from carlasc.core.choices import PoseSource as PoseSource  # noqa: PLC0414 (part of this module)
+from carlasc.core.choices import RefineMode as RefineMode  # noqa: PLC0414 (part of this module)
 from carlasc.errors import ArgumentError, check_choice
-
-PoseSource = Literal["auto", "file", "kiss-icp"]
-RefineMode = Literal["auto", "always", "never"]
-MotionSource = Literal["auto", "boxes", "instances", "flow", "evidence", "none"]
 
 
 @dataclass(frozen=True)
@@ -17,14 +15,14 @@ class PoseOptions:
     """Where the poses of scans come from.
 
     Attributes:
-        source: "file": the poses of the data; "kiss-icp": estimated from the scans (needs the extra
-            `kitti`); "auto": the poses of the data where they exist, otherwise estimated. Estimated
-            poses are written only where the sequence has none.
-        refine: whether poses are changed so that neighbouring scans agree. "auto": where scans
-            agree clearly better afterwards, measured in places that take no part; "always": also
-            where they do not; "never". The given poses are not overwritten.
-        force: accept poses that are farther apart than a vehicle can move or turn, or under which
-            scans do not overlap.
+        source: where poses come from. "file": the poses of the data. "kiss-icp": estimated from the
+            scans (needs the extra kitti). "auto": the poses of the data if they exist, otherwise
+            estimated. Estimated poses are written only where the sequence has none.
+        refine: refine poses, so that neighbouring scans agree. "auto": only where scans then agree
+            clearly better, measured in places that take no part. "always": all poses. "never":
+            none. The given poses are not overwritten.
+        force: accept poses even if they jump between frames, if scans do not overlap under them, or
+            if their calibration is missing.
 
     Raises:
         ArgumentError: an unknown value.
@@ -44,10 +42,10 @@ class MotionOptions:
     """How moving points are found.
 
     Attributes:
-        source: "boxes", "instances", "flow": the field of the sequence; "evidence": free space: a
-            point moves if rays of other scans passed through its place; "none": only points of
-            moving classes move; "auto": the best of these fields that exists, and "evidence" for
-            what it misses, unless every point has flow.
+        source: how moving points are found. "boxes", "instances", "flow": by the field of that
+            name. "evidence": a point moves if rays of other scans passed through its position.
+            "none": only classes that always move. "auto": the best field that exists, and
+            "evidence" for what it misses, unless every point has flow.
         min_speed_m_s: slower actors count as static, in metres per second.
 
     Raises:

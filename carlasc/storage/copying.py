@@ -213,8 +213,7 @@ def unpack(
     Args:
         source: a packed store, or anything else that `carlasc.open` takes, or a source.
         out: the folder to write: a path, or a URL of an object store.
-        overwrite: write into an existing folder and replace files of the same names; other files
-            are unchanged.
+        overwrite: write into an existing folder, and replace files of the same names.
         run: how the work is distributed. The default is one process per core, fewer for few frames.
             Progress counts files.
 

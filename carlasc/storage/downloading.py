@@ -166,14 +166,15 @@ def download(
 
     Args:
         out: folder that the zips are written to.
-        split: "train" (two zips), "val", "test", "all", or several of them. Empty for grids,
+        split: "train" (two zips), "val", "test" or "all"; several may be given. Grids need none,
             because their zips hold all splits.
-        what: "sequences" (scans, poses, coarse grids), or only "fine" or "cylindrical" grids.
-        extract: extract each zip into `out` (grids into a separate folder there), then remove it.
-        keep: with `extract`, keep the zip too.
-        base_url: URL of a mirror: zips are fetched from `<base_url>/<name>`. None fetches from the
-            published URLs.
-        connections: number of blocks of a zip that are fetched at the same time.
+        what: what to download. "sequences": scans, poses and coarse grids. "fine", "cylindrical":
+            only these grids, of all splits.
+        extract: extract each zip into the folder (grids into a separate folder there), then remove
+            it.
+        keep: with `extract`: keep the zips too.
+        base_url: URL of a mirror: zips are read from BASE_URL/NAME. None: the published URLs.
+        connections: number of parallel connections, each of which fetches a block of a zip.
         progress: called with (bytes done, total bytes), for each zip first while fetching, then
             while extracting.
 

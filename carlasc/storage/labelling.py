@@ -84,12 +84,12 @@ def label(
             `.label`: uint32 per point, of which the lower 16 bits are the class. `.npy`: (N,) class
             ids, or (N, C) probabilities by class id. `.npz`: `labels` (N,), `probabilities` (N, C),
             or both.
-        classes: class table of the predictions: its name, a JSON file, or a table; None for the
-            table of each sequence. Labels are converted to the table of the sequence if a remap
-            exists; otherwise the result has the table of the predictions.
-        logits: whether (N, C) arrays hold scores before the softmax.
-        by: name of the network in carlasc.json, reports and cards; None for the name of the folder
-            `predictions`.
+        classes: class table of the predictions: its name, a JSON file, or a table. Labels are
+            converted to the table of the sequence if a remap exists; otherwise the result has the
+            table of the predictions. None: the table of each sequence.
+        logits: the predicted class scores are logits (before the softmax).
+        by: name of the network, for the metadata, reports and cards. None: the name of the folder
+            of predictions.
         frames: range of frames that get labels; each needs a file. Other frames are copied without
             labels.
         overwrite: replace a data set at `out` that `label` has made.

@@ -96,10 +96,10 @@ def pack(
         source: what to pack: anything that `carlasc.open` takes, or a source.
         out: the store to write, a path or (.zarr) a URL of an object store. The suffix, `.zarr`,
             `.h5` or `.parquet`, determines its kind.
-        small: compress points with PCodec (zarr only): smaller, but fewer programs can read it.
-        lossy_mm: quantise points to this many millimetres, which the store records. None keeps
-            every bit.
-        overwrite: replace an existing store at `out`.
+        small: compress points with PCodec (only .zarr): smaller, but fewer programs can read it.
+        lossy_mm: round coordinates of points to this step, in millimetres, which the store records.
+            None: exact.
+        overwrite: replace an existing store.
         run: how the work is distributed. A `.zarr` is packed in blocks of frames: by worker
             processes (default: one per core, fewer for few blocks), by an executor, or in parts;
             the last part to finish completes the store. Other stores have one writer: `workers` is

@@ -50,17 +50,19 @@ class Scene:
     Attributes:
         source: a path or URL that `carlasc.open` takes, a grid's folder, the file of one frame, a
             Source or a Sequence.
-        sequence: path or name of the sequence in the source; None takes the first.
+        sequence: path or name of the sequence, if the source has several. None: the first.
         frames: range of frame numbers; None takes all.
-        every: show every N-th frame of the range.
-        grid: name of the grid; None takes `evaluation`, or the first grid.
-        truth: ground truth to compare the grid with; anything that `source` may be.
-        truth_grid: name of the ground truth's grid; None as for `grid`.
-        classes: class table to show, such as "carlasc11"; None shows the grid's own classes, or
-            those of the ground truth if only these are common to both.
-        source_classes: class table of the labels in `source`; None takes the one in its metadata.
-        palette: "class" (the colours of the class table), "colorblind", or "height" (by height; for
-            pictures only).
+        every: show only every N-th frame.
+        grid: name of the grid. None: evaluation, or the first grid.
+        truth: ground truth of the source, which is then shown as a prediction with its errors. It
+            may be anything that the source may be.
+        truth_grid: name of the grid with the ground truth. None: as for `grid`.
+        classes: class table to show, such as "carlasc11" (the paper's eleven). None: that of the
+            data, or that of the ground truth if only its classes are common to both.
+        source_classes: class table of the labels in the source, if its metadata do not name it:
+            carla, carlasc11, and so on.
+        palette: "class": the colours of the class table. "colorblind": colours for colour-blind
+            readers. "height": colours by height, only for pictures.
 
     Raises:
         ArgumentError: an unknown class table or palette, an invalid range of frames, or `every`

@@ -127,14 +127,14 @@ def view(
             for Rerun, .mcap a recording for Foxglove. A name without an ending is the folder of a
             page for a web server: the browser fetches frames when it shows them, and without
             `frames` the page shows the whole sequence. None opens a window.
-        thin_m: points in a page are thinned to one per cell of this side length, metres.
-        beside: another run of the same sequence, which a page compares with `source` on both sides
-            of a divider. Anything that a scene's `source` may be; of several sequences, the one
-            with the same path or name is taken.
-        beside_grid: name of its grid; None as for the grid of `source`. Without `beside`, another
-            grid of `source` itself.
-        full_points: whether a recording keeps all points; otherwise at most 30,000 of each frame.
-        overwrite: whether an existing file is replaced.
+        thin_m: keep one point of a page per cell of this side length, in metres.
+        beside: another run of the sequence, shown in the page on the other side of a movable
+            divider.
+        beside_grid: name of the grid of the other run; without another run, another grid of the
+            same one.
+        full_points: keep all points in a recording, and print its expected size first; otherwise at
+            most 30,000 points per frame.
+        overwrite: replace an existing file.
         progress: called with (frames done, frames in all) while a file is written.
         report: called with lines of text: for a recording with `full_points`, its approximate size;
             for a window, the keys, and after each key its effect.

@@ -1,17 +1,21 @@
 """Options that stand in groups, or that a converter declares, are options like any other."""
 
+import dataclasses
 import inspect
 import re
-from typing import get_type_hints
+import subprocess
+import sys
+from typing import Annotated, get_args
 
 import pytest
 from typer.testing import CliRunner
 
+from carlasc import CardDetails, FromScans, LayoutOptions, StyleOptions, Voting
 from carlasc.cli import app, convert
 from carlasc.cli.flags import DeclaredOptions, OneWorkerFlags, flatten
-from carlasc.cli.grid_flags import GroundTruthFlags, ScanFlags, VoteFlags
+from carlasc.cli.grid_flags import GroundTruthFlags, MotionGiven
+from carlasc.cli.library import TABLE, Given, Library, declarations
 from carlasc.cli.regrid import regrid
-from carlasc.groundtruth import FromScans
 from carlasc.motion import MotionOptions, PoseOptions
 
 
@@ -19,44 +23,87 @@ def run(*arguments):
     return CliRunner().invoke(app, [*map(str, arguments)], terminal_width=200)
 
 
+def parameters_of(function):
+    return inspect.signature(flatten(function)).parameters
+
+
+def option_of(library, name):
+    """Return the option of a command that stands for an argument or a field of the library."""
+    (one,) = [one for one in library.parameters() if one.name.endswith(f"__{name}")]
+    return get_args(one.annotation)[1]
+
+
 def test_a_group_becomes_options_and_comes_back_as_an_object():
     seen = []
 
-    def command(scans: ScanFlags, work: OneWorkerFlags, name: str = "x") -> None:
-        seen.append((scans, work, name))
+    def command(
+        scans: Annotated[Given, Library("carlasc.FromScans")],
+        motion: MotionGiven,
+        work: OneWorkerFlags,
+        name: str = "x",
+    ) -> None:
+        seen.append((scans, motion, work, name))
 
     flat = flatten(command)
-    names = list(inspect.signature(flat).parameters)
-    assert {"window", "stride", "workers", "cluster", "name"} <= set(names)
-    given = {
-        name: parameter.default for name, parameter in inspect.signature(flat).parameters.items()
-    }
-    flat(**given | {"stride": 3, "motion": "flow", "name": "y"})
-    ((scans, work, name),) = seen
-    assert scans == ScanFlags(stride=3, motion="flow") and scans.is_given
+    given = {name: one.default for name, one in inspect.signature(flat).parameters.items()}
+    assert {"FromScans__window", "FromScans__stride", "workers", "cluster", "name"} <= set(given)
+    flat(**given | {"FromScans__stride": 3, "MotionOptions__source": "flow", "name": "y"})
+    ((scans, motion, work, name),) = seen
+    assert scans.values == {"stride": 3} and scans.is_given
     assert work == OneWorkerFlags() and not work.is_given
     assert name == "y"
-    merged = scans.from_scans(PoseOptions("file"))
-    assert (merged.stride, merged.motion, merged.poses) == (
-        3,
-        MotionOptions("flow"),
-        PoseOptions("file"),
-    )
+    merged = scans.make(motion=motion.make(), poses=PoseOptions("file"))
+    assert merged == FromScans(stride=3, motion=MotionOptions("flow"), poses=PoseOptions("file"))
 
 
 def test_regrid_and_convert_have_the_same_grid_options():
-    of = {
-        function: set(inspect.signature(flatten(function)).parameters)
-        for function in (regrid, convert.convert)
-    }
-
     def making(making: GroundTruthFlags) -> None:
         """Take the options alone."""
 
-    shared = set(inspect.signature(flatten(making)).parameters)
-    assert {"res", "bounds", "rule", "keep_evidence", "window", "motion"} <= shared
-    assert all(shared <= names for names in of.values())
-    assert VoteFlags().voting().free_step_m == 1.5
+    shared = set(parameters_of(making))
+    fields = {name.rpartition("__")[2] for name in shared}
+    assert {"res", "bounds", "rule", "keep_evidence", "window", "own_path"} <= fields
+    assert all(shared <= set(parameters_of(command)) for command in (regrid, convert.convert))
+
+
+@pytest.mark.parametrize("made", [FromScans, Voting, LayoutOptions, StyleOptions, CardDetails])
+def test_each_field_of_an_option_object_is_an_option_with_its_default(made):
+    library = Library(f"carlasc.{made.__name__}")
+    options = {one.name.rpartition("__")[2]: one for one in library.parameters()}
+    fields = {field.name: field.default for field in dataclasses.fields(made)}
+    assert set(fields) - set(options) == ({"motion", "poses"} if made is FromScans else set())
+    for name, parameter in options.items():
+        named = re.search(r"\[default: (.*)\]$", get_args(parameter.annotation)[1].help)
+        default = fields[name]
+        if default is None or default is False or default == ():
+            assert named is None
+        else:
+            text = ":".join(map(str, default)) if isinstance(default, tuple) else str(default)
+            assert named[1] == ("yes" if default is True else text)
+
+
+def test_what_a_text_says_of_python_is_said_of_the_command_line():
+    assert option_of(Library("carlasc.Scene"), "truth_grid").help.endswith(
+        "Default: as for --grid."
+    )
+    assert (
+        option_of(Library("carlasc.download"), "keep").help == "With --extract: keep the zips too."
+    )
+    assert option_of(Library("carlasc.FromScans"), "dynamic").help.startswith(
+        "What happens to moving points. align: each moving actor"
+    )
+
+
+def test_every_renamed_or_hidden_name_is_one_of_the_library():
+    for name, shown in TABLE.items():
+        known = declarations(name)
+        assert {*shown.hidden.split(), *shown.files.split(), *shown.renamed} <= set(known), name
+
+
+def test_a_python_that_drops_docstrings_keeps_the_help():
+    command = [sys.executable, "-OO", "-m", "carlasc", "pack", "--help"]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "Compress points with PCodec" in ran.stdout
 
 
 @pytest.mark.parametrize(
@@ -104,19 +151,3 @@ def test_declared_options_that_are_not_given_are_left_to_the_library():
     flat(**dict.fromkeys(names))
     flat(**dict.fromkeys(names) | {names[-1]: False})
     assert seen[0] == {} and list(seen[1].values()) == [False]
-
-
-def test_the_default_that_a_help_text_names_is_that_of_the_library():
-    """The text of `--complete` named the default of an earlier version."""
-    named = {}
-    for name, annotation in get_type_hints(ScanFlags, include_extras=True).items():
-        for option in getattr(annotation, "__metadata__", ()):
-            word = re.search(r"(?:^|[;.] )(\w+): [^;.]*\(default\)", option.help)
-            named |= {name: word[1]} if word else {}
-    library = FromScans()
-    assert named == {
-        "dynamic": library.dynamic,
-        "motion": library.motion.source,
-        "complete": library.complete,
-        "rays": library.rays,
-    }

@@ -227,5 +227,6 @@ def test_degrees_end_at_the_command_line():
     assert spec.lower[1] == np.float32(-math.pi / 2) and spec.upper[1] == np.float32(math.pi / 2)
     whole = GridFlags(size="8,8,4", coordinates="cylindrical", bounds="0,20,-180,180,-2,1").spec()
     assert whole.lower[1] == GridSpec.published("cylindrical").lower[1]
-    with pytest.raises(ArgumentError, match="at most 2 pi"):
+    with pytest.raises(ArgumentError) as error:
         GridFlags(size="8,8,4", coordinates="cylindrical", bounds="0,20,-190,180,-2,1").spec()
+    assert "2 pi" in error.value.expected

@@ -57,3 +57,9 @@ def test_the_list_of_commands_shows_their_first_lines():
     for name, command in get_command(app).commands.items():
         first = " ".join(command.help.split("\n\n")[0].split())
         assert f"{name} {first[:30]}" in text, name
+
+
+def test_a_command_with_texts_and_defaults_loads_no_pydantic(data):
+    """Typer converts values with pydantic, which takes as long to load as NumPy."""
+    _, modules = loaded("info", data, "--json")
+    assert "numpy" in modules and "pydantic" not in modules

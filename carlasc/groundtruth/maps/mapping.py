@@ -99,19 +99,18 @@ def map(
         source: a data set with one sequence: anything that `carlasc.open` takes, or a source.
         out: the file of the map: .ply, .pcd, .las or .npz (points), or .bt (OctoMap). None: only
             the files `mesh` and `distance`.
-        cell_m: size of a cell, metres; a grid has its own cells.
+        cell_m: size of a cell, in metres: one point is written per cell. A grid has its own cells.
         frames: range of frame numbers; None for all. Moving actors are searched for in a few more
             seconds. With `grid`, one frame.
-        grid: name of the grid that is the map.
+        grid: make the map from this grid of one frame, instead of the scans.
         actors: also write the body of each moving actor, in its own frame, to the folder
-            `<out>_actors`, and their poses to `actors.json`.
-        mesh: file of the surface of the occupied cells, with the colours of classes: .ply or .glb.
-        distance: .npz file of each voxel's distance from the surface, with `grid`: see
-            `docs/commands/map.md`.
+            OUT_actors, and their poses to actors.json.
+        mesh: file of the surface of the occupied cells, with classes as colours: .ply or .glb.
+        distance: with `grid`: .npz file of the distance of each voxel from the surface.
         motion: how moving points are found.
         poses: where poses come from. Missing poses are estimated from the scans, unless
             `PoseOptions("file")` is given.
-        overwrite: replace files that exist.
+        overwrite: replace existing files.
         run: how the work is spread. Steps of progress are scans.
 
     Returns:

@@ -156,12 +156,12 @@ def audit(
             SemanticKITTI, SSCBench, Occ3D, OpenOccupancy or CarlaOcc.
         scans: a recording in CarlaSC's layout, with scans; poses, labels, boxes, instances and flow
             are used if they exist.
-        grid: name of the grids; None takes `evaluation`, or the only grid of a sequence.
-        made_from: first and last scan, relative to its frame, that a grid was made from; None if
-            that is not known.
+        grid: name of the grids. None: evaluation, or the only grid.
+        made_from: first and last scan that each grid was made from, in frames relative to its
+            frame. None: not known.
         frames: frames of the grids; None for all.
-        keep: folder for intermediate sums, so that an interrupted audit continues, and parts can be
-            joined.
+        keep: folder for intermediate counts: an interrupted audit continues there, and parts of a
+            run need it to be joined.
         run: how the work is spread, with a callback for progress. A part needs `keep`; the last
             part gives the verdicts.
 

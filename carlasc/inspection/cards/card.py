@@ -87,9 +87,9 @@ def card(
         out: folder of the card, the root folder of the publication. None: the source, if it is a
             folder or a Parquet store; otherwise the folder that contains it.
         about: details that are not in the data: their name, authors, licence, and how to cite them.
-        pictures: whether a grid and a scan are drawn, which needs the extra `render`.
+        pictures: draw a grid and a scan (needs the extra `render`).
         every: count the classes of every N-th frame.
-        overwrite: whether an existing card is replaced.
+        overwrite: replace an existing card.
         run: how the counting is spread, with a callback for progress.
 
     Returns:

@@ -27,18 +27,17 @@ class CardDetails:
     """Details of a data set that are not in the data.
 
     Attributes:
-        name: name of the data set; None takes that of the source.
-        description: a sentence or two; None makes one from the data.
-        authors: names of the people or groups that publish it.
-        license: licence of the sequences whose carlasc.json names none, such as "cc-by-4.0", or the
-            address of its text. Converted sequences keep the licence of their source.
+        name: name of the data set. None: that of the source.
+        description: description in a sentence or two. None: one made from the data.
+        authors: people or groups that publish it.
+        license: licence of the sequences whose carlasc.json names none: a name such as cc-by-4.0,
+            or the URL of its text. Converted sequences keep the licence of their source.
         citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is always named,
             too.
-        url: address of the page where the data are published, such as
-            "https://huggingface.co/datasets/ORG/NAME".
-        contact: a name or an address for questions.
+        url: URL where the data are published, such as https://huggingface.co/datasets/ORG/NAME.
+        contact: contact for questions, such as an e-mail address.
         version: version of the data.
-        published: date of the publication, YYYY-MM-DD; None takes today.
+        published: date of the publication, YYYY-MM-DD. None: today.
 
     Raises:
         ArgumentError: a version, a date or an address is not valid.

@@ -92,7 +92,7 @@ def finish(
 
     Args:
         out: the store: a path, or a URL of an object store.
-        incomplete: finish the store even if announced frames are missing.
+        incomplete: finish the store even if frames are missing.
         **storage_options: options of fsspec for a URL.
 
     Returns:

@@ -143,12 +143,12 @@ class CameraOptions:
     Without `still`, the camera moves with the ego vehicle.
 
     Attributes:
-        view: "perspective", "bev" (bird's-eye view) or "both", side by side.
+        view: "perspective": from behind and above; "bev": from straight above (bird's-eye view);
+            "both", side by side.
         viewpoint: where perspective views are taken from; the default is a point behind and above
             the ego vehicle.
-        orbit: whether the camera circles the scene once: while the frames follow each other, or
-            around a single frame.
-        still: whether the camera stays at one place in the world; needs poses.
+        orbit: circle the scene once: while the frames follow each other, or around a single frame.
+        still: do not move the camera with the ego vehicle; needs poses.
 
     Raises:
         ArgumentError: an unknown view.

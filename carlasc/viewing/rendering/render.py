@@ -112,21 +112,20 @@ def render(
         out: file name that ends in .png, .gif, .mp4 or .webp; None names the file after the
             sequence, in the current folder. A scene without `frames` gives a picture of the first
             frame, or a film of all frames.
-        what: grid, scan, flow, truth, errors: several names, separated by commas, are drawn side by
-            side. None draws the grid, with a ground truth also the truth and the errors; or the
-            scan if there is no grid.
-        color: what the colours of the grid mean: "class"; or "confidence" (the probability that a
-            voxel is occupied), "views" (the scans that saw it), "votes", "inferred" (seen or
-            inferred): see `docs/format.md#evidence`; "actor" (the number of its actor) or "seen"
-            (by how many cameras).
-        boxes: whether boxes around actors are drawn: those of the field `boxes`, otherwise the
-            tightest ones around the points of each actor of `instances`.
+        what: grid, scan, flow, truth or errors; several names, separated by commas, are drawn side
+            by side. None: the grid, with a ground truth also the truth and the errors; or the scan
+            if there is no grid.
+        color: what the colours of the grid show. "class": classes; "confidence": the probability
+            that a voxel is occupied; "views": the scans that saw it; "votes"; "inferred": seen or
+            inferred; "actor": the number of its actor; "seen": by how many cameras.
+        boxes: draw boxes around actors: those of the data, otherwise the tightest ones around the
+            points of each actor.
         camera: the camera. By default the camera follows the ego vehicle, behind and above it,
             because grids and scans are in the frame of its sensor.
         style: size, legend, captions and size of text, for a screen or for a paper.
-        fps: pictures per second of a film; None takes 10, the rate of the data (20 for an orbit
-            around one frame).
-        overwrite: whether an existing file is replaced.
+        fps: frames of a film per second. None: 10, the rate of the data (20 for an orbit around one
+            frame).
+        overwrite: replace an existing file.
         run: how the pictures are spread over processes, with a callback for progress.
 
     Returns:

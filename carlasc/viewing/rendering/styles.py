@@ -33,18 +33,18 @@ class StyleOptions:
 
     Attributes:
         name: "screen"; or "paper": PNG with 300 pixels per inch, text of 8 points, and the legend
-            in a separate file, `<name>.legend.png`.
-        size: (width, height) of the picture in pixels; or a text such as "1280x720" (pixels),
-            "8.8cm x 5cm", "88mm x 50mm" or "3.5in x 2in". None takes 1280 x 720 pixels, or 8.8 x 5
-            cm on paper.
-        dpi: pixels per inch in the metadata of a PNG. None takes 300 on paper and for a size with a
+            in a separate file, NAME.legend.png.
+        size: width and height of the picture in pixels, as 1280x720, or with a unit, as 8.8cmx5cm,
+            88mmx50mm or 3.5inx2in; in Python also a tuple of pixels. None: 1280x720, or 8.8cmx5cm
+            on paper.
+        dpi: pixels per inch in the metadata of a PNG. None: 300 on paper and for a size with a
             unit.
-        captions: for a list of scenes: a text for each panel, after its letter. Empty names the
-            differences between the panels.
-        columns: for a list of scenes: number of panels in a row. None takes the number of frames of
-            one scene, or the best fit.
-        legend: whether the picture has a legend.
-        ego: whether a plain car is drawn at the sensor.
+        captions: for several scenes: a caption for each panel, after its letter. By default, a
+            caption names the differences between the panels.
+        columns: for several scenes: number of panels in a row. None: the number of frames of one
+            scene, or the best fit.
+        legend: draw a legend.
+        ego: draw the ego vehicle, as a plain car at the sensor.
 
     Raises:
         ArgumentError: an unknown style, or an impossible size, `dpi` or number of columns.
