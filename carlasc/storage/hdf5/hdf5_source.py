@@ -21,8 +21,8 @@ from carlasc.storage.files import parse_json_value
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
 from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
 from carlasc.storage.transport.remote_tree import RemoteTree
-from carlasc.storage.transport.requests import holding_a_lock
 from carlasc.storage.transport.trees import Tree
+from carlasc.storage.transport.web import garbage_collection_paused
 
 _BLOSC = 32001  # registered number of the filter
 _GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 itself
@@ -118,7 +118,7 @@ class HDF5Store(ArrayStore):
             if isinstance(self.tree, RemoteTree):
                 with (
                     self.tree.open(self.path) as remote,
-                    holding_a_lock(),
+                    garbage_collection_paused(),
                     h5py.File(remote, "r") as file,
                 ):
                     yield file

@@ -288,7 +288,7 @@ class CachedTree(Tree):
                 write_at(descriptor, data, start)
 
     def _key(self, path: str) -> str:
-        options = self.remote.requests.options
+        options = self.remote.client.options
         endpoint = (
             options.get("endpoint_url")
             or dict(options.get("client_kwargs") or {}).get("endpoint_url")

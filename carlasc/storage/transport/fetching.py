@@ -42,7 +42,8 @@ from carlasc.storage.transport.failures import (
     fail,
     is_temporary,
 )
-from carlasc.storage.transport.requests import HttpAnswer, Requests
+from carlasc.storage.transport.requests import persist
+from carlasc.storage.transport.web import HttpAnswer, WebClient
 
 _ZIP = b"PK"
 _GONE = (401, 403, 404, 410)
@@ -124,7 +125,7 @@ class FileFetch:
                 expected="a URL that begins with http:// or https://",
                 found="another URL",
             )
-        self._requests = Requests(url)
+        self._client = WebClient(url, {})
         self.file = self._persist(self._probe)
 
     def remaining(self) -> int:
@@ -295,7 +296,7 @@ class FileFetch:
 
     @contextmanager
     def _answer(self, headers: dict[str, str]) -> Iterator[HttpAnswer]:
-        with self._requests.answer(headers) as answer:
+        with self._client.answer(headers) as answer:
             if answer.status in _GONE:
                 raise MissingDataError(
                     self._where,
@@ -317,7 +318,7 @@ class FileFetch:
         If all attempts fail, raise a one-line error about the last failure.
         """
         try:
-            return self._requests.persist(work, count, stop)
+            return persist(work, self._client.settings, count, stop)
         except (CarlascError, _ChangedError, _RangeIgnoredError):
             raise
         except Exception as error:
@@ -325,7 +326,7 @@ class FileFetch:
                 raise CarlascError(
                     self._where,
                     expected="data",
-                    found=f"none in {self._requests.settings.attempts} attempts "
+                    found=f"none in {self._client.settings.attempts} attempts "
                     f"({describe_failure(error)})",
                     advice="run the same command again to continue",
                 ) from None

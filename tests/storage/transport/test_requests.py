@@ -43,7 +43,7 @@ from carlasc.storage.transport.requests import RemoteSettings
 from carlasc.storage.transport.targets import RemoteTarget, Target, check_shared, target_of
 from carlasc.testing import SinkContract
 
-pytest.importorskip("s3fs")
+pytest.importorskip("obstore")
 FAULTS = {
     "503": "",
     "drop": "",
@@ -276,7 +276,7 @@ def test_a_silent_server_is_one_line_after_a_bounded_time(
     message = failing(
         lambda: RemoteTree(f"s3://{BUCKET}/x", options_for(faulty.url)).read("a"), CarlascError
     )
-    assert "failed at each attempt, last with ReadTimeoutError" in message
+    assert "failed at each attempt" in message
     assert time.perf_counter() - began < 3
 
 
@@ -364,7 +364,7 @@ def test_credentials_appear_neither_in_messages_nor_in_representations(
     for thing in (
         target,
         tree,
-        tree.requests,
+        tree.client,
         FolderSink(target),
         FolderSink(target).sequence("a"),
         as_sink(target),
@@ -488,12 +488,13 @@ def test_a_remote_file_reads_as_a_local_one_in_few_requests() -> None:
     assert whole.read(len(data)) == data and len(fetched) == 1
 
 
-def test_threads_share_one_file_system(endpoint: str) -> None:
+def test_threads_share_one_connection(endpoint: str) -> None:
     tree = upload_bytes(endpoint, "threads/a", b"12345").tree
     with ThreadPoolExecutor(4) as pool:
         assert {
-            id(fs) for fs in pool.map(lambda _: (tree.read("a"), tree.requests.fs)[1], range(8))
-        } == {id(tree.requests.fs)}
+            id(found)
+            for found in pool.map(lambda _: (tree.read("a"), tree.client.connection)[1], range(8))
+        } == {id(tree.client.connection)}
 
 
 @contextmanager
