@@ -117,7 +117,7 @@ def test_one_frame_from_scans_passes_through_few_files(tmp_path):
 
 def modules_of(path):
     """Yield the full names of the modules that a file imports, wherever in it; by name too
-    (`import_extra("s3fs", ...)`).
+    (`import_extra("obstore", ...)`).
     """
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
@@ -136,7 +136,6 @@ def modules_of(path):
 
 
 CLIENTS = (
-    "aiobotocore",
     "aiohttp",
     "boto3",
     "botocore",
@@ -145,8 +144,8 @@ CLIENTS = (
     "httpx",
     "httpx2",
     "huggingface_hub",
+    "obstore",
     "requests",
-    "s3fs",
     "urllib.request",
     "urllib3",
 )

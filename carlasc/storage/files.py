@@ -14,6 +14,7 @@ import os
 import re
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -123,11 +124,12 @@ def _remove(temporary: Path) -> None:
 
 
 def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
-    """Write all bytes at an offset of an open file."""
+    """Write all bytes at an offset of an open file. Several threads may write to one file."""
     view = memoryview(data)
-    while view:
-        written = os.pwrite(descriptor, view, offset)
-        view, offset = view[written:], offset + written
+    with _POSITION:
+        os.lseek(descriptor, offset, os.SEEK_SET)
+        while view:
+            view = view[os.write(descriptor, view) :]
 
 
 def has_content(path: str | os.PathLike[str]) -> bool:
@@ -181,6 +183,8 @@ def _remove_ended(parts: Iterable[Path]) -> None:
 
 
 def _is_alive(process: int) -> bool:
+    if os.name == "nt":  # there, os.kill ends the process
+        return True
     try:
         os.kill(process, 0)  # signal 0 only checks that the process exists
     except ProcessLookupError:
@@ -284,6 +288,7 @@ DURABLE = "CARLASC_DURABLE"
 Worker processes have the environment of the process that starts them.
 """
 
+_POSITION = threading.Lock()  # of open files: Windows cannot write at an offset in one call
 _VALUES = {"yes": True, "1": True, "true": True, "no": False, "0": False, "false": False}
 _SIDE_BY_SIDE = 16  # files that are synced at the same time
 # errors of file systems that cannot sync a folder
@@ -380,8 +385,11 @@ def make_folder(folder: Path) -> None:
 
 
 def _sync_path(path: Path) -> None:
+    windows = os.name == "nt"  # syncs files that are open for writing, and no folders
+    if windows and path.is_dir():
+        return
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDWR if windows else os.O_RDONLY)
         try:
             _sync(descriptor)
         finally:

@@ -29,7 +29,7 @@ from carlasc.storage.transport.targets import LocalTarget, RemoteTarget, Target,
 from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.zarr.zarr_sink import ZarrSink
 
-for package in ("s3fs", "numcodecs", "google_crc32c"):
+for package in ("obstore", "numcodecs", "google_crc32c"):
     pytest.importorskip(package)
 
 

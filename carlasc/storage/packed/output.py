@@ -178,17 +178,18 @@ class PatientFile(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         """Read bytes at the position; zeros after an error."""
         view = memoryview(buffer).cast("B")
-        found = b""
+        data = b""
         if self._error is None:
             try:
-                found = os.pread(self._descriptor, len(view), self._position)
+                os.lseek(self._descriptor, self._position, os.SEEK_SET)
+                data = os.read(self._descriptor, len(view))
             except OSError as error:
                 self._error = error
         if self._error is not None:
-            found = bytes(len(view))
-        view[: len(found)] = found
-        self._position += len(found)
-        return len(found)
+            data = bytes(len(view))
+        view[: len(data)] = data
+        self._position += len(data)
+        return len(data)
 
     def truncate(self, size: int | None = None) -> int:
         """Set the size."""

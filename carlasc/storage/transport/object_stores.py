@@ -251,7 +251,7 @@ def _library() -> ModuleType:
     Raises:
         CarlascError: the process was forked, on a system other than Linux.
     """
-    global _used_in
+    global _used_in  # noqa: PLW0603 (the state of this process)
     library = importlib.import_module("obstore")
     importlib.import_module("obstore.store")
     if _used_in not in (0, os.getpid()):

@@ -23,7 +23,6 @@ from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.requests import send
 from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 
-
 _MOST_REMOVED = 1000  # objects in one request: the limit of S3
 
 

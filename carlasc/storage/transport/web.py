@@ -247,7 +247,7 @@ def garbage_collection_paused() -> Iterator[None]:
     same lock: a deadlock. Before the block starts, a collection in progress on that thread is
     finished.
     """
-    global _pauses, _was_enabled
+    global _pauses, _was_enabled  # noqa: PLW0603 (garbage collection is one for all threads)
     import asyncio
 
     from fsspec.asyn import get_loop, sync
