@@ -217,6 +217,11 @@ def storage_error(path: Path, error: OSError) -> StorageError:
     )
 
 
+def damaged(where: str | os.PathLike[str], expected: str, found: str) -> FormatError:
+    """Return the error of a store whose parts do not fit each other."""
+    return FormatError(where, expected=expected, found=found, advice="the store is damaged")
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically, as one line, like the published params.json."""
     write_atomic(path, to_json(value))

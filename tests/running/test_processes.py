@@ -14,6 +14,8 @@ from carlasc import Run
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.running.processes import run_all
 
+pytestmark = pytest.mark.posix("signals")
+
 
 class RecordingExecutor(Executor):
     """Does its work when asked for the result, and counts what is under way."""

@@ -100,6 +100,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return files_of(out)
 
 
+@pytest.mark.posix("fork")
 def test_two_processes_write_different_blocks_in_any_order(
     tmp_path: Path, reference: dict[str, bytes]
 ) -> None:
@@ -149,6 +150,7 @@ def test_two_processes_that_write_the_same_blocks_at_once_lose_nothing(
     assert files_of(tmp_path / "x.zarr") == reference
 
 
+@pytest.mark.posix("fork")
 @pytest.mark.parametrize("seed", range(4))
 def test_a_process_that_is_killed_anywhere_is_continued(
     tmp_path: Path, reference: dict[str, bytes], seed: int, monkeypatch: pytest.MonkeyPatch

@@ -14,6 +14,8 @@ from carlasc.storage import field_files, files, layout
 from carlasc.storage.files import to_json, write_atomic, write_many
 from carlasc.storage.folder import FolderWriter
 
+pytestmark = pytest.mark.posix("calls of the system are traced")
+
 SPEC = GridSpec.published("cartesian")
 
 

@@ -190,6 +190,7 @@ def test_unfinished_files_of_a_killed_run_are_removed_inside_the_sequence_only(
     assert list((tmp_path / "elsewhere").iterdir())
 
 
+@pytest.mark.posix("pipes")
 def test_a_pipe_and_a_device_are_no_scans(tmp_path):
     folder = tmp_path / "Train" / "Town01_Light" / "cartesian" / "velodyne"
     folder.mkdir(parents=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, import_extra, reading
 from carlasc.storage.arrays import check_ratio
-from carlasc.storage.files import parse_json_value
+from carlasc.storage.files import damaged, parse_json_value
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
 from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
 from carlasc.storage.transport.remote_tree import RemoteTree
@@ -103,12 +103,7 @@ class HDF5Store(ArrayStore):
     def _dataset(self, file: Any, node: str) -> Any:
         found = find_node(file, node, self.location)
         if not isinstance(found, import_extra("h5py", "hdf5").Dataset):
-            raise FormatError(
-                self.location,
-                expected=f"the data set {node}",
-                found="none",
-                advice="the store is damaged",
-            )
+            raise damaged(self.location, f"the data set {node}", "none")
         return found
 
     @contextmanager
@@ -159,11 +154,8 @@ class HDF5Array(StoredArray):
             or dataset.dtype.kind not in "uif"
             or checksums.ndim != 1
         ):
-            raise FormatError(
-                where,
-                expected="a chunked data set with the Blosc filter",
-                found="other filters or no chunks",
-                advice="the store is damaged",
+            raise damaged(
+                where, "a chunked data set with the Blosc filter", "other filters or no chunks"
             )
         array = cls(tree, dataset.name, dataset.dtype, shape, chunk, Encoding())
         rooms = [-(-n // step) for n, step in zip(shape, chunk, strict=True)]
@@ -177,12 +169,7 @@ class HDF5Array(StoredArray):
 
         dataset.id.chunk_iter(note)
         if len(places) != len(checksums):
-            raise FormatError(
-                where,
-                expected=f"{len(checksums)} chunks",
-                found=str(len(places)),
-                advice="the store is damaged",
-            )
+            raise damaged(where, f"{len(checksums)} chunks", str(len(places)))
         array._path, array._places = path, places
         array._checksums = dict(zip(sorted(places), checksums.tolist(), strict=True))
         return array
@@ -191,12 +178,7 @@ class HDF5Array(StoredArray):
         """Return the file, the first byte and the end of each chunk."""
         for number in numbers:
             if number not in self._places:
-                raise FormatError(
-                    self.tree.where(self._path),
-                    expected=f"chunk {number} of {self.name}",
-                    found="none",
-                    advice="the store is damaged",
-                )
+                raise damaged(self.tree.where(self._path), f"chunk {number} of {self.name}", "none")
         return [(self._path, *self._places[number]) for number in numbers]
 
     def files(self, numbers: Sequence[int]) -> list[str]:
@@ -276,14 +258,10 @@ def check_small(dataset: Any, what: str) -> None:
     check_ratio(size, stored, what)
     if dataset.chunks is None or not size:
         if size > stored:  # HDF5 would fill the rest with zeros
-            raise FormatError(
-                what, expected=f"{size} bytes", found=f"{stored}", advice="the store is damaged"
-            )
+            raise damaged(what, f"{size} bytes", f"{stored}")
         return
     if dataset.chunks != dataset.shape or dataset.id.get_num_chunks() != 1:
-        raise FormatError(
-            what, expected="one chunk", found="several chunks", advice="the store is damaged"
-        )
+        raise damaged(what, "one chunk", "several chunks")
     if _GZIP in filters:  # HDF5 decompresses a whole chunk without a limit
         packed = dataset.id.read_direct_chunk((0,) * len(dataset.shape))[1]
         unpacked = zlib.decompressobj().decompress(packed, size + 1)

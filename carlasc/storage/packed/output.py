@@ -97,7 +97,7 @@ def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
         ) from error
 
 
-class PatientFile(io.RawIOBase):
+class DeferredErrorFile(io.RawIOBase):
     """A new file for libraries that do not handle failed writes.
 
     After a failed write, h5py crashes, pyarrow prints an error of its destructor, and Foxglove

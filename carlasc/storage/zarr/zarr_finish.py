@@ -15,7 +15,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError, FormatError, MissingDataError
-from carlasc.storage.files import parse_json, remove_stale, to_json
+from carlasc.storage.files import damaged, parse_json, remove_stale, to_json
 from carlasc.storage.packed.array_layout import (
     FIELD,
     SEQUENCE,
@@ -126,22 +126,14 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
             target.location, expected=f"a zarr store of version {VERSION}", found="none"
         )
     if not isinstance(block := root.get("block"), int) or block < 1:
-        raise FormatError(
-            target.location,
-            expected="a number of frames in block",
-            found=repr(block),
-            advice="the store is damaged",
-        )
+        raise damaged(target.location, "a number of frames in block", repr(block))
     groups = _groups(target, paths)
     result, nodes, sequences = FinishedStore(target.location), StoreNodes(), dict[str, str]()
     for node, attributes in groups.items():
         if attributes.get("type") == SEQUENCE:
             if not {"path", "split", "name", "coordinates"} <= attributes.keys():
-                raise FormatError(
-                    f"{target.location}/{node}",
-                    expected="the attributes of a sequence",
-                    found="some missing",
-                    advice="the store is damaged",
+                raise damaged(
+                    f"{target.location}/{node}", "the attributes of a sequence", "some missing"
                 )
             sequences[attributes["path"]] = node
             inside = [path for path in paths if path.startswith(f"{node}/")]

@@ -31,6 +31,8 @@ from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
 
+pytestmark = pytest.mark.posix("fork, and limits of the size of files")
+
 pytest.importorskip("aiohttp")
 
 SIZE = 10 * PIECE

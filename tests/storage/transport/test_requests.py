@@ -506,6 +506,7 @@ def _forked(target: Callable[[], bool]) -> Iterator[Any]:
     process.join(10)
 
 
+@pytest.mark.posix("fork")
 @pytest.mark.slow
 def test_a_tree_is_read_on_both_sides_of_a_fork(endpoint: str) -> None:
     tree = upload_bytes(endpoint, "fork/a", b"12345").tree
