@@ -160,12 +160,12 @@ def remove_stale(folder: Path, *, deep: bool = False) -> None:
     A temporary file is stale if the process on this machine that wrote it has ended, or if it is a
     day old.
     """
-    found = (
+    parts = (
         folder.rglob(f".*{_PART}")
         if deep
         else (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}"))
     )
-    _remove_ended(found)
+    _remove_ended(parts)
 
 
 def _remove_ended(parts: Iterable[Path]) -> None:
@@ -338,15 +338,15 @@ def sync_all(paths: Iterable[Path]) -> None:
     Raises:
         OSError: the disk is full or fails; names the path.
     """
-    found = list(dict.fromkeys(paths))
+    places = list(dict.fromkeys(paths))
     if not is_durable():
         return
-    if len(found) < 2:
-        for path in found:
+    if len(places) < 2:
+        for path in places:
             _sync_path(path)
         return
-    with ThreadPoolExecutor(min(len(found), _SIDE_BY_SIDE), thread_name_prefix="sync") as pool:
-        list(pool.map(_sync_path, found))
+    with ThreadPoolExecutor(min(len(places), _SIDE_BY_SIDE), thread_name_prefix="sync") as pool:
+        list(pool.map(_sync_path, places))
 
 
 def sync_tree(path: Path) -> None:

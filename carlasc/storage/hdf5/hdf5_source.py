@@ -58,8 +58,8 @@ class HDF5Store(ArrayStore):
     def attributes(self, node: str) -> dict[str, Any] | None:
         """Return a node's attributes."""
         with self._open() as file:
-            found = find_node(file, node, self.location)
-            return None if found is None else _read_attributes(found, f"{self.location}/{node}")
+            group = find_node(file, node, self.location)
+            return None if group is None else _read_attributes(group, f"{self.location}/{node}")
 
     def read_small(self, node: str) -> NDArray[Any]:
         """Return a whole data set."""
@@ -96,15 +96,15 @@ class HDF5Store(ArrayStore):
             total += item.id.get_storage_size() if isinstance(item, h5py.Dataset) else 0
 
         with self._open() as file:
-            if (found := find_node(file, node, self.location)) is not None:
-                found.visititems(add)
+            if (group := find_node(file, node, self.location)) is not None:
+                group.visititems(add)
         return total
 
     def _dataset(self, file: Any, node: str) -> Any:
-        found = find_node(file, node, self.location)
-        if not isinstance(found, import_extra("h5py", "hdf5").Dataset):
+        dataset = find_node(file, node, self.location)
+        if not isinstance(dataset, import_extra("h5py", "hdf5").Dataset):
             raise damaged(self.location, f"the data set {node}", "none")
-        return found
+        return dataset
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
@@ -208,9 +208,9 @@ def find_node(file: Any, node: str, where: str) -> Any:
         FormatError: a link on the path refers to another file, or is symbolic.
     """
     h5py = import_extra("h5py", "hdf5")
-    found = file
+    place = file
     for name in filter(None, node.split("/")):
-        link = found.get(name, getlink=True) if isinstance(found, h5py.Group) else None
+        link = place.get(name, getlink=True) if isinstance(place, h5py.Group) else None
         if link is None:
             return None
         if not isinstance(link, h5py.HardLink):
@@ -225,15 +225,15 @@ def find_node(file: Any, node: str, where: str) -> Any:
                 found=kind,
                 advice=_UNTRUSTED,
             )
-        found = found[name]
-    if isinstance(found, h5py.Dataset) and (found.is_virtual or found.external):
+        place = place[name]
+    if isinstance(place, h5py.Dataset) and (place.is_virtual or place.external):
         raise FormatError(
             f"{where}: {node}",
             expected="values in the file itself",
             found="values in other files",
             advice=_UNTRUSTED,
         )
-    return found
+    return place
 
 
 def check_small(dataset: Any, what: str) -> None:
@@ -277,12 +277,12 @@ def _filters(dataset: Any) -> list[int]:
 
 
 def _read_attributes(node: Any, where: str) -> dict[str, Any]:
-    found = {}
+    attributes = {}
     for name, stored in node.attrs.items():
         value = stored.item() if hasattr(stored, "item") else stored
         value = value.decode() if isinstance(value, bytes) else value
         if name.endswith(":json"):
-            found[name.removesuffix(":json")] = parse_json_value(value, f"{where}: {name}")
+            attributes[name.removesuffix(":json")] = parse_json_value(value, f"{where}: {name}")
         else:
-            found[name] = value
-    return found
+            attributes[name] = value
+    return attributes

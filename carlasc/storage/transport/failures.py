@@ -174,12 +174,12 @@ def _is_of_connection(error: BaseException) -> bool:
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
-    found: BaseException | None = error
+    cause: BaseException | None = error
     for _ in range(5):
-        if found is None:
+        if cause is None:
             return
-        yield found
-        found = found.__cause__
+        yield cause
+        cause = cause.__cause__
 
 
 def _status_and_code(error: BaseException) -> tuple[int | None, str]:
@@ -193,7 +193,7 @@ def _status_and_code(error: BaseException) -> tuple[int | None, str]:
             return int(match[1]), code[1] if code else ""
         answer = getattr(cause, "response", None)
         for holder, name in ((cause, "status"), (cause, "code"), (answer, "status_code")):
-            found = getattr(holder, name, None)
-            if isinstance(found, int) and 100 <= found < 600:
-                return found, ""
+            status = getattr(holder, name, None)
+            if isinstance(status, int) and 100 <= status < 600:
+                return status, ""
     return None, ""

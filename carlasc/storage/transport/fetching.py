@@ -192,8 +192,12 @@ class FileFetch:
                     )
 
         def fetch(block: int) -> None:
-            count = partial(got.get, block, 0) if self.file.ranges else int
-            self._persist(partial(one_try, block), count, stop)
+            # a stream begins again at each attempt: what arrived of it is no progress
+            self._persist(
+                partial(one_try, block),
+                lambda: got.get(block, 0) if self.file.ranges else 0,
+                stop,
+            )
             with lock:
                 self._save(got, descriptor)
 

@@ -168,7 +168,7 @@ class ObjectStoreClient(Client):
         if not key:
             return None
         try:
-            found = _library().head(store, key)
+            about = _library().head(store, key)
         except FileNotFoundError:
             try:  # the answer to HEAD does not say whether the bucket exists
                 _library().get(store, key)
@@ -176,7 +176,7 @@ class ObjectStoreClient(Client):
                 if bucket_is_missing(error):
                     raise
             return None
-        return found["size"], f"{found['e_tag'] or ''} {found['last_modified']}"
+        return about["size"], f"{about['e_tag'] or ''} {about['last_modified']}"
 
     def entries(self, url: str) -> dict[str, int | None]:
         """List a folder."""
@@ -217,10 +217,10 @@ class ObjectStoreClient(Client):
             library.put(store, key, data, mode="create", attributes={_MARK: mark})
         except library.exceptions.AlreadyExistsError:
             try:
-                found = library.get(self.connection[0], key, options={"head": True}).attributes
+                attributes = library.get(self.connection[0], key, options={"head": True}).attributes
             except FileNotFoundError:  # it was removed meanwhile
-                found = {}
-            if found.get(_MARK) != mark:
+                attributes = {}
+            if attributes.get(_MARK) != mark:
                 raise FileExistsError(url) from None
 
     def remove(self, urls: Iterable[str]) -> None:

@@ -106,8 +106,8 @@ class LocalTree(Tree):
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the folder."""
         try:
-            with os.scandir(self.root / folder) as found:
-                return {entry.name: entry.is_dir() for entry in found}
+            with os.scandir(self.root / folder) as entries:
+                return {entry.name: entry.is_dir() for entry in entries}
         except (FileNotFoundError, NotADirectoryError):
             return {}
         except OSError as error:
