@@ -96,7 +96,12 @@ class ObjectStoreClient(Client):
             )
         except library.exceptions.UnknownConfigurationKeyError as error:
             name = str(error).split("'")[1]
-            raise ArgumentError(name, expected="an option of obstore", found="another") from None
+            raise ArgumentError(
+                name,
+                expected="a storage option",
+                found="a name that the store does not know",
+                advice="see the page on storage",
+            ) from None
         except (library.exceptions.BaseError, ValueError, TypeError):
             raise CarlascError(
                 without_credentials(self.url),
@@ -135,7 +140,8 @@ class ObjectStoreClient(Client):
         session = import_extra("boto3", "remote").Session(profile_name=profile or None)
         if session.get_credentials() is None:
             return None
-        config.setdefault("region", session.region_name or "us-east-1")
+        region = _variable("AWS_REGION", "AWS_DEFAULT_REGION") or session.region_name
+        config.setdefault("region", region or "us-east-1")
         _library()
         return importlib.import_module("obstore.auth.boto3").Boto3CredentialProvider(session)
 

@@ -147,18 +147,15 @@ class RemoteTree(Tree):
 
         Their lengths are checked if their folder has been listed.
         """
-        for attempt in range(2):
-            answers = send([partial(self._get, path) for path in paths], self.client.settings)
-            wrong = [
-                path
-                for path, answer in zip(paths, answers, strict=True)
-                if isinstance(answer, WrongAnswerError)
-            ]
-            if attempt or not wrong:
-                break
-            for path in wrong:  # the files may have been replaced since the listing
+        answers: dict[str, bytes | Exception] = {}
+        missing = list(paths)
+        for _ in range(2):
+            asked = [partial(self._get, path) for path in missing]
+            answers |= zip(missing, send(asked, self.client.settings), strict=True)
+            missing = [path for path in missing if isinstance(answers[path], WrongAnswerError)]
+            for path in missing:  # the files may have been replaced since the listing
                 self._sizes[path] = self._size(path)
-        return [self._data(path, answer) for path, answer in zip(paths, answers, strict=True)]
+        return [self._data(path, answers[path]) for path in paths]
 
     def _get(
         self, path: str, start: int | None = None, end: int | None = None, size: int | None = None
@@ -227,10 +224,7 @@ class RemoteTree(Tree):
         return about
 
     def _size(self, path: str) -> int:
-        size = self.size(path)
-        if size is None:
-            raise MissingDataError(self.where(path), expected="a file", found="nothing")
-        return size
+        return self.version(path)[0]
 
     def check_ranges(self, path: str = "") -> None:
         """Request one byte to check for range requests: without them, each read would transfer the

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 from helpers.datasets.sequences import files_of, write_dataset
+from helpers.parts import raises
 from helpers.processes.cache_jobs import PIECE, read_files, tree_at
 from helpers.servers.range_server import Served, serve_folder
 
@@ -300,9 +301,7 @@ def test_errors_name_the_remote_file(served, tmp_path):
 
 
 def test_bad_caches_are_refused(served, tmp_path):
-    with pytest.raises(
-        ArgumentError, match="max_bytes: expected a number of bytes above 0, found 0"
-    ):
+    with raises(ArgumentError, where="max_bytes", expected="a number of bytes above 0", found="0"):
         Cache(tmp_path, 0)
     (tmp_path / "file").touch()
     with pytest.raises(StorageError, match="cannot be used as a cache: .*choose another folder"):

@@ -14,6 +14,7 @@ import fsspec
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
+from helpers.parts import raises
 from helpers.servers.object_store import BUCKET, faulty_server, options_for, s3_server
 from storage.transport.test_zipped import write_zip
 
@@ -218,8 +219,11 @@ def test_a_server_without_ranges_is_an_error_before_anything_is_fetched(
     folder, url, handler = site
     write_zip(files_of(published), folder / "other.zip")
     monkeypatch.setattr(handler, "ranges", False)
-    with pytest.raises(
-        CarlascError, match=r"other\.zip: expected a server that supports range requests.*download"
+    with raises(
+        CarlascError,
+        where=r"other\.zip",
+        expected="a server that supports range requests",
+        advice="download",
     ):
         carlasc.open(f"{url}/other.zip")
 
@@ -281,7 +285,7 @@ def test_the_signature_of_a_url_is_sent_with_each_request_and_never_shown(
 
 
 def test_nothing_at_a_url_is_missing_data(site: tuple[Path, str, type[RangeHandler]]) -> None:
-    with pytest.raises(MissingDataError, match=r"absent\.zip: .*found nothing"):
+    with raises(MissingDataError, where=r"absent\.zip", found="nothing"):
         carlasc.open(f"{site[1]}/absent.zip")
 
 

@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
+from helpers.parts import raises
 from helpers.servers.object_store import (
     BUCKET,
+    KEY,
     SECRET,
     FaultyServer,
     every,
@@ -314,6 +316,29 @@ def test_missing_credentials_are_one_line(
         )
 
 
+def test_credentials_are_those_of_a_profile_in_the_home_folder(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    upload_bytes(endpoint, "profile/a", b"12345")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_PROFILE"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / ".aws").mkdir()
+    (tmp_path / ".aws" / "credentials").write_text(
+        f"[lab]\naws_access_key_id = {KEY}\naws_secret_access_key = {SECRET}\n"
+    )
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+    tree = RemoteTree(f"s3://{BUCKET}/profile", {"profile": "lab"})
+    assert tree.read("a") == b"12345"
+
+
+def test_an_option_that_the_store_does_not_know_is_named(endpoint: str) -> None:
+    tree = RemoteTree(f"s3://{BUCKET}/x", {**options_for(endpoint), "bogus": 1})
+    with pytest.raises(ArgumentError) as caught:
+        tree.read("a")
+    assert caught.value.where == "bogus"
+
+
 def test_nothing_at_a_key_and_a_short_object_are_one_line(endpoint: str) -> None:
     tree = upload_bytes(endpoint, "short/a", b"12345").tree
     assert "short/b: expected a file, found nothing" in failing(
@@ -445,7 +470,7 @@ def test_sinks_are_of_the_kind_that_their_place_says(tmp_path: Path) -> None:
     assert type(as_sink(tmp_path / "out.zarr")).__name__ == "ZarrSink"
     remote = as_sink("memory://folder")
     assert isinstance(remote, FolderSink) and remote.location == "memory://folder"
-    with pytest.raises(ArgumentError, match="found a web server, which can only be read"):
+    with raises(ArgumentError, found="a web server, which can only be read"):
         as_sink("https://host/folder")
 
 
