@@ -9,13 +9,14 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import threading
 from collections.abc import Iterable, Mapping
 from datetime import timedelta
-from importlib.machinery import ExtensionFileLoader
+from importlib.machinery import ExtensionFileLoader, ModuleSpec
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from carlasc.errors import ArgumentError, CarlascError, import_extra, without_credentials
 from carlasc.storage.transport.clients import Client
@@ -46,8 +47,6 @@ _S3_NAMES = {
     "region_name": "region",
     "anon": "skip_signature",
 }
-
-_used_in = 0  # the process in which obstore has sent a request, or its parent
 
 
 class ObjectStoreClient(Client):
@@ -247,40 +246,57 @@ def _variable(*names: str) -> str:
     return next(filter(None, map(os.environ.get, names)), "")
 
 
-def _library() -> ModuleType:
-    """Return obstore; in a forked process a second copy of it.
+class _Library:
+    """obstore in this process; in a forked process a second copy of it.
 
     Its threads (of tokio) do not survive a fork: a request in the child would wait for ever, and
     the loaders of PyTorch fork their workers. They belong to the loaded file, so that a copy of the
     file, which needs no name on Linux, has threads of its own.
-
-    Raises:
-        CarlascError: the process was forked, on a system other than Linux.
     """
-    global _used_in  # noqa: PLW0603 (the state of this process)
-    library = importlib.import_module("obstore")
-    importlib.import_module("obstore.store")
-    if _used_in not in (0, os.getpid()):
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._used = self._lost = False  # whether its threads exist, or were lost by a fork
+        self._file = ""  # the installed file, of which copies are made
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._after_fork)
+
+    def _after_fork(self) -> None:
+        self._lock, self._lost = threading.Lock(), self._used  # a lost thread may hold the old lock
+
+    def __call__(self) -> ModuleType:
+        """Return the library.
+
+        Raises:
+            CarlascError: its threads were lost, on a system other than Linux.
+        """
+        with self._lock:
+            if self._lost:
+                self._load_copy()
+            self._used, self._lost = True, False
+            importlib.import_module("obstore.store")
+            self._file = self._file or str(sys.modules[PRIVATE].__file__)
+            return sys.modules["obstore"]
+
+    def _load_copy(self) -> None:
         if not sys.platform.startswith("linux"):
             raise CarlascError(
                 "a forked process",
                 problem="cannot send requests to object stores",
                 advice='start processes with the method "spawn"',
             )
-        name = PRIVATE
-        source = Path(str(sys.modules[name].__file__)).read_bytes()
-        for module in [m for m in sys.modules if m.partition(".")[0] == "obstore"]:
-            del sys.modules[module]
-        copied = os.memfd_create("obstore")
-        with open(copied, "wb", closefd=False) as file:
-            file.write(source)
-        place = f"/proc/self/fd/{copied}"
-        spec = spec_from_file_location(name, place, loader=ExtensionFileLoader(name, place))
-        assert spec is not None and spec.loader is not None
-        sys.modules[name] = module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-        os.close(copied)
-        library = importlib.import_module("obstore")
-        importlib.import_module("obstore.store")
-    _used_in = os.getpid()
-    return library
+        content = Path(self._file).read_bytes()
+        for name in [name for name in sys.modules if name.partition(".")[0] == "obstore"]:
+            del sys.modules[name]
+        with open(os.memfd_create("obstore"), "wb") as file:
+            file.write(content)
+            file.flush()
+            place = f"/proc/self/fd/{file.fileno()}"
+            loader = ExtensionFileLoader(PRIVATE, place)
+            spec = spec_from_file_location(PRIVATE, place, loader=loader)
+            module = module_from_spec(cast("ModuleSpec", spec))
+            sys.modules[PRIVATE] = module
+            loader.exec_module(module)
+
+
+_library = _Library()

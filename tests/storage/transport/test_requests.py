@@ -536,8 +536,14 @@ def _forked(target: Callable[[], bool]) -> Iterator[Any]:
 def test_a_tree_is_read_on_both_sides_of_a_fork(endpoint: str) -> None:
     tree = upload_bytes(endpoint, "fork/a", b"12345").tree
     assert tree.read("a") == b"12345"
-    with _forked(lambda: tree.read("a") == b"12345") as answer:
-        assert answer.get()
+
+    def in_a_child_and_in_its_child() -> bool:
+        with _forked(lambda: tree.read("a") == b"12345") as answer:
+            return answer.get() and tree.read("a") == b"12345"
+
+    for target in (lambda: tree.read("a") == b"12345", in_a_child_and_in_its_child):
+        with _forked(target) as answer:
+            assert answer.get()
     assert tree.read("a") == b"12345"
 
 
