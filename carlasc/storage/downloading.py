@@ -273,7 +273,7 @@ def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
         values = parse_json(record.read_bytes(), str(record))
     except FormatError:
         return None  # a power failure can leave an empty file: the zip is fetched again
-    size, files = values.get("size"), values.get("files")
+    size, files = values.get("size", -1), values.get("files", -1)
     if not all(type(count) is int and count >= 0 for count in (size, files)):
         found = f"{size!r} and {files!r}"
         raise FormatError(

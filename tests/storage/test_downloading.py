@@ -216,7 +216,7 @@ def test_a_redirection_that_leads_to_no_web_server_or_nowhere_is_refused_at_once
 
 def test_bytes_under_a_wrong_content_range_are_never_taken(site: Site, tmp_path: Path) -> None:
     site.shift_range = 16
-    with raises(CarlascError, expected="bytes"):
+    with raises(CarlascError, found="expected bytes"):
         get(site, tmp_path)
     assert "val_cartesian.zip" not in names(tmp_path)
 
