@@ -267,5 +267,6 @@ def one_line_if_lost(client: DaskClient) -> Iterator[None]:
         raise CarlascError(
             f"the scheduler {getattr(getattr(client, 'scheduler', None), 'address', '')}".rstrip(),
             problem="the connection was lost",
-            advice="check that the scheduler is running, and run the same command again to continue",
+            advice="check that the scheduler is running, and run the same command again to "
+            "continue",
         ) from error

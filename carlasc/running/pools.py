@@ -1,4 +1,4 @@
-"""A pool of worker processes that can be stopped immediately, and that are replaced when they die."""
+"""A pool of worker processes that can be stopped at once, and are replaced when they die."""
 
 from __future__ import annotations
 

@@ -237,7 +237,8 @@ def _archive(file: IO[bytes], where: str) -> Iterator[NpzFile]:
 @contextmanager
 def _opened(path: str | Path) -> Iterator[IO[bytes]]:
     try:
-        file = Path(path).open("rb")  # noqa: SIM115 (closed below: only what opening raises is caught here)
+        # closed below: only what opening raises is caught here
+        file = Path(path).open("rb")  # noqa: SIM115
     except FileNotFoundError as error:
         raise MissingDataError(path, expected="a file", found="nothing") from error
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name

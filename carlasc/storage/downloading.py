@@ -228,7 +228,7 @@ def download(
 
 
 def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float) -> int:
-    """Fetch a zip of at most `most` bytes unless it exists, and return the number of bytes fetched."""
+    """Fetch a zip of at most `most` bytes unless it exists; return the number of new bytes."""
     size = fetch.file.size
     if path.exists():
         if size is not None and path.stat().st_size != size:

@@ -74,7 +74,7 @@ class FieldLayout:
             raise damaged(where, "the field that the sequence lists", "none")
         scale = attributes.get("scale_m")
         if scale is not None and not (type(scale) in (int, float) and 0 < scale <= 1):
-            raise damaged(where, "a step of coordinates above 0, up to 1 m", repr(scale))  # fmt: skip
+            raise damaged(where, "a step of coordinates above 0, up to 1 m", repr(scale))
         options = PackOptions(small=attributes.get("codec") == _PCODEC)
         packing = packing_of(layout.field_named(field), options, attributes)
         if attributes.get("kind") != packing.kind:

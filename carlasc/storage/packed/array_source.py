@@ -58,7 +58,7 @@ class ArrayStore(ABC):
         """Return the stored bytes of a node and the nodes below it."""
 
     def forget(self) -> bool:
-        """Discard cached metadata, and return whether the store may have grown since it was opened."""
+        """Discard cached metadata; return whether the store may have grown since it was opened."""
         return False
 
 
@@ -82,7 +82,7 @@ class ArraySource(PackedSource):
         return {path: ArraySequence(self.store, path, group) for path, group in self.nodes.items()}
 
     def published_bytes(self) -> dict[str, int]:
-        """Return the size of the published files by field, computed from the numbers of elements."""
+        """Return the size of the published files by field, from the numbers of elements."""
         sizes: Counter[str] = Counter()
         for sequence in self._sequences().values():
             sizes["documents"] += sum(
@@ -155,7 +155,7 @@ class ArraySequence(PackedSequence[ArrayField]):
         return self._field(field).files_of(list(frames))
 
     def published_bytes(self, field: str) -> int:
-        """Return the size of the published files of a field, computed from the numbers of elements."""
+        """Return the size of the published files of a field, from the numbers of elements."""
         return self._field(field).published_bytes()
 
     def _read_again(self, read: Callable[[], _T]) -> _T:

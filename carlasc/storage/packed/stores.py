@@ -81,7 +81,7 @@ class PackedSource(Source):
         self.lossy_mm = float(lossy) if isinstance(lossy, int | float) and lossy else None
 
     def published_bytes(self) -> dict[str, int]:
-        """Return the size of the published files by field; empty if the store does not record it."""
+        """Return the size of the published files by field; empty if it is not recorded."""
         return {}
 
     @abstractmethod
@@ -154,7 +154,9 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
             not all(isinstance(name, str) for name in names)
             or self.coordinates not in layout.COORDINATES
         ):
-            raise damaged(location, "names of the sequence, its fields and its text files", "other values")  # fmt: skip
+            raise damaged(
+                location, "names of the sequence, its fields and its text files", "other values"
+            )
         check_names([*self._fields, *self._documents], location)
         self._readers: dict[str, _FieldReader] = {}
 

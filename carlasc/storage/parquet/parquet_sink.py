@@ -277,9 +277,20 @@ class TableWriter(FieldWriter):
         }
         self._file = DeferredErrorFile(self.path, self.path)
         self._writer = parquet.ParquetWriter(
-            self._file, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,
-            use_dictionary=[name for name in ("sequence", "frame", *types) if name not in split and not is_picture], column_encoding=split or None,
-            data_page_size=_PAGE, dictionary_pagesize_limit=_PAGE, write_page_checksum=True, write_statistics=["sequence", "frame"],
+            self._file,
+            self._schema,
+            compression="none" if is_picture else "zstd",
+            compression_level=None if is_picture else _LEVEL,
+            use_dictionary=[
+                name
+                for name in ("sequence", "frame", *types)
+                if name not in split and not is_picture
+            ],
+            column_encoding=split or None,
+            data_page_size=_PAGE,
+            dictionary_pagesize_limit=_PAGE,
+            write_page_checksum=True,
+            write_statistics=["sequence", "frame"],
         )  # fmt: skip
 
     def close(self) -> None:

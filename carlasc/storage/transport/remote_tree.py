@@ -140,7 +140,7 @@ class RemoteTree(Tree):
 
     def read_range(self, path: str, start: int, end: int) -> bytes:
         """Fetch the range."""
-        return self.read_ranges([(path, start, end)])[0]
+        return bytes(self.read_ranges([(path, start, end)])[0])
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
         """Fetch the files, several at a time.
@@ -172,7 +172,7 @@ class RemoteTree(Tree):
             fail(self.where(path), answer)
         return answer
 
-    def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes]:  # type: ignore[override]
+    def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
         """Fetch the ranges, several at a time."""
         sizes = {
             path: self._size(path) for path in {path for path, start, _ in ranges if start < 0}

@@ -264,7 +264,7 @@ def _walk(data: bytes, count: int, where: str) -> NDArray[np.int64]:
 
 
 def _columns(data: bytes, positions: NDArray[np.int64], where: str) -> dict[str, NDArray[np.int64]]:
-    """Return the fixed fields of all records, with values from the 64-bit extra field if it exists."""
+    """Return the fixed fields of all records, with the values of 64-bit extra fields."""
     raw = np.frombuffer(data, np.uint8)
 
     def column(offset: int, width: int) -> NDArray[np.int64]:

@@ -72,8 +72,8 @@ class ZarrArray(StoredArray):
             if not len(shape) == len(outer) == len(chunk) > 0:
                 raise ValueError(f"shape {shape}, chunks {outer} of {chunk}")
             encoding = encoding_of(codecs)
-            # A shard holds whole frames, so the number of a shard follows from the first axis alone:
-            # `file` and `locate` rest on this.
+            # A shard holds whole frames, so the number of a shard follows from the first axis
+            # alone: `file` and `locate` rest on this.
             if any(n > limit for n, limit in zip(shape[1:], outer[1:], strict=True)):
                 raise ValueError(
                     f"shape {shape} in shards of {outer}, which divide other axes than the first"
@@ -142,8 +142,8 @@ class ZarrArray(StoredArray):
         missing = sorted(shards - self._indices.keys())
         if not missing:
             return
-        # All indices have one size, because also a missing chunk has its row. An index at the end is
-        # therefore found from the end of the file, without asking for the size of the file.
+        # All indices have one size, because also a missing chunk has its row. An index at the end
+        # is therefore found from the end of the file, without asking for the size of the file.
         size = index_bytes(self.per_shard or 1)
         start, end = (0, size) if self._index_first else (-size, 0)
         files = [self.file(shard) for shard in missing]
@@ -171,8 +171,8 @@ class ShardIndex:
         if len(data) != index_bytes(per_shard):
             raise damaged(what, f"{index_bytes(per_shard)} bytes", str(len(data)))
         table = np.frombuffer(without_checksum(data, what), "<u8").reshape(-1, 2)
-        # Only existing chunks are kept, in rising order of their slots: `place` searches by halving,
-        # and a shard of a field with few frames takes little memory.
+        # Only existing chunks are kept, in rising order of their slots: `place` searches by
+        # halving, and a shard of a field with few frames takes little memory.
         slots = np.flatnonzero(table[:, 0] != _ABSENT)
         # access to one number is faster than in a NumPy array
         self.slots = array("q", slots.astype("=i8").tobytes())
