@@ -1,5 +1,6 @@
 """The rooms are in the order of the design: each imports those above it, never those below."""
 
+import ast
 import re
 from functools import cache
 from graphlib import TopologicalSorter
@@ -95,7 +96,6 @@ def test_a_frame_passes_through_few_files(counted, case):
 
 
 CLIENTS = (
-    "aiobotocore",
     "aiohttp",
     "boto3",
     "botocore",
@@ -104,8 +104,8 @@ CLIENTS = (
     "httpx",
     "httpx2",
     "huggingface_hub",
+    "obstore",
     "requests",
-    "s3fs",
     "urllib.request",
     "urllib3",
 )

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from carlasc.errors import FormatError, MissingDataError, reading
 
 _LONGEST_HEADER = 1 << 14  # bytes; NumPy refuses headers of more than 10,000
-_PIECE = 1 << 18  # bytes that are unpacked at a time
 # bytes: smaller arrays are unpacked at any compression ratio: zeros compress very well
 _SMALL = 1 << 26  # fact: small-array
 _MOST_RATIO = 100  # largest compression ratio of larger arrays; Deflate reaches 1032
@@ -71,31 +70,6 @@ class ArrayFormat:
         return all(kind in tuple(map(np.dtype, self.dtypes)) for kind in kinds)
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The checked header of a .npy file."""
-
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-    fortran_order: bool
-    start: int  # first byte of the values
-
-    @property
-    def size(self) -> int:
-        """Number of bytes of the values."""
-        return math.prod(self.shape) * self.dtype.itemsize
-
-    def array(self, values: bytes | memoryview) -> NDArray[Any]:
-        """Return these bytes as an array in C order.
-
-        Copies only if the file is in Fortran order.
-        """
-        flat = np.frombuffer(values, self.dtype, math.prod(self.shape))
-        return np.asarray(
-            flat.reshape(self.shape, order="F" if self.fortran_order else "C"), order="C"
-        )
-
-
 def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> NDArray[Any]:
     """Return the array of a .npy file.
 
@@ -110,16 +84,11 @@ def parse_npy(data: bytes | memoryview, expected: ArrayFormat, where: str) -> ND
     Raises:
         FormatError: the file has another type, shape or size, or is no .npy file.
     """
-    header = _read_header(io.BytesIO(data[:_LONGEST_HEADER]), expected, where)
-    if len(data) - header.start != header.size:
-        raise FormatError(
-            where,
-            expected=f"{header.start + header.size} bytes ({_text(header.shape)} "
-            f"{header.dtype.name})",
-            found=str(len(data)),
-            advice="the file is cut short, or something was added",
-        )
-    return header.array(memoryview(data)[header.start :])
+    shape, fortran_order, dtype, start = _check_header(
+        io.BytesIO(data[:_LONGEST_HEADER]), len(data), expected, where
+    )
+    values = np.frombuffer(data, dtype, math.prod(shape), start)
+    return np.asarray(values.reshape(shape, order="F" if fortran_order else "C"), order="C")
 
 
 def read_npy(path: str | Path, expected: ArrayFormat) -> NDArray[Any]:
@@ -132,18 +101,7 @@ def read_npy(path: str | Path, expected: ArrayFormat) -> NDArray[Any]:
         FormatError: the file has another type, shape or size, cannot be read, or is no .npy file.
     """
     with _opened(path) as file:
-        header = _read_header(file, expected, str(path))
-        found = os.fstat(file.fileno()).st_size
-        if found != header.start + header.size:
-            raise FormatError(
-                path,
-                expected=f"{header.start + header.size} bytes ({_text(header.shape)} "
-                f"{header.dtype.name})",
-                found=str(found),
-                advice="the file is cut short, or something was added",
-            )
-        file.seek(header.start)
-        return header.array(file.read(header.size))
+        return _read_array(file, os.fstat(file.fileno()).st_size, expected, str(path))
 
 
 def check_ratio(size: int, packed: int, where: str) -> None:
@@ -228,37 +186,7 @@ class NpzFile:
             )
             raise FormatError(where, expected="a stored or deflated array", found=found)
         with reading(where, "a .npy array in a whole zip"), self._archive.open(member) as stream:
-            header = _read_header(stream, expected, where)
-            self._check_size(header, member, where)
-            return header.array(self._unpack(stream, header, where))
-
-    def _check_size(self, header: _Header, member: zipfile.ZipInfo, where: str) -> None:
-        if member.file_size != header.start + header.size:
-            raise FormatError(
-                where,
-                expected=f"{header.start + header.size} bytes ({_text(header.shape)} "
-                f"{header.dtype.name})",
-                found=str(member.file_size),
-                advice="the file is damaged",
-            )
-        check_ratio(header.size, member.compress_size, where)
-
-    @staticmethod
-    def _unpack(stream: IO[bytes], header: _Header, where: str) -> memoryview:
-        values = np.empty(header.size, np.uint8)
-        view, place = values.data, 0
-        while place < header.size and (part := stream.read(min(_PIECE, header.size - place))):
-            view[place : place + len(part)] = part
-            place += len(part)
-        stream.read(1)  # reaches the end, where the checksum is compared
-        if place != header.size:
-            raise FormatError(
-                where,
-                expected=f"{header.size} bytes of values",
-                found=str(place),
-                advice="the file is damaged",
-            )
-        return view
+            return _read_array(stream, member.file_size, expected, where, member.compress_size)
 
 
 def npz_bytes(arrays: Mapping[str, tuple[NDArray[Any], int]]) -> bytes:
@@ -309,7 +237,8 @@ def _archive(file: IO[bytes], where: str) -> Iterator[NpzFile]:
 @contextmanager
 def _opened(path: str | Path) -> Iterator[IO[bytes]]:
     try:
-        file = Path(path).open("rb")  # noqa: SIM115 (closed below: only what opening raises is caught here)
+        # closed below: only what opening raises is caught here
+        file = Path(path).open("rb")  # noqa: SIM115
     except FileNotFoundError as error:
         raise MissingDataError(path, expected="a file", found="nothing") from error
     except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
@@ -329,42 +258,64 @@ def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]
     return header
 
 
-def _read_header(stream: IO[bytes], expected: ArrayFormat, where: str) -> _Header:
-    """Read the header of a .npy file, and check it against the expected format.
+def _read_array(
+    stream: IO[bytes], length: int, expected: ArrayFormat, where: str, packed: int | None = None
+) -> NDArray[Any]:
+    """Return the array of a .npy file of `length` bytes, which are `packed` bytes in a zip."""
+    shape, *_ = _check_header(stream, length, expected, where)
+    if packed is not None:
+        check_ratio(length, packed, where)
+    with reading(where, "a .npy array"):
+        stream.seek(0)
+        array = np.lib.format.read_array(stream, allow_pickle=False)
+        stream.read(1)  # reaches the end of a member, where its checksum is compared
+    return np.asarray(array.reshape(shape), order="C")
+
+
+def _check_header(
+    stream: IO[bytes], length: int, expected: ArrayFormat, where: str
+) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Read the header of a .npy file, and check it against the expected format and the length of
+    the file.
 
     NumPy parses its text as a Python literal of at most 10,000 characters. No code is run.
+
+    Returns:
+        Shape, whether the order is Fortran, type, and the first byte of the values.
     """
     with reading(where, "a .npy array"):
         shape, fortran_order, dtype = _npy_header(stream)
         start = stream.tell()
+    wanted, count = expected.shape, math.prod(shape)
     # An empty array of shape (0,) is accepted as (0, K): CarlaSC has such files for an empty list
     # of actors.
-    if (
-        len(shape) == 1
-        and shape[0] == 0
-        and expected.shape is not None
-        and len(expected.shape) == 2
-    ):
-        shape = (0, expected.shape[1] or 0)
+    if shape == (0,) and wanted is not None and len(wanted) == 2:
+        shape = (0, wanted[1] or 0)
     if not expected.holds(dtype):
         names = list(dict.fromkeys(np.dtype(name).name for name in expected.dtypes))
-        wanted = " or ".join(names) if len(names) < 4 else "numeric"
-        raise FormatError(where, expected=f"{wanted} values", found=dtype.name)
-    fits = expected.shape is None or (
-        len(shape) == len(expected.shape)
-        and all(
-            length in (None, found) for length, found in zip(expected.shape, shape, strict=True)
-        )
+        text = " or ".join(names) if len(names) < 4 else "numeric"
+        raise FormatError(where, expected=f"{text} values", found=dtype.name)
+    fits = wanted is None or (
+        len(shape) == len(wanted)
+        and all(size in (None, given) for size, given in zip(wanted, shape, strict=True))
     )
     if not fits or min(shape, default=0) < 0:
         raise FormatError(
-            where, expected=f"an array of {_text(expected.shape or ())} values", found=_text(shape)
+            where, expected=f"an array of {_text(wanted or ())} values", found=_text(shape)
         )
-    if math.prod(shape) * dtype.itemsize >= 2**63:
+    size = start + count * dtype.itemsize
+    if size >= 2**63:
         raise FormatError(where, expected="an array that fits into memory", found=_text(shape))
-    if expected.most is not None and math.prod(shape) > expected.most:
+    if expected.most is not None and count > expected.most:
         raise FormatError(where, expected=f"at most {expected.most} values", found=_text(shape))
-    return _Header(dtype, shape, fortran_order, start)
+    if length != size:
+        raise FormatError(
+            where,
+            expected=f"{size} bytes ({_text(shape)} {dtype.name})",
+            found=str(length),
+            advice="the file is cut short, or something was added",
+        )
+    return shape, fortran_order, dtype, start
 
 
 def _text(shape: tuple[int | None, ...]) -> str:

@@ -149,7 +149,7 @@ def image_fields(sequence: Sequence, folder: str = "images") -> dict[str, str]:
 
 
 def has_image(sequence: Sequence, camera: CameraModel, frame: int) -> bool:
-    """Whether an image of a frame exists, in the folder of images or where cameras.json refers to."""
+    """Whether an image of a frame exists, in its folder or where cameras.json refers to."""
     field = image_fields(sequence).get(camera.name)
     return bool(camera.images and _reference(sequence, camera, frame)) or (
         field is not None and frame in sequence.frames(field)
@@ -221,7 +221,8 @@ def decode_image(data: bytes, where: str, camera: CameraModel, *, color: bool) -
     try:
         with image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
             if picture.size != (camera.width, camera.height):
-                expected = f"{camera.width} x {camera.height} pixels, as camera {camera.name} is calibrated"
+                size = f"{camera.width} x {camera.height}"
+                expected = f"{size} pixels, as camera {camera.name} is calibrated"
                 raise FormatError(
                     where, expected=expected, found=f"{picture.size[0]} x {picture.size[1]}"
                 )

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeGuard
 
 from carlasc.errors import ArgumentError, ConflictError, FormatError, check_choice
 from carlasc.running.spreading import StepCounter
@@ -206,29 +205,31 @@ def download(
         make_folder(folder)
         remove_stale(folder)
     done = {archive: _extracted_before(folder, archive) for archive in archives if extract}
-    pending = [archive for archive in archives if done.get(archive) is None]
-    fetches = {
-        archive: FileFetch(_url(archive, base_url), folder / archive.name, connections)
-        for archive in pending
-    }
+    fetches = {}
+    for archive in archives:
+        if done.get(archive) is None:
+            url = archive.url if base_url is None else f"{base_url.rstrip('/')}/{archive.name}"
+            fetches[archive] = FileFetch(url, folder / archive.name, connections)
     _check_space(folder, fetches, extract)
     results = []
     for archive in archives:
-        before = done.get(archive)
+        path, before = folder / archive.name, done.get(archive)
         if before is not None:
-            if not keep:
-                _remove_left(folder / archive.name, before.size)
+            # a killed run can extract a zip and not remove it
+            if not keep and path.is_file() and path.stat().st_size == before.size:
+                with writing(path):
+                    remove_file(path)
             results.append(before)
             continue
         fetch = fetches[archive]
-        fetched = _fetch(folder / archive.name, fetch, progress, 2e9 * archive.gigabytes)
-        result = Downloaded(archive.name, str(folder / archive.name), fetch.file.size, fetched)
+        fetched = _fetch(path, fetch, progress, 2e9 * archive.gigabytes)
+        result = Downloaded(archive.name, str(path), fetch.file.size, fetched)
         results.append(_extract(result, folder, archive, keep, progress) if extract else result)
     return DownloadResult(tuple(results), time.perf_counter() - began)
 
 
 def _fetch(path: Path, fetch: FileFetch, progress: Progress | None, most: float) -> int:
-    """Fetch a zip of at most `most` bytes unless it exists, and return the number of bytes fetched."""
+    """Fetch a zip of at most `most` bytes unless it exists; return the number of new bytes."""
     size = fetch.file.size
     if path.exists():
         if size is not None and path.stat().st_size != size:
@@ -265,13 +266,6 @@ def _extract(
     return Downloaded(result.name, kept, result.size, result.fetched, str(target), files)
 
 
-def _remove_left(path: Path, size: int | None) -> None:
-    """Remove a zip that a killed run extracted but did not remove."""
-    if path.is_file() and path.stat().st_size == size:
-        with writing(path):
-            remove_file(path)
-
-
 def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
     record = _record(folder, archive)
     if not record.is_file():
@@ -280,17 +274,13 @@ def _extracted_before(folder: Path, archive: Archive) -> Downloaded | None:
         values = parse_json(record.read_bytes(), str(record))
     except FormatError:
         return None  # a power failure can leave an empty file: the zip is fetched again
-    size, files = values.get("size"), values.get("files")
-    if not (_is_count(size) and _is_count(files)):
+    size, files = values.get("size", -1), values.get("files", -1)
+    if not all(type(count) is int and count >= 0 for count in (size, files)):
         found = f"{size!r} and {files!r}"
         raise FormatError(
             record, expected="integers as size and files", found=found, advice="remove it"
         )
     return Downloaded(archive.name, None, size, 0, str(folder / archive.folder), files)
-
-
-def _is_count(value: object) -> TypeGuard[int]:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
 def _record(folder: Path, archive: Archive) -> Path:
@@ -306,7 +296,3 @@ def _check_space(folder: Path, fetches: dict[Archive, FileFetch], extract: bool)
         needed += 0 if (folder / archive.name).exists() else fetch.remaining()
         needed += (fetch.file.size or 0) if extract else 0
     check_space(folder, needed, "for the zips and the files in them" if extract else "for the zips")
-
-
-def _url(archive: Archive, base_url: str | None) -> str:
-    return archive.url if base_url is None else f"{base_url.rstrip('/')}/{archive.name}"

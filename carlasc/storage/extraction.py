@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import BinaryIO
 
 from carlasc.errors import ConflictError, FormatError, StorageError, reading
 from carlasc.storage.arrays import check_ratio
@@ -44,17 +44,11 @@ def extract_zip(archive: Path, folder: Path, advance: Callable[[int], None]) -> 
             members = [member for member in opened.infolist() if not member.is_dir()]
         for member in members:
             check_member(member, archive)
-        check_ratio(
-            sum(member.file_size for member in members), archive.stat().st_size, str(archive)
-        )
+        total = _size(members)
+        check_ratio(total, archive.stat().st_size, str(archive))
         missing = [member for member in members if not _extracted(member, folder / member.filename)]
-        check_space(
-            folder, sum(member.file_size for member in missing), f"to extract {archive.name}"
-        )
-        advance(
-            sum(member.file_size for member in members)
-            - sum(member.file_size for member in missing)
-        )
+        check_space(folder, _size(missing), f"to extract {archive.name}")
+        advance(total - _size(missing))
         for parent in {(folder / member.filename).parent for member in missing}:
             remove_stale(parent)
         for start in range(0, len(missing), _TOGETHER):
@@ -65,7 +59,7 @@ def extract_zip(archive: Path, folder: Path, advance: Callable[[int], None]) -> 
                     for member in batch
                 }
             )
-            advance(sum(member.file_size for member in batch))
+            advance(_size(batch))
     return len(members)
 
 
@@ -76,7 +70,11 @@ def extracted_size(archive: Path) -> int:
         FormatError: it is not a zip.
     """
     with _opened(archive) as opened:
-        return sum(member.file_size for member in opened.infolist())
+        return _size(opened.infolist())
+
+
+def _size(members: list[zipfile.ZipInfo]) -> int:
+    return sum(member.file_size for member in members)
 
 
 def _opened(archive: Path) -> zipfile.ZipFile:
@@ -91,10 +89,13 @@ def _reading(archive: Path) -> AbstractContextManager[None]:
 def _copy(
     opened: zipfile.ZipFile, member: zipfile.ZipInfo, archive: Path, target: BinaryIO
 ) -> None:
+    block = b"-"
     with _reading(archive):
         source = opened.open(member)
     with source:
-        while block := _read(source, archive):
+        while block:
+            with _reading(archive):
+                block = source.read(_BLOCK)
             target.write(block)  # an error here comes from the disk, not from the zip
     if target.tell() != member.file_size:
         raise FormatError(
@@ -103,11 +104,6 @@ def _copy(
             found=str(target.tell()),
             advice="the zip is damaged: fetch it again",
         )
-
-
-def _read(source: IO[bytes], archive: Path) -> bytes:
-    with _reading(archive):
-        return source.read(_BLOCK)
 
 
 def check_member(member: zipfile.ZipInfo, archive: Path) -> None:

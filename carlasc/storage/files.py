@@ -14,6 +14,7 @@ import os
 import re
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -123,11 +124,12 @@ def _remove(temporary: Path) -> None:
 
 
 def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
-    """Write all bytes at an offset of an open file."""
+    """Write all bytes at an offset of an open file. Several threads may write to one file."""
     view = memoryview(data)
-    while view:
-        written = os.pwrite(descriptor, view, offset)
-        view, offset = view[written:], offset + written
+    with _POSITION:
+        os.lseek(descriptor, offset, os.SEEK_SET)
+        while view:
+            view = view[os.write(descriptor, view) :]
 
 
 def has_content(path: str | os.PathLike[str]) -> bool:
@@ -179,12 +181,12 @@ def remove_stale(folder: Path, *, deep: bool = False) -> None:
     A temporary file is stale if the process on this machine that wrote it has ended, or if it is a
     day old.
     """
-    found = (
+    parts = (
         folder.rglob(f".*{_PART}")
         if deep
         else (*folder.glob(f".*{_PART}"), *folder.glob(f"*/.*{_PART}"))
     )
-    _remove_ended(found)
+    _remove_ended(parts)
 
 
 def _remove_ended(parts: Iterable[Path]) -> None:
@@ -202,6 +204,8 @@ def _remove_ended(parts: Iterable[Path]) -> None:
 
 
 def _is_alive(process: int) -> bool:
+    if os.name == "nt":  # there, os.kill ends the process
+        return True
     try:
         os.kill(process, 0)  # signal 0 only checks that the process exists
     except ProcessLookupError:
@@ -232,6 +236,11 @@ def storage_error(path: Path, error: OSError) -> StorageError:
         problem=f"cannot be written: {error.strerror or error}",
         advice=advice.get(error.errno or 0, "check the path"),
     )
+
+
+def damaged(where: str | os.PathLike[str], expected: str, found: str) -> FormatError:
+    """Return the error of a store whose parts do not fit each other."""
+    return FormatError(where, expected=expected, found=found, advice="the store is damaged")
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -305,6 +314,7 @@ DURABLE = "CARLASC_DURABLE"
 Worker processes have the environment of the process that starts them.
 """
 
+_POSITION = threading.Lock()  # of open files: Windows cannot write at an offset in one call
 _VALUES = {"yes": True, "1": True, "true": True, "no": False, "0": False, "false": False}
 _SIDE_BY_SIDE = 16  # files that are synced at the same time
 # errors of file systems that cannot sync a folder
@@ -349,15 +359,15 @@ def sync_all(paths: Iterable[Path]) -> None:
     Raises:
         OSError: the disk is full or fails; names the path.
     """
-    found = list(dict.fromkeys(paths))
+    places = list(dict.fromkeys(paths))
     if not is_durable():
         return
-    if len(found) < 2:
-        for path in found:
+    if len(places) < 2:
+        for path in places:
             _sync_path(path)
         return
-    with ThreadPoolExecutor(min(len(found), _SIDE_BY_SIDE), thread_name_prefix="sync") as pool:
-        list(pool.map(_sync_path, found))
+    with ThreadPoolExecutor(min(len(places), _SIDE_BY_SIDE), thread_name_prefix="sync") as pool:
+        list(pool.map(_sync_path, places))
 
 
 def sync_tree(path: Path) -> None:
@@ -401,8 +411,11 @@ def make_folder(folder: Path) -> None:
 
 
 def _sync_path(path: Path) -> None:
+    windows = os.name == "nt"  # syncs files that are open for writing, and no folders
+    if windows and path.is_dir():
+        return
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDWR if windows else os.O_RDONLY)
         try:
             _sync(descriptor)
         finally:

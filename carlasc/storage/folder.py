@@ -258,7 +258,8 @@ class WholeFiles:
 
     def _ends_as_zip(self, path: str, size: int) -> bool:
         with open(f"{self._folder}/{path}", "rb", buffering=0) as file:
-            return os.pread(file.fileno(), len(_ZIP_END), max(0, size - _ZIP_END_BYTES)) == _ZIP_END
+            file.seek(max(0, size - _ZIP_END_BYTES))
+            return file.read(len(_ZIP_END)) == _ZIP_END
 
     def _cells_of(self, grid: str) -> int | None:
         """Return the number of voxels of a grid; None if it is not known."""

@@ -226,7 +226,8 @@ def field_named(name: str) -> Field:
         )  # fmt: skip
     raise FormatError(
         f"field {name!r}",
-        expected=f"one of {', '.join(SCAN_FIELDS)}, or <grid>/ and one of {', '.join(_GRID_FIELDS)}",
+        expected=f"one of {', '.join(SCAN_FIELDS)}, "
+        f"or <grid>/ and one of {', '.join(_GRID_FIELDS)}",
         found="none of them",
     )
 

@@ -111,7 +111,7 @@ class Metadata:
 
 
 def _read_axes(values: dict[str, Any], where: str) -> Axes:
-    """Remove `axes` from the values of carlasc.json, or `frame` of version 1, and return the axes."""
+    """Remove `axes` from the values of carlasc.json (`frame` in version 1), and return them."""
     frame, axes = values.pop("frame", None), values.pop("axes", None)
     if frame is not None and frame not in _AXES:
         raise FormatError(where, expected=f"{' or '.join(_AXES)} in frame", found=repr(frame))

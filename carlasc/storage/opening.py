@@ -16,8 +16,8 @@ from carlasc.storage.protocol import Source
 from carlasc.storage.published import PublishedSource
 from carlasc.storage.sinks import Sink
 from carlasc.storage.transport.caching import Cache, CachedTree
+from carlasc.storage.transport.clients import HUB
 from carlasc.storage.transport.remote_tree import RemoteTree
-from carlasc.storage.transport.servers import HUB
 from carlasc.storage.transport.targets import Target, target_of
 from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 from carlasc.storage.transport.zipped import ZipTree

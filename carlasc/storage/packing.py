@@ -146,7 +146,7 @@ def pack(
 
 
 def _refuse_several(out: object, run: Run) -> None:
-    """Raise ArgumentError if several processes would write a store that supports one writer only."""
+    """Raise ArgumentError if several processes would write a store of one writer."""
     for name, wanted in (("executor", run.executor is not None), ("part", run.part.count > 1)):
         if wanted:
             raise ArgumentError(

@@ -103,7 +103,10 @@ class PixelClasses:
         array = read_npy(path, ArrayFormat(NUMBERS, None))
         size, is_float = (camera.height, camera.width), array.dtype.kind == "f"
         if array.ndim != 2 + is_float or array.shape[:2] != size:
-            expected = f"{size} integers, or {size} floats per class, as camera {camera.name} is calibrated"
+            name = camera.name
+            expected = (
+                f"{size} integers, or {size} floats per class, as camera {name} is calibrated"
+            )
             raise FormatError(
                 path, expected=expected, found=f"{array.dtype.name} of shape {array.shape}"
             )

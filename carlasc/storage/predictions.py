@@ -94,7 +94,9 @@ def find_predictions(
                 )
                 or "none"
             )
-            expected = f"one folder of files such as {sequence.name}/000000{SUFFIXES[0]} ({', '.join(SUFFIXES[1:])})"
+            others = ", ".join(SUFFIXES[1:])
+            name = f"{sequence.name}/000000{SUFFIXES[0]}"
+            expected = f"one folder of files such as {name} ({others})"
             raise (FormatError if matching else MissingDataError)(
                 root, expected=expected, found=folders
             )
@@ -210,7 +212,8 @@ class PredictionReader:
         if wrong.any():
             row = int(wrong.argmax())
             found = f"a sum of {sums[row]:g} and a minimum of {shares[row].min():g} at point {row}"
-            expected = f"class probabilities that are at least 0 and sum to 1 within {_TOLERANCE} per point"
+            total = f"sum to 1 within {_TOLERANCE} per point"
+            expected = f"class probabilities that are at least 0 and {total}"
             advice = (
                 "" if self.logits else "give `logits=True` if these are scores before the softmax"
             )

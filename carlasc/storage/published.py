@@ -116,12 +116,12 @@ class PublishedSequence(Sequence):
 
     def __getstate__(self) -> dict[str, Any]:
         return super().__getstate__() | {
-            "_frames": {name: compact(found) for name, found in self._frames.items()}
+            "_frames": {name: compact(frames) for name, frames in self._frames.items()}
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(
-            state, _frames={name: expand(found) for name, found in state["_frames"].items()}
+            state, _frames={name: expand(frames) for name, frames in state["_frames"].items()}
         )
 
     def _list_folder_of(self, field: str) -> None:

@@ -170,7 +170,8 @@ class Sink(ABC):
         """
         return path if self.location == "." else f"{self.location}/{path}"
 
-    def finish(self, *, incomplete: bool = False) -> None:  # noqa: B027 (a folder has nothing to finish)
+    # a folder has nothing to finish
+    def finish(self, *, incomplete: bool = False) -> None:  # noqa: B027
         """Finish the store.
 
         A packed store can be opened after that. This is not called after an error.

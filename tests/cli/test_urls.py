@@ -31,7 +31,7 @@ from carlasc.captures import find_captures
 from carlasc.cli import app
 from carlasc.storage.transport.targets import RemoteTarget
 
-pytest.importorskip("s3fs")
+pytest.importorskip("obstore")
 
 
 @pytest.fixture(scope="module")

@@ -173,6 +173,7 @@ def test_an_iterator_that_is_left_in_the_middle_leaves_no_thread(served, tmp_pat
     assert len(frames_of(loader)) == 2 * FRAMES
 
 
+@pytest.mark.posix("fork")
 def test_workers_may_be_forked_while_files_are_fetched(served, truth, tmp_path):
     dataset = dataset_at(served, tmp_path)
     served.before = lambda path: time.sleep(0.02)

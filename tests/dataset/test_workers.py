@@ -14,6 +14,8 @@ pytest.importorskip("torch", reason="needs carlasc[torch]")
 import torch
 from torch.utils.data import DataLoader, DistributedSampler
 
+pytestmark = pytest.mark.posix("fork")
+
 RAGGED = ("points", "point_labels", "flow", "remission")
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))

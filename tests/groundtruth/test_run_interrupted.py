@@ -16,6 +16,8 @@ from carlasc import Run
 from carlasc.core.grids import GridSpec
 from carlasc.groundtruth import regrid
 
+pytestmark = pytest.mark.posix("signals")
+
 SPEC = GridSpec.published()
 FRAMES = 30
 

@@ -19,6 +19,8 @@ from faults.targets import TARGETS, Target
 
 from carlasc.errors import FormatError
 
+pytestmark = pytest.mark.posix("limits of memory")
+
 QUICK = ("folder", "zip", "zarr", "parquet", "capture", "results", "kitti", "nuscenes")
 SEED = 7
 

@@ -14,7 +14,7 @@ from carlasc import Run
 from carlasc.errors import ArgumentError, CarlascError
 from carlasc.running import open_cluster, run_all
 
-pytestmark = pytest.mark.needs("distributed")
+pytestmark = [pytest.mark.needs("distributed"), pytest.mark.posix("signals")]
 
 OTHER_VERSION = (  # what a worker runs before anything else
     "import importlib.metadata as metadata; version = metadata.version\n"

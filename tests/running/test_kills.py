@@ -21,6 +21,8 @@ from carlasc import Run
 from carlasc.running import Engine, open_cluster, run_all
 from carlasc.running.pools import LostTaskError
 
+pytestmark = pytest.mark.posix("signals")
+
 
 class Killer:
     """Kills a worker process of this process every now and then, at random moments, but not before

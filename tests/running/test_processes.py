@@ -15,6 +15,8 @@ from carlasc.errors import ArgumentError
 from carlasc.running.pools import LostTaskError
 from carlasc.running.processes import run_all
 
+pytestmark = pytest.mark.posix("signals")
+
 
 class RecordingExecutor(Executor):
     """Does its work when asked for the result, and counts what is under way."""

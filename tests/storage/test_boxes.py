@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.sequences import scan
+from helpers.parts import raises
 
 import carlasc
 from carlasc import Run
@@ -94,6 +95,6 @@ def test_boxes_that_are_wrong_name_their_frame(folder):
     table = sequence.read("boxes", 1).copy()
     table["length"] = 0
     FolderSink(folder).sequence(PATH).write("boxes", 1, table)
-    with pytest.raises(FormatError, match="frame 1: boxes: sizes: expected positive"):
+    with raises(FormatError, where="frame 1: boxes: sizes", expected="positive"):
         sequence.scan(1)
     assert len(sequence.scan(1, fields=("labels",))) == 20

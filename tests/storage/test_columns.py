@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.parts import raises
 
 from carlasc.errors import FormatError
 from carlasc.storage.packed.columns import narrow, quantise
@@ -54,6 +55,6 @@ def test_coordinates_are_rounded_to_the_nearest_step() -> None:
 
 @pytest.mark.parametrize("coordinate", [np.nan, np.inf, -np.inf, 2.0**31, -(2.0**31)])
 def test_coordinates_that_no_step_stands_for_are_refused(coordinate: float) -> None:
-    with pytest.raises(FormatError, match="expected finite coordinates within 2147483648 m"):
+    with raises(FormatError, expected="finite coordinates within 2147483648 m"):
         quantise(np.array([1.0, coordinate]), 1.0)
     assert quantise(np.array([2.0**31 - 1]), 1.0).tolist() == [2**31 - 1]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.parts import raises
 from helpers.servers.http_server import Site, serve
 
 from carlasc.errors import ArgumentError, CarlascError, ConflictError, FormatError, MissingDataError
@@ -190,8 +191,8 @@ def test_a_stream_of_more_bytes_than_the_published_zip_can_have_is_ended(
     site.ranges = site.lengths = False
     fetch = FileFetch(f"{site.url}{VAL}", tmp_path / "x.zip", 3)
     assert fetch.file.size is None
-    with pytest.raises(
-        FormatError, match="val_cartesian.zip: expected at most 1000 bytes, found more"
+    with raises(
+        FormatError, where="val_cartesian.zip", expected="at most 1000 bytes", found="more"
     ):
         fetch.run(lambda count: None, 1000)
     assert "x.zip" not in names(tmp_path)
@@ -206,8 +207,8 @@ def test_a_redirection_that_leads_to_no_web_server_or_nowhere_is_refused_at_once
     site.redirect[VAL] = place
     for name in ("BACKOFF_S", "LONGEST_WAIT_S"):  # the error would wait, if it were sent again
         monkeypatch.setenv(f"CARLASC_REMOTE_{name}", "10000")
-    with pytest.raises(
-        CarlascError, match="val_cartesian.zip: expected a file, found a redirection in a loop"
+    with raises(
+        CarlascError, where="val_cartesian.zip", expected="a file", found="a redirection in a loop"
     ):
         get(site, tmp_path)
     assert names(tmp_path) == []
@@ -215,7 +216,7 @@ def test_a_redirection_that_leads_to_no_web_server_or_nowhere_is_refused_at_once
 
 def test_bytes_under_a_wrong_content_range_are_never_taken(site: Site, tmp_path: Path) -> None:
     site.shift_range = 16
-    with pytest.raises(CarlascError, match="expected bytes"):
+    with raises(CarlascError, found="expected bytes"):
         get(site, tmp_path)
     assert "val_cartesian.zip" not in names(tmp_path)
 
@@ -252,16 +253,14 @@ def test_a_page_instead_of_the_zip_is_refused_at_the_first_request(
     site: Site, tmp_path: Path
 ) -> None:
     site.files[VAL], site.content_type = b"<html>gone</html>" * 500, "text/html"
-    with pytest.raises(FormatError, match="expected a zip, found text/html"):
+    with raises(FormatError, expected="a zip", found="text/html"):
         get(site, tmp_path)
     assert names(tmp_path) == []
 
 
 def test_a_missing_file_is_one_line_with_its_address(site: Site, tmp_path: Path) -> None:
     site.files.clear()
-    with pytest.raises(
-        MissingDataError, match="val_cartesian.zip: expected a file, found status 404"
-    ):
+    with raises(MissingDataError, where="val_cartesian.zip", expected="a file", found="status 404"):
         get(site, tmp_path)
 
 
@@ -380,7 +379,7 @@ def test_a_server_that_fails_is_asked_again(site: Site, tmp_path: Path) -> None:
 
 def test_a_server_that_always_fails_is_given_up(site: Site, tmp_path: Path) -> None:
     site.status = 503
-    with pytest.raises(CarlascError, match=r"expected data, found none in 7 attempts \(503\)"):
+    with raises(CarlascError, expected="data", found=r"none in 7 attempts \(503\)"):
         get(site, tmp_path)
     assert len(site.requests) == 7
 
@@ -487,12 +486,12 @@ def test_a_part_of_another_size_than_its_record_is_fetched_again(
 
 
 def test_keeping_without_extracting_is_an_argument_error(site: Site, tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="keep: expected `extract=True` too"):
+    with raises(ArgumentError, where="keep", expected="`extract=True` too"):
         get(site, tmp_path, keep=True)
 
 
 def test_no_connection_is_an_argument_error(tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="connections: expected 1 or more, found 0"):
+    with raises(ArgumentError, where="connections", expected="1 or more", found="0"):
         download(tmp_path, split="val", connections=0)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.parts import raises
 
 from carlasc.cli import app
 from carlasc.core.grids import GridSpec
@@ -13,6 +14,8 @@ from carlasc.errors import ArgumentError, StorageError
 from carlasc.storage import field_files, files, layout
 from carlasc.storage.files import to_json, write_atomic, write_many
 from carlasc.storage.folder import FolderWriter
+
+pytestmark = pytest.mark.posix("calls of the system are traced")
 
 SPEC = GridSpec.published("cartesian")
 
@@ -89,7 +92,7 @@ def test_nothing_is_synced_where_it_is_turned_off(
 
 def test_another_value_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(files.DURABLE, "perhaps")
-    with pytest.raises(ArgumentError, match="CARLASC_DURABLE: expected yes or no, found 'perhaps'"):
+    with raises(ArgumentError, where="CARLASC_DURABLE", expected="yes or no", found="'perhaps'"):
         files.is_durable()
 
 

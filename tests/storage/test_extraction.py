@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from helpers.parts import raises
 from storage.test_downloading import make_zip, names
 
 from carlasc.errors import CarlascError, ConflictError, FormatError
@@ -38,7 +39,7 @@ def test_a_link_in_a_zip_is_refused(tmp_path: Path) -> None:
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(link, "/etc/passwd")
-    with pytest.raises(FormatError, match="found the link"):
+    with raises(FormatError, found="the link"):
         extraction.extract_zip(path, tmp_path / "out", lambda _: None)
 
 

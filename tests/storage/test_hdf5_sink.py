@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.sequences import scan
+from helpers.parts import raises
 
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
@@ -139,7 +140,7 @@ def test_a_corrupted_chunk_names_field_and_frame(store: Path) -> None:
 
 def test_a_truncated_file_is_one_clear_error(store: Path) -> None:
     store.write_bytes(store.read_bytes()[: store.stat().st_size // 2])
-    with pytest.raises(FormatError, match=r"x\.h5: expected an HDF5 file.*truncated"):
+    with raises(FormatError, where=r"x\.h5", expected="an HDF5 file", advice="truncated"):
         carlasc.open(store)
 
 
@@ -164,7 +165,7 @@ def test_a_store_of_another_version_says_so(store: Path, version: int, message: 
 def test_another_hdf5_file_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["data"] = np.arange(3)
-    with pytest.raises(FormatError, match="expected a store packed by carlasc"):
+    with raises(FormatError, expected="a store packed by carlasc"):
         carlasc.open(tmp_path / "x.h5")
 
 

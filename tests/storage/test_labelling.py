@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.parts import raises
 from numpy.testing import assert_array_equal
 from typer.testing import CliRunner
 
@@ -192,7 +193,7 @@ def test_what_exists_is_not_replaced_unless_it_was_labelled_and_that_is_asked_fo
     data, predictions, tmp_path
 ):
     carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
-    with pytest.raises(ConflictError, match="expected a new path"):
+    with raises(ConflictError, expected="a new path"):
         carlasc.label(data, tmp_path / "out", tmp_path / "net", run=ALONE)
     carlasc.label(
         data, tmp_path / "out", tmp_path / "net", by="x", overwrite=True, frames=(0, 3), run=ALONE
@@ -229,9 +230,11 @@ def test_an_interrupted_run_is_continued_by_the_same_call_and_by_no_other(
     out = tmp_path / "out"
     ran = subprocess.run([sys.executable, "-c", KILLED, data, out, tmp_path / "net"], check=False)
     assert ran.returncode == 9 and not out.exists() and (tmp_path / "out.part").is_dir()
-    with pytest.raises(
+    with raises(
         ConflictError,
-        match=r"out\.part: expected the files of an interrupted run .*: remove the folder",
+        where=r"out\.part",
+        expected="the files of an interrupted run",
+        advice="remove the folder",
     ):
         carlasc.label(data, out, tmp_path / "net", by="another", run=ALONE)
     changed = tmp_path / "net" / WHOLE / "000000.npy"
@@ -305,7 +308,7 @@ def test_a_record_a_report_and_a_card_say_who_predicted(data, predictions, tmp_p
 
 @pytest.mark.parametrize("by", ["", " ", "a\nb"])
 def test_a_name_is_one_line(data, predictions, tmp_path, by):
-    with pytest.raises(ArgumentError, match="expected a name in one line"):
+    with raises(ArgumentError, expected="a name in one line"):
         carlasc.label(data, tmp_path / "out", tmp_path / "net", by=by, run=ALONE)
 
 

@@ -2,6 +2,7 @@ import io
 
 import numpy as np
 import pytest
+from helpers.parts import raises
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -71,9 +72,9 @@ def test_probabilities_are_rounded_to_float16_when_they_are_written():
 
 
 def test_flags_and_views_that_do_not_fit_are_refused():
-    with pytest.raises(FormatError, match="expected uint8 or a smaller type, found uint16"):
+    with raises(FormatError, expected="uint8 or a smaller type", found="uint16"):
         layout.field_named("evaluation/flags").encode(np.zeros(2, np.uint16), "x")
-    with pytest.raises(FormatError, match="expected uint16 or a smaller type, found uint32"):
+    with raises(FormatError, expected="uint16 or a smaller type", found="uint32"):
         layout.field_named("evaluation/views").encode(np.zeros(2, np.uint32), "x")
 
 
@@ -84,7 +85,7 @@ def test_votes_come_back():
         back = field.decode(bytes(field.encode(votes, "x")), "x")
         assert back.dtype == dtype
         assert (back == votes).all()
-    with pytest.raises(FormatError, match=r"v.npz: expected an .npz"):
+    with raises(FormatError, where="v.npz", expected="an .npz"):
         field.decode(b"PK nonsense", "v.npz")
 
 
@@ -98,10 +99,10 @@ def test_velocities_come_back_bit_for_bit():
         assert field.decode(data, "x", (2, 3, 4)).tobytes() == table.tobytes()
         with np.load(io.BytesIO(data)) as file:
             assert file.files == ["voxel", "velocity"] and file["velocity"].shape == (count, 3)
-    with pytest.raises(FormatError, match="v.npz: voxel: expected at most 2 values, found 3"):
+    with raises(FormatError, where="v.npz: voxel", expected="at most 2 values", found="3"):
         field.decode(data, "v.npz", (1, 1, 2))
-    with pytest.raises(
-        FormatError, match="v.npz: expected a table of voxel and velocity, found float32"
+    with raises(
+        FormatError, where="v.npz", expected="a table of voxel and velocity", found="float32"
     ):
         field.encode(np.zeros((2, 4), np.float32), "v.npz")
 
@@ -117,13 +118,13 @@ def test_boxes_come_back_bit_for_bit():
 
 def test_boxes_of_another_size_or_type_are_refused():
     field = layout.field_named("boxes")
-    with pytest.raises(
-        FormatError, match=r"boxes/0.bin: expected a multiple of 89 bytes \(one box\), found 90"
+    with raises(
+        FormatError, where="boxes/0.bin", expected=r"a multiple of 89 bytes \(one box\)", found="90"
     ):
         field.decode(bytes(90), "boxes/0.bin")
-    with pytest.raises(FormatError, match="expected a table of boxes, found float64"):
+    with raises(FormatError, expected="a table of boxes", found="float64"):
         field.encode(np.zeros((2, 13)), "boxes/0.bin")
-    with pytest.raises(FormatError, match=r"found .*shape \(1, 2\)"):
+    with raises(FormatError, found=r".*shape \(1, 2\)"):
         field.encode(np.zeros((1, 2), BOXES_DTYPE), "boxes/0.bin")
 
 
@@ -144,34 +145,37 @@ def test_file_names_are_those_of_the_format():
         layout.frame_of(name, ".label")
         for name in ("12.label", "000012.bin", "x00012.label", ".000012.label.part")
     ] == [None] * 4
-    with pytest.raises(FormatError, match="'colour': expected one of points"):
+    with raises(FormatError, where="'colour'", expected="one of points"):
         layout.field_named("colour")
 
 
 def test_a_file_cut_short_is_refused_with_both_sizes():
-    with pytest.raises(
-        FormatError, match=r"a.bin: expected a multiple of 16 bytes \(4 float32 per row\), found 17"
+    with raises(
+        FormatError,
+        where="a.bin",
+        expected=r"a multiple of 16 bytes \(4 float32 per row\)",
+        found="17",
     ):
         layout.field_named("points").decode(bytes(17), "a.bin")
-    with pytest.raises(FormatError, match=r"expected 96 bytes \(2 x 3 x 4 uint32\), found 92"):
+    with raises(FormatError, expected=r"96 bytes \(2 x 3 x 4 uint32\)", found="92"):
         layout.field_named("evaluation/labels").decode(bytes(92), "a.label", (2, 3, 4))
 
 
 def test_arrays_that_do_not_fit_are_refused():
     with pytest.raises(FormatError, match=r"expected shape \(N, 4\), found \(2, 3\)"):
         layout.field_named("points").encode(np.zeros((2, 3), np.float32), "a.bin")
-    with pytest.raises(FormatError, match="expected unsigned integers, found int64"):
+    with raises(FormatError, expected="unsigned integers", found="int64"):
         layout.field_named("labels").encode(np.zeros(2, np.int64), "a.label")
-    with pytest.raises(FormatError, match="expected uint32 or a smaller type"):
+    with raises(FormatError, expected="uint32 or a smaller type"):
         layout.field_named("labels").encode(np.zeros(2, np.uint64), "a.label")
 
 
 def test_broken_lines_are_named():
-    with pytest.raises(
-        FormatError, match="poses.txt: expected 12 numbers per line, found 11 in line 2"
+    with raises(
+        FormatError, where="poses.txt", expected="12 numbers per line", found="11 in line 2"
     ):
         layout.decode_poses(b"1 " * 12 + b"\n" + b"1 " * 11, "poses.txt")
-    with pytest.raises(FormatError, match="times.txt: expected 1 numbers per line"):
+    with raises(FormatError, where="times.txt", expected="1 numbers per line"):
         layout.decode_times(b"zero\n", "times.txt")
 
 
@@ -197,5 +201,5 @@ def test_a_field_of_images_is_a_folder_per_camera():
         "pictures.front.jpg",
         "images.a/b.jpg",
     ):
-        with pytest.raises(FormatError, match="expected one of"):
+        with raises(FormatError, expected="one of"):
             layout.field_named(name)

@@ -1,6 +1,7 @@
 import json
 
 import pytest
+from helpers.parts import raises
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.tables import CARLA, SEMANTICKITTI
@@ -103,8 +104,10 @@ def test_a_grid_may_have_classes_of_its_own(tmp_path, classes):
         json.dumps(params | {"carlasc": {"format": 9, "classes": classes}})
     )
     (sequence,) = FolderSource(folder).sequences().values()
-    with pytest.raises(
+    with raises(
         FormatError,
-        match="evaluation_own/params.json: carlasc: expected format 2 or older, found format 9",
+        where="evaluation_own/params.json: carlasc",
+        expected="format 2 or older",
+        found="format 9",
     ):
         sequence.classes_of("evaluation_own")

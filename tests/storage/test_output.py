@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 
 from carlasc.errors import StorageError
-from carlasc.storage.packed.output import PatientFile
+from carlasc.storage.packed.output import DeferredErrorFile
 
 
 def test_a_file_that_cannot_be_created_can_be_closed_as_python_does_when_it_forgets_it(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "folder").write_bytes(b"a file")
-    file = PatientFile.__new__(PatientFile)
+    file = DeferredErrorFile.__new__(DeferredErrorFile)
     with pytest.raises(StorageError, match="cannot be written"):
         file.__init__(tmp_path / "folder" / "x.h5", tmp_path / "x.h5")  # type: ignore[misc]
     file.close()

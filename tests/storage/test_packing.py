@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, grid, params, write_dataset
+from helpers.parts import raises
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -313,7 +314,7 @@ def test_a_grid_whose_size_changes_is_an_error(tmp_path: Path, kind: str) -> Non
     rng = np.random.default_rng(0)
     writer.write("evaluation/labels", 0, grid(rng, SIZE)["labels"])
     writer.write("evaluation/labels", 1, grid(rng, (3, 5, 3))["labels"])
-    with pytest.raises(FormatError, match=r"evaluation/000001\.label: expected 120 bytes"):
+    with raises(FormatError, where=r"evaluation/000001\.label", expected="120 bytes"):
         pack(tmp_path / "data", tmp_path / f"x.{kind}")
     with pytest.raises(CarlascError, match="run the same command again"):
         carlasc.open(tmp_path / f"x.{kind}")
@@ -388,9 +389,11 @@ def test_what_another_source_left_is_not_mixed_with_this_one(data: Path, tmp_pat
     )
     other = write_dataset(tmp_path / "other", seed=1)
     (other / PATH / "carlasc.json").write_bytes(b"{}")
-    with pytest.raises(
+    with raises(
         ConflictError,
-        match=r"carlasc\.json: expected the text file of this source, found a different file",
+        where=r"carlasc\.json",
+        expected="the text file of this source",
+        found="a different file",
     ):
         pack(other, tmp_path / "x.zarr")
 
@@ -558,6 +561,6 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(data: Path, tmp_path: 
     def appear(done: int, total: int) -> None:
         (tmp_path / "x.h5").write_bytes(b"diary")
 
-    with pytest.raises(ConflictError, match=r"x\.h5: expected a new path, found a file"):
+    with raises(ConflictError, where=r"x\.h5", expected="a new path", found="a file"):
         pack(data / "Val", tmp_path / "x.h5", run=Run(progress=appear))
     assert (tmp_path / "x.h5").read_bytes() == b"diary"

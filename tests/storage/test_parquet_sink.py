@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.datasets.parquet_tables import seal_tables
 from helpers.datasets.sequences import FRAMES
+from helpers.parts import raises
 
 import carlasc
 from carlasc.errors import ArgumentError, FormatError
@@ -134,7 +135,7 @@ def test_a_corrupted_page_names_field_and_frame(store: Path) -> None:
 def test_a_truncated_table_is_one_clear_error(store: Path) -> None:
     file = store / WHOLE / "points.parquet"
     file.write_bytes(file.read_bytes()[:-9])
-    with pytest.raises(FormatError, match=r"points\.parquet: expected a Parquet file"):
+    with raises(FormatError, where=r"points\.parquet", expected="a Parquet file"):
         carlasc.open(store).sequences()[WHOLE].read("points", 5)
 
 
@@ -147,7 +148,7 @@ def test_a_missing_table_is_damage(store: Path) -> None:
 def test_a_store_of_a_newer_version_says_so(store: Path) -> None:
     mark = store / "carlasc-tables.json"
     mark.write_text(json.dumps(json.loads(mark.read_bytes()) | {"version": 7}))
-    with pytest.raises(FormatError, match="found version 7: upgrade carlasc"):
+    with raises(FormatError, found="version 7", advice="upgrade carlasc"):
         carlasc.open(store)
 
 
@@ -206,7 +207,7 @@ def test_statistics_leave_points_out_that_are_not_finite(tmp_path: Path) -> None
 def test_votes_of_another_width_than_the_first_frame_are_refused(tmp_path: Path) -> None:
     with ParquetSink(tmp_path / "x.parquet") as sink, sink.sequence(SCANS) as writer:
         writer.write("fine/votes", 0, np.zeros(2, field_files.VOTES_DTYPE))
-        with pytest.raises(FormatError, match="frame 1: its labels: expected 1 bytes each"):
+        with raises(FormatError, where="frame 1: its labels", expected="1 bytes each"):
             writer.write("fine/votes", 1, np.zeros(2, field_files.WIDE_VOTES_DTYPE))
 
 
@@ -221,5 +222,5 @@ def test_a_table_of_another_size_than_the_grid_is_one_clear_error(store: Path) -
     ):
         carlasc.open(store).sequences()[WHOLE].read("evaluation/labels", 5)
     seal_tables(store / WHOLE)
-    with pytest.raises(FormatError, match="frame 5: expected 72 voxels, found 48"):
+    with raises(FormatError, where="frame 5", expected="72 voxels", found="48"):
         carlasc.open(store).sequences()[WHOLE].read("evaluation/labels", 5)

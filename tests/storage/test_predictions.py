@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.parts import raises
 from numpy.testing import assert_array_equal
 
 from carlasc.core import ClassTable
@@ -92,7 +93,7 @@ def test_an_npz_has_labels_probabilities_or_both(tmp_path):
     np.savez(tmp_path / "000000.npz", probabilities=given)
     assert_array_equal(CARLA_ONLY.read(tmp_path / "000000.npz", 40)[0], given.argmax(axis=1))
     np.savez(tmp_path / "000000.npz", others=labels)
-    with pytest.raises(FormatError, match="expected labels or probabilities, found neither"):
+    with raises(FormatError, expected="labels or probabilities", found="neither"):
         CARLA_ONLY.read(tmp_path / "000000.npz", 40)
 
 
@@ -146,7 +147,7 @@ def test_a_label_file_that_is_cut_short_is_refused(tmp_path):
 
 def test_ids_of_a_table_with_gaps_must_be_in_it(tmp_path):
     np.save(tmp_path / "000000.npy", np.array([10, 2, 40]))  # SemanticKITTI has no class 2
-    with pytest.raises(FormatError, match="found 2"):
+    with raises(FormatError, found="2"):
         PredictionReader(SEMANTICKITTI, SEMANTICKITTI19).read(tmp_path / "000000.npy", 3)
 
 
@@ -225,7 +226,7 @@ def test_files_of_another_split_or_of_another_sequence_are_not_taken(sequences, 
 def test_two_folders_of_a_sequence_and_two_kinds_of_files_are_refused(sequences, tmp_path):
     write(tmp_path / "a/Town07_Heavy")
     write(tmp_path / "b/Town07_Heavy")
-    with pytest.raises(FormatError, match="found a/Town07_Heavy, b/Town07_Heavy"):
+    with raises(FormatError, found="a/Town07_Heavy, b/Town07_Heavy"):
         find_predictions(tmp_path, {SCANS: sequences[SCANS]}, ALL)
     write(tmp_path / "a/Town07_Heavy", suffix=".npy")
     with pytest.raises(FormatError, match=r"files with one suffix, found \.label and \.npy"):
@@ -244,7 +245,7 @@ def test_names_of_frames_have_six_digits_as_those_of_the_layout(sequences, tmp_p
 )
 def test_a_folder_without_predictions_is_one_line(sequences, tmp_path, make):
     make(tmp_path / "x")
-    with pytest.raises(MissingDataError, match="found none"):
+    with raises(MissingDataError, found="none"):
         find_predictions(tmp_path / "x", sequences, ALL)
 
 

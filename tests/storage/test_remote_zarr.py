@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of
+from helpers.parts import raises
 from helpers.servers.object_store import (
     BUCKET,
     FaultyServer,
@@ -29,7 +30,7 @@ from carlasc.storage.transport.targets import LocalTarget, RemoteTarget, Target,
 from carlasc.storage.zarr.zarr_finish import finish
 from carlasc.storage.zarr.zarr_sink import ZarrSink
 
-for package in ("s3fs", "numcodecs", "google_crc32c"):
+for package in ("obstore", "numcodecs", "google_crc32c"):
     pytest.importorskip(package)
 
 
@@ -120,11 +121,11 @@ def test_packing_to_a_bucket_and_back(
     assert there.out == out
     assert (there.stored_bytes, there.published_bytes) == (here.stored_bytes, here.published_bytes)
     assert files_in(RemoteTarget(out)) == files_of(tmp_path / "x.zarr")
-    with pytest.raises(ConflictError, match=r"\.zarr: expected a new path, found a finished store"):
+    with raises(ConflictError, where=r"\.zarr", expected="a new path", found="a finished store"):
         pack(reference, out)
     assert len(pack(reference, out, overwrite=True, run=Run(workers=1)).sequences) == 1
     assert files_in(RemoteTarget(out)) == files_of(tmp_path / "x.zarr")
-    with pytest.raises(ConflictError, match="expected a path outside"):
+    with raises(ConflictError, expected="a path outside"):
         pack(out, f"{out}/inside.zarr")
     unpack(out, tmp_path / "files", run=Run(workers=1))
     sequence = carlasc.open(tmp_path / "files").sequences()[PATH]

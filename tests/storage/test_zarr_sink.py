@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, scan
+from helpers.parts import raises
 
 import carlasc
 from carlasc.errors import ArgumentError, ConflictError, FormatError
@@ -219,7 +220,7 @@ def test_a_store_of_another_version_says_so(store: Path, version: int, message: 
 
 def test_another_zarr_store_is_refused(tmp_path: Path) -> None:
     zarr.create_group(tmp_path / "x.zarr")
-    with pytest.raises(FormatError, match="expected a store packed by carlasc"):
+    with raises(FormatError, expected="a store packed by carlasc"):
         carlasc.open(tmp_path / "x.zarr")
 
 

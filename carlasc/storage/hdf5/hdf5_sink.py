@@ -28,7 +28,7 @@ from carlasc.storage.packed.array_layout import (
 )
 from carlasc.storage.packed.chunks import crc32c, in_threads
 from carlasc.storage.packed.columns import Column
-from carlasc.storage.packed.output import PatientFile, put_in_place, refuse_existing
+from carlasc.storage.packed.output import DeferredErrorFile, put_in_place, refuse_existing
 from carlasc.storage.packed.stores import (
     STORE,
     VERSION,
@@ -268,7 +268,7 @@ class HDF5Output:
             import_extra(module, "hdf5")
         self.location = str(path)
         self.path = path
-        self._output = PatientFile(path, place)
+        self._output = DeferredErrorFile(path, place)
         self._file = h5py.File(self._output, "w", libver=("v110", "v110"), track_order=False)
         self.check()
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, import_extra, reading
 from carlasc.storage.arrays import check_ratio
-from carlasc.storage.files import parse_json_value
+from carlasc.storage.files import damaged, parse_json_value
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
 from carlasc.storage.packed.chunks import Encoding, StoredArray, crc32c
 from carlasc.storage.transport.remote_tree import RemoteTree
-from carlasc.storage.transport.requests import holding_a_lock
 from carlasc.storage.transport.trees import Tree
+from carlasc.storage.transport.web import garbage_collection_paused
 
 _BLOSC = 32001  # registered number of the filter
 _GZIP, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 itself
@@ -58,8 +58,8 @@ class HDF5Store(ArrayStore):
     def attributes(self, node: str) -> dict[str, Any] | None:
         """Return a node's attributes."""
         with self._open() as file:
-            found = find_node(file, node, self.location)
-            return None if found is None else _read_attributes(found, f"{self.location}/{node}")
+            group = find_node(file, node, self.location)
+            return None if group is None else _read_attributes(group, f"{self.location}/{node}")
 
     def read_small(self, node: str) -> NDArray[Any]:
         """Return a whole data set."""
@@ -96,20 +96,15 @@ class HDF5Store(ArrayStore):
             total += item.id.get_storage_size() if isinstance(item, h5py.Dataset) else 0
 
         with self._open() as file:
-            if (found := find_node(file, node, self.location)) is not None:
-                found.visititems(add)
+            if (group := find_node(file, node, self.location)) is not None:
+                group.visititems(add)
         return total
 
     def _dataset(self, file: Any, node: str) -> Any:
-        found = find_node(file, node, self.location)
-        if not isinstance(found, import_extra("h5py", "hdf5").Dataset):
-            raise FormatError(
-                self.location,
-                expected=f"the data set {node}",
-                found="none",
-                advice="the store is damaged",
-            )
-        return found
+        dataset = find_node(file, node, self.location)
+        if not isinstance(dataset, import_extra("h5py", "hdf5").Dataset):
+            raise damaged(self.location, f"the data set {node}", "none")
+        return dataset
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
@@ -118,7 +113,7 @@ class HDF5Store(ArrayStore):
             if isinstance(self.tree, RemoteTree):
                 with (
                     self.tree.open(self.path) as remote,
-                    holding_a_lock(),
+                    garbage_collection_paused(),
                     h5py.File(remote, "r") as file,
                 ):
                     yield file
@@ -159,11 +154,8 @@ class HDF5Array(StoredArray):
             or dataset.dtype.kind not in "uif"
             or checksums.ndim != 1
         ):
-            raise FormatError(
-                where,
-                expected="a chunked data set with the Blosc filter",
-                found="other filters or no chunks",
-                advice="the store is damaged",
+            raise damaged(
+                where, "a chunked data set with the Blosc filter", "other filters or no chunks"
             )
         array = cls(tree, dataset.name, dataset.dtype, shape, chunk, Encoding())
         rooms = [-(-n // step) for n, step in zip(shape, chunk, strict=True)]
@@ -177,12 +169,7 @@ class HDF5Array(StoredArray):
 
         dataset.id.chunk_iter(note)
         if len(places) != len(checksums):
-            raise FormatError(
-                where,
-                expected=f"{len(checksums)} chunks",
-                found=str(len(places)),
-                advice="the store is damaged",
-            )
+            raise damaged(where, f"{len(checksums)} chunks", str(len(places)))
         array._path, array._places = path, places
         array._checksums = dict(zip(sorted(places), checksums.tolist(), strict=True))
         return array
@@ -191,12 +178,7 @@ class HDF5Array(StoredArray):
         """Return the file, the first byte and the end of each chunk."""
         for number in numbers:
             if number not in self._places:
-                raise FormatError(
-                    self.tree.where(self._path),
-                    expected=f"chunk {number} of {self.name}",
-                    found="none",
-                    advice="the store is damaged",
-                )
+                raise damaged(self.tree.where(self._path), f"chunk {number} of {self.name}", "none")
         return [(self._path, *self._places[number]) for number in numbers]
 
     def files(self, numbers: Sequence[int]) -> list[str]:
@@ -226,9 +208,9 @@ def find_node(file: Any, node: str, where: str) -> Any:
         FormatError: a link on the path refers to another file, or is symbolic.
     """
     h5py = import_extra("h5py", "hdf5")
-    found = file
+    place = file
     for name in filter(None, node.split("/")):
-        link = found.get(name, getlink=True) if isinstance(found, h5py.Group) else None
+        link = place.get(name, getlink=True) if isinstance(place, h5py.Group) else None
         if link is None:
             return None
         if not isinstance(link, h5py.HardLink):
@@ -243,15 +225,15 @@ def find_node(file: Any, node: str, where: str) -> Any:
                 found=kind,
                 advice=_UNTRUSTED,
             )
-        found = found[name]
-    if isinstance(found, h5py.Dataset) and (found.is_virtual or found.external):
+        place = place[name]
+    if isinstance(place, h5py.Dataset) and (place.is_virtual or place.external):
         raise FormatError(
             f"{where}: {node}",
             expected="values in the file itself",
             found="values in other files",
             advice=_UNTRUSTED,
         )
-    return found
+    return place
 
 
 def check_small(dataset: Any, what: str) -> None:
@@ -276,14 +258,10 @@ def check_small(dataset: Any, what: str) -> None:
     check_ratio(size, stored, what)
     if dataset.chunks is None or not size:
         if size > stored:  # HDF5 would fill the rest with zeros
-            raise FormatError(
-                what, expected=f"{size} bytes", found=f"{stored}", advice="the store is damaged"
-            )
+            raise damaged(what, f"{size} bytes", f"{stored}")
         return
     if dataset.chunks != dataset.shape or dataset.id.get_num_chunks() != 1:
-        raise FormatError(
-            what, expected="one chunk", found="several chunks", advice="the store is damaged"
-        )
+        raise damaged(what, "one chunk", "several chunks")
     if _GZIP in filters:  # HDF5 decompresses a whole chunk without a limit
         packed = dataset.id.read_direct_chunk((0,) * len(dataset.shape))[1]
         unpacked = zlib.decompressobj().decompress(packed, size + 1)
@@ -299,12 +277,12 @@ def _filters(dataset: Any) -> list[int]:
 
 
 def _read_attributes(node: Any, where: str) -> dict[str, Any]:
-    found = {}
+    attributes = {}
     for name, stored in node.attrs.items():
         value = stored.item() if hasattr(stored, "item") else stored
         value = value.decode() if isinstance(value, bytes) else value
         if name.endswith(":json"):
-            found[name.removesuffix(":json")] = parse_json_value(value, f"{where}: {name}")
+            attributes[name.removesuffix(":json")] = parse_json_value(value, f"{where}: {name}")
         else:
-            found[name] = value
-    return found
+            attributes[name] = value
+    return attributes

@@ -62,17 +62,17 @@ class ArrayField:
     @cached_property
     def columns(self) -> dict[str, StoredColumn]:
         """The columns that are stored."""
-        found = {}
+        columns = {}
         for name, counts in self._counts.items():
             column, array = self.layout.columns[name], self._array_of(name)
             self.layout.check(
                 array, column, int(self.frames[-1]), int(counts.max()), f"{self.where}/{name}"
             )
             firsts = self.frames * array.slots
-            found[name] = StoredColumn(
+            columns[name] = StoredColumn(
                 column, array, firsts, np.maximum(counts, 0), self.layout.is_grid
             )
-        return found
+        return columns
 
     def read(self, frames: list[int]) -> list[NDArray[Any]]:
         """Read frames.
@@ -134,7 +134,7 @@ class ArrayField:
             )
             for column in self.columns.values()
         ]
-        return list(dict.fromkeys(file for found in files for file in found))
+        return list(dict.fromkeys(file for names in files for file in names))
 
     def _stored_in(self, column: Column, position: int) -> str | None:
         """Return the name of the stored column with the elements of a frame: the column or its wide
@@ -219,7 +219,7 @@ class StoredColumn:
 
     def parts(self, positions: list[int]) -> list[FramePart]:
         """Return the parts that hold some frames."""
-        step, found = self.array.step, []
+        step, parts = self.array.step, []
         for position in positions:
             first, count = self.firsts[position], self.counts[position]
             chunks = min(count, 1) if self.is_grid else -(-count // step)
@@ -229,8 +229,8 @@ class StoredColumn:
                     self.array.dtype,
                     f"a frame of {self.array.name}",
                 )
-            found.append(FramePart(range(first, first + chunks), count))
-        return found
+            parts.append(FramePart(range(first, first + chunks), count))
+        return parts
 
     def fetch(self, tasks: list[FramePart]) -> None:
         """Fetch the chunks of all tasks at once."""

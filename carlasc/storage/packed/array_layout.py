@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from carlasc.core.grids import GridSpec
 from carlasc.errors import FormatError
 from carlasc.storage import field_files, layout
-from carlasc.storage.files import parse_json
+from carlasc.storage.files import damaged, parse_json
 from carlasc.storage.packed.chunks import StoredArray
 from carlasc.storage.packed.columns import FEW, LEAST, Column, Packing, packing_of
 from carlasc.storage.packed.stores import VERSION, PackOptions
@@ -71,18 +71,10 @@ class FieldLayout:
             FormatError: the attributes are missing or do not fit the field.
         """
         if attributes is None or attributes.get("type") != FIELD:
-            raise FormatError(
-                where,
-                expected="the field that the sequence lists",
-                found="none",
-                advice="the store is damaged",
-            )
+            raise damaged(where, "the field that the sequence lists", "none")
         scale = attributes.get("scale_m")
         if scale is not None and not (type(scale) in (int, float) and 0 < scale <= 1):
-            raise FormatError(
-                where, expected="a step of coordinates above 0, up to 1 m", found=repr(scale),
-                advice="the store is damaged",
-            )  # fmt: skip
+            raise damaged(where, "a step of coordinates above 0, up to 1 m", repr(scale))
         options = PackOptions(small=attributes.get("codec") == _PCODEC)
         packing = packing_of(layout.field_named(field), options, attributes)
         if attributes.get("kind") != packing.kind:
@@ -96,12 +88,7 @@ class FieldLayout:
         if not all(type(number) is int and 0 < number < 2**31 for number in numbers) or (
             len(numbers) != 3 if packing.kind == "grid" else isinstance(size, list)
         ):
-            raise FormatError(
-                where,
-                expected="a chunk size above 0",
-                found=repr(size),
-                advice="the store is damaged",
-            )
+            raise damaged(where, "a chunk size above 0", repr(size))
         return cls(packing, attributes)
 
     @classmethod
@@ -186,11 +173,10 @@ class FieldLayout:
         fits = fits and last < array.shape[0] < 2**63 // max(1, array.slots)
         fits = fits and array.shape[1:] == (rest if self.is_grid else (*rest[:-1], array.shape[-1]))
         if not fits or not (self.is_grid or most <= array.shape[-1]):
-            raise FormatError(
+            raise damaged(
                 where,
-                expected=f"{column.dtype} with room for frame {last}",
-                found=f"{array.dtype.str} of shape {array.shape} in chunks {array.chunk}",
-                advice="the store is damaged",
+                f"{column.dtype} with room for frame {last}",
+                f"{array.dtype.str} of shape {array.shape} in chunks {array.chunk}",
             )
 
     def divide(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from carlasc.errors import FormatError
 from carlasc.storage.arrays import check_size
+from carlasc.storage.files import damaged
 from carlasc.storage.packed.array_fields import ArrayField
 from carlasc.storage.packed.array_layout import SEQUENCE, FieldLayout, document_node, field_node
 from carlasc.storage.packed.chunks import StoredArray
@@ -57,7 +58,7 @@ class ArrayStore(ABC):
         """Return the stored bytes of a node and the nodes below it."""
 
     def forget(self) -> bool:
-        """Discard cached metadata, and return whether the store may have grown since it was opened."""
+        """Discard cached metadata; return whether the store may have grown since it was opened."""
         return False
 
 
@@ -81,7 +82,7 @@ class ArraySource(PackedSource):
         return {path: ArraySequence(self.store, path, group) for path, group in self.nodes.items()}
 
     def published_bytes(self) -> dict[str, int]:
-        """Return the size of the published files by field, computed from the numbers of elements."""
+        """Return the size of the published files by field, from the numbers of elements."""
         sizes: Counter[str] = Counter()
         for sequence in self._sequences().values():
             sizes["documents"] += sum(
@@ -119,12 +120,7 @@ class ArraySequence(PackedSequence[ArrayField]):
         location = f"{store.location}/{group}"
         attributes = store.attributes(group)
         if attributes is None or attributes.get("type") != SEQUENCE:
-            raise FormatError(
-                location,
-                expected="the sequence that the store lists",
-                found="none",
-                advice="the store is damaged",
-            )
+            raise damaged(location, "the sequence that the store lists", "none")
         super().__init__(path, location, attributes)
         self.tree = store.tree
 
@@ -159,7 +155,7 @@ class ArraySequence(PackedSequence[ArrayField]):
         return self._field(field).files_of(list(frames))
 
     def published_bytes(self, field: str) -> int:
-        """Return the size of the published files of a field, computed from the numbers of elements."""
+        """Return the size of the published files of a field, from the numbers of elements."""
         return self._field(field).published_bytes()
 
     def _read_again(self, read: Callable[[], _T]) -> _T:
@@ -191,23 +187,15 @@ class ArraySequence(PackedSequence[ArrayField]):
         where = f"{self.location}/counts"
         frames = self.store.read_small(f"{self.group}/frames").astype(np.int64)
         if frames.ndim != 1 or (np.diff(frames, prepend=-1) <= 0).any():
-            raise FormatError(
-                where,
-                expected="ascending frame numbers",
-                found="other values",
-                advice="the store is damaged",
-            )
+            raise damaged(where, "ascending frame numbers", "other values")
         counts = self.store.read_small(f"{self.group}/counts").astype(np.int64)
         columns = (self.store.attributes(f"{self.group}/counts") or {}).get("columns")
         columns = columns if isinstance(columns, list) else []
         if counts.shape != (len(frames), len(columns)) or not all(
             isinstance(name, str) for name in columns
         ):
-            raise FormatError(
-                where, expected=f"({len(frames)}, {len(columns)}) numbers of elements, with "
-                                f"ascending frame numbers", found="other values",
-                advice="the store is damaged",
-            )  # fmt: skip
+            raise damaged(where, f"({len(frames)}, {len(columns)}) numbers of elements, with "
+                                f"ascending frame numbers", "other values")  # fmt: skip
         return frames, {column: counts[:, number] for number, column in enumerate(columns)}
 
     def _open_field(self, field: str) -> ArrayField:
@@ -241,11 +229,10 @@ class ArraySequence(PackedSequence[ArrayField]):
         if grid is None:  # params.json is written last, and may be missing
             check_size(shape, np.dtype("<u4"), f"{self.location}: field {field}")
         elif shape != grid.size:
-            raise FormatError(
+            raise damaged(
                 f"{self.location}: field {field}",
-                expected=f"grids of shape {grid.size}, as in params.json",
-                found=f"{shape}",
-                advice="the store is damaged",
+                f"grids of shape {grid.size}, as in params.json",
+                f"{shape}",
             )
 
     def __getstate__(self) -> dict[str, Any]:

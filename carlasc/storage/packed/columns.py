@@ -298,7 +298,7 @@ class GridPacking(Packing):
 
 
 class VotesPacking(Packing):
-    """Votes or probabilities by class: the columns of the table, as `voxel`, `label` and `votes`."""
+    """Votes or probabilities by class: the columns of the table: `voxel`, `label`, `votes`."""
 
     kind = "votes"
 
@@ -334,7 +334,7 @@ class VotesPacking(Packing):
 
 
 class VelocitiesPacking(Packing):
-    """Velocities of moving voxels: the columns of the table, as `voxel`, and `velocity` as (3, N)."""
+    """Velocities of moving voxels: `voxel` (N,) and `velocity` (3, N)."""
 
     kind = "velocities"
 
@@ -360,7 +360,7 @@ class VelocitiesPacking(Packing):
 
 
 class BoxesPacking(Packing):
-    """Boxes: the real numbers of the table as `geometry` (10, N), and its other columns unchanged."""
+    """Boxes: the real numbers as `geometry` (10, N), and the other columns unchanged."""
 
     kind = "boxes"
 

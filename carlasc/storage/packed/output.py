@@ -97,7 +97,7 @@ def put_in_place(finished: Path, path: Path, overwrite: bool) -> None:
         ) from error
 
 
-class PatientFile(io.RawIOBase):
+class DeferredErrorFile(io.RawIOBase):
     """A new file for libraries that do not handle failed writes.
 
     After a failed write, h5py crashes, pyarrow prints an error of its destructor, and Foxglove
@@ -178,17 +178,18 @@ class PatientFile(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         """Read bytes at the position; zeros after an error."""
         view = memoryview(buffer).cast("B")
-        found = b""
+        data = b""
         if self._error is None:
             try:
-                found = os.pread(self._descriptor, len(view), self._position)
+                os.lseek(self._descriptor, self._position, os.SEEK_SET)
+                data = os.read(self._descriptor, len(view))
             except OSError as error:
                 self._error = error
         if self._error is not None:
-            found = bytes(len(view))
-        view[: len(found)] = found
-        self._position += len(found)
-        return len(found)
+            data = bytes(len(view))
+        view[: len(data)] = data
+        self._position += len(data)
+        return len(data)
 
     def truncate(self, size: int | None = None) -> int:
         """Set the size."""

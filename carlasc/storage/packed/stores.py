@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from carlasc.core.grids import Coordinates
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
-from carlasc.storage.files import leads_outside
+from carlasc.storage.files import damaged, leads_outside
 from carlasc.storage.layout import identity_of
 from carlasc.storage.packed.output import unfinished_error
 from carlasc.storage.protocol import Sequence, Source
@@ -81,7 +81,7 @@ class PackedSource(Source):
         self.lossy_mm = float(lossy) if isinstance(lossy, int | float) and lossy else None
 
     def published_bytes(self) -> dict[str, int]:
-        """Return the size of the published files by field; empty if the store does not record it."""
+        """Return the size of the published files by field; empty if it is not recorded."""
         return {}
 
     @abstractmethod
@@ -98,9 +98,7 @@ def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]
         )
     version = root.get("version", 1)
     if isinstance(version, bool) or not isinstance(version, int | np.integer) or version < 1:
-        raise FormatError(
-            where, expected="a version above 0", found=repr(version), advice="the store is damaged"
-        )
+        raise damaged(where, "a version above 0", repr(version))
     if version != VERSION:
         raise FormatError(
             where,
@@ -116,9 +114,7 @@ def _check_root(root: Mapping[str, Any] | None, where: str) -> Mapping[str, str]
     if not isinstance(sequences, dict) or not all(
         isinstance(node, str) for node in sequences.values()
     ):
-        raise FormatError(
-            where, expected="the groups of sequences", found="none", advice="the store is damaged"
-        )
+        raise damaged(where, "the groups of sequences", "none")
     nodes: dict[str, str] = dict(sorted(sequences.items()))
     check_names([*nodes, *nodes.values()], where)
     return nodes
@@ -150,28 +146,17 @@ class PackedSequence(Sequence, Generic[_FieldReader]):
             self.coordinates = cast(Coordinates, about["coordinates"])
             self._fields, self._documents = frozenset(about["fields"]), tuple(about["documents"])
         except KeyError as error:
-            raise FormatError(
-                location,
-                expected=f"the attribute {error.args[0]}",
-                found="none",
-                advice="the store is damaged",
-            ) from error
+            raise damaged(location, f"the attribute {error.args[0]}", "none") from error
         except TypeError as error:
-            raise FormatError(
-                location,
-                expected="lists of fields and text files",
-                found=str(error),
-                advice="the store is damaged",
-            ) from error
+            raise damaged(location, "lists of fields and text files", str(error)) from error
         names = (self.name, self.coordinates, self.split or "", *self._fields, *self._documents)
         if (
             not all(isinstance(name, str) for name in names)
             or self.coordinates not in layout.COORDINATES
         ):
-            raise FormatError(
-                location, expected="names of the sequence, its fields and its text files", found="other values",
-                advice="the store is damaged",
-            )  # fmt: skip
+            raise damaged(
+                location, "names of the sequence, its fields and its text files", "other values"
+            )
         check_names([*self._fields, *self._documents], location)
         self._readers: dict[str, _FieldReader] = {}
 

@@ -24,7 +24,7 @@ from carlasc.storage.files import (
 from carlasc.storage.packed.output import (
     TABLES_MARK,
     UNFINISHED_MARK,
-    PatientFile,
+    DeferredErrorFile,
     put_in_place,
     refuse_existing,
     remove,
@@ -223,7 +223,7 @@ class ParquetWriter(PackedWriter):
 
 
 def _write_table(table: Any, path: Path) -> None:
-    file = PatientFile(path, path)
+    file = DeferredErrorFile(path, path)
     import_extra("pyarrow.parquet", "parquet").write_table(
         table, file, compression="zstd", write_page_checksum=True
     )
@@ -275,11 +275,22 @@ class TableWriter(FieldWriter):
             for name in types
             if self.entry.kind == "position" and name in AXES
         }
-        self._file = PatientFile(self.path, self.path)
+        self._file = DeferredErrorFile(self.path, self.path)
         self._writer = parquet.ParquetWriter(
-            self._file, self._schema, compression="none" if is_picture else "zstd", compression_level=None if is_picture else _LEVEL,
-            use_dictionary=[name for name in ("sequence", "frame", *types) if name not in split and not is_picture], column_encoding=split or None,
-            data_page_size=_PAGE, dictionary_pagesize_limit=_PAGE, write_page_checksum=True, write_statistics=["sequence", "frame"],
+            self._file,
+            self._schema,
+            compression="none" if is_picture else "zstd",
+            compression_level=None if is_picture else _LEVEL,
+            use_dictionary=[
+                name
+                for name in ("sequence", "frame", *types)
+                if name not in split and not is_picture
+            ],
+            column_encoding=split or None,
+            data_page_size=_PAGE,
+            dictionary_pagesize_limit=_PAGE,
+            write_page_checksum=True,
+            write_statistics=["sequence", "frame"],
         )  # fmt: skip
 
     def close(self) -> None:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from carlasc.errors import FormatError, MissingDataError, import_extra, reading
 from carlasc.storage import layout
 from carlasc.storage.arrays import check_ratio, check_size
-from carlasc.storage.files import parse_json
+from carlasc.storage.files import damaged, parse_json
 from carlasc.storage.packed.output import TABLES_MARK
 from carlasc.storage.packed.stores import PackedSequence, PackedSource
 from carlasc.storage.parquet.table_columns import column_types, join_columns
@@ -99,12 +99,7 @@ class ParquetSequence(PackedSequence["FieldTable"]):
         grid = field.rpartition("/")[0]
         if per_voxel and grid not in self.grids:
             where = f"{self.location}/{layout.params_file(grid)}"
-            raise FormatError(
-                where,
-                expected="the geometry of the grid",
-                found="none",
-                advice="the store is damaged",
-            )
+            raise damaged(where, "the geometry of the grid", "none")
         return table.read(frame, self.grids[grid].size if per_voxel else None)
 
     def read_document(self, name: str) -> bytes:
@@ -126,12 +121,7 @@ class ParquetSequence(PackedSequence["FieldTable"]):
             rows = file.read(["name", "data"], use_threads=False).to_pylist()
             data = next((row["data"] for row in rows if row["name"] == name), None)
         if not isinstance(data, bytes):
-            raise FormatError(
-                self.tree.where(path),
-                expected=f"the text file {name}",
-                found="none",
-                advice="the store is damaged",
-            )
+            raise damaged(self.tree.where(path), f"the text file {name}", "none")
         return data
 
     def _check_footer(self, name: str) -> None:
@@ -161,11 +151,10 @@ class FieldTable:
         self.attributes = about
         frames, rows = (_counts(about.get(name)) for name in ("frames", "rows"))
         if not frames or len(frames) != len(rows) or not _rise(frames):
-            raise FormatError(
+            raise damaged(
                 self.where,
-                expected="ascending frame numbers, and the number of rows of each",
-                found="other values",
-                advice="the store is damaged",
+                "ascending frame numbers, and the number of rows of each",
+                "other values",
             )
         self.frames = np.array(frames, np.int64)
         groups = np.cumsum(np.array(rows, np.int64) > 0) - 1  # an empty frame has none
@@ -181,9 +170,7 @@ class FieldTable:
         where = f"{self.where}: field {self.field}, frame {frame}"
         most = None if shape is None else math.prod(shape)
         if most is not None and rows != most:
-            raise FormatError(
-                where, expected=f"{most} voxels", found=str(rows), advice="the store is damaged"
-            )
+            raise damaged(where, f"{most} voxels", str(rows))
         if rows:
             columns = self._read_group(frame, most is None)
         else:
@@ -212,9 +199,7 @@ class FieldTable:
             )
             if about is None or about.num_rows != rows:
                 found = "none" if about is None else str(about.num_rows)
-                raise FormatError(
-                    where, expected=f"{rows} rows", found=found, advice="the store is damaged"
-                )
+                raise damaged(where, f"{rows} rows", found)
             if bounded:
                 for type_ in self._types.values():
                     check_size((rows,), np.dtype("u1" if type_ == "binary" else type_), where)
@@ -257,12 +242,7 @@ def opened(tree: Tree, path: str, metadata: Any = None) -> Iterator[Any]:
             yield file
     except FormatError as error:
         if isinstance(error.__cause__, FileNotFoundError):
-            raise FormatError(
-                where,
-                expected="the table that the sequence lists",
-                found="none",
-                advice="the store is damaged",
-            ) from error
+            raise damaged(where, "the table that the sequence lists", "none") from error
         raise
 
 
@@ -277,11 +257,10 @@ def check_attributes(about: Any, where: str) -> Mapping[str, Any]:
     if (
         "scale_m" in about and not (type(scale) in (int, float) and 0 < scale <= 1)
     ) or label_bytes not in (1, 2):
-        raise FormatError(
+        raise damaged(
             where,
-            expected="a step of coordinates up to 1 m, and labels of 1 or 2 bytes",
-            found=f"{scale!r} and {label_bytes!r}",
-            advice="the store is damaged",
+            "a step of coordinates up to 1 m, and labels of 1 or 2 bytes",
+            f"{scale!r} and {label_bytes!r}",
         )
     return {**about, "label_bytes": label_bytes}
 
@@ -325,12 +304,7 @@ def check_footer(tree: Tree, path: str, expected: object) -> None:
     try:
         found = footer_checksum(tree, path)
     except MissingDataError as error:
-        raise FormatError(
-            tree.where(path),
-            expected="the table that the sequence lists",
-            found="none",
-            advice="the store is damaged",
-        ) from error
+        raise damaged(tree.where(path), "the table that the sequence lists", "none") from error
     if found != expected:
         raise FormatError(
             tree.where(path),
@@ -347,12 +321,7 @@ def _check_types(schema: Any, types: Mapping[str, str], where: str) -> None:
     short = {"float32": "float", "float64": "double", "float16": "halffloat"}
     for name, type_ in types.items():
         if found[name] != short.get(type_, type_):
-            raise FormatError(
-                where,
-                expected=f"{type_} in {name}",
-                found=found[name],
-                advice="the store is damaged",
-            )
+            raise damaged(where, f"{type_} in {name}", found[name])
 
 
 def _counts(values: object) -> list[int]:

@@ -7,17 +7,18 @@ the remote file, its access time that of its last use. This module sets both.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from carlasc.errors import ArgumentError, MissingDataError, StorageError
 from carlasc.storage.files import sync_file, write_at
@@ -27,7 +28,8 @@ from carlasc.storage.transport.trees import LocalTree, Tree
 _PIECE = 4 << 20  # bytes of a range that is requested
 _AT_ONCE = 4  # ranges of a file that are requested in parallel; all of them are in memory
 _LARGEST_SHARE = 4  # files above 1/4 of the cache size are read without the cache
-_PART, _LOCK = ".part", ".lock"
+_PART = ".part"
+_LOCKS = ".locks"  # the folder of locks
 _TOUCH_S = 0.5  # precision of the time of the last use
 _FULL_S = 60.0  # pause of fetching after the disk was full
 
@@ -37,8 +39,8 @@ class Cache:
     """A cache folder for files of remote stores. Several stores and processes may share it.
 
     When the folder would become larger than `max_bytes`, the least recently used files are removed.
-    An incomplete file of a killed process is never read. Locks are those of the operating system
-    (`flock`), so the folder should be on a local disk.
+    An incomplete file of a killed process is never read. Locks are those of the operating system,
+    so the folder should be on a local disk.
 
     Attributes:
         folder: the folder; it is created when a store is opened.
@@ -64,8 +66,8 @@ class Cache:
             StorageError: it cannot be created or written to.
         """
         try:
-            Path(self.folder).mkdir(parents=True, exist_ok=True)
-            with _locked(Path(self.folder) / _LOCK, wait=False):
+            (Path(self.folder) / _LOCKS).mkdir(parents=True, exist_ok=True)
+            with suppress(Timeout), self._lock("").acquire(blocking=False):
                 pass
         except OSError as error:
             raise StorageError(
@@ -78,6 +80,13 @@ class Cache:
         """Return the path of a cached file."""
         return Path(self.folder) / name[:2] / name
 
+    def _lock(self, name: str) -> FileLock:
+        """Return the lock of a cached file; for "", that under which files are counted.
+
+        The operating system releases a lock when its process ends for any reason.
+        """
+        return FileLock(Path(self.folder) / _LOCKS / f"{name}.lock")
+
     def find(self, key: str, since: float) -> str | None:
         """Return the name of the cached file with a key, if it was compared with the remote file
         after `since`; otherwise None.
@@ -86,8 +95,8 @@ class Cache:
             for entry in entries:
                 if entry.name.startswith(f"{key}-") and not entry.name.endswith(_PART):
                     with suppress(FileNotFoundError):  # removed meanwhile
-                        found = entry.stat()
-                        if found.st_mtime >= since and found.st_size == _size_of(entry.name):
+                        about = entry.stat()
+                        if about.st_mtime >= since and about.st_size == _size_of(entry.name):
                             return entry.name
         return None
 
@@ -109,24 +118,23 @@ class Cache:
         path = self.path(name)
         part = path.with_name(f"{name}{_PART}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        while not _is_whole(path):
-            with _locked(part, wait) as descriptor:  # the unfinished file is also the lock
-                if descriptor is None:
-                    return False
-                if not _is_at(part, descriptor):
-                    continue  # the previous process has renamed or removed it
-                try:
-                    if not _is_whole(path):
-                        if not self._make_room(descriptor, _size_of(name)):
-                            return False
-                        fill(descriptor)
-                        # its full size is already set: after a power failure it could hold zeros
-                        sync_file(descriptor)
-                        part.rename(path)
-                finally:
-                    if _is_at(part, descriptor):
-                        part.unlink()
-        return True
+        if _is_whole(path):
+            return True
+        with suppress(Timeout), self._lock(name).acquire(blocking=wait):
+            if _is_whole(path):  # another process has written it meanwhile
+                return True
+            try:
+                with part.open("wb", buffering=0) as file:  # discards the bytes of a killed process
+                    if not self._make_room(file.fileno(), _size_of(name)):
+                        return False
+                    fill(file.fileno())
+                    # its full size is already set: after a power failure it could hold zeros
+                    sync_file(file.fileno())
+                part.replace(path)
+            finally:
+                part.unlink(missing_ok=True)
+            return True
+        return False
 
     def touch(self, name: str, *, compared: bool = False) -> bool:
         """Record that a file is used, and whether it was `compared` with the remote file.
@@ -147,19 +155,27 @@ class Cache:
 
         Return whether there is room for it.
         """
-        folder = Path(self.folder)
-        with _locked(folder / _LOCK):
-            os.truncate(descriptor, 0)  # discard the bytes of a killed process
-            files = sorted(_files(folder))
+        with self._lock(""):
+            files = sorted(_files(Path(self.folder)))
             excess = sum(length for _, length, _ in files) + size - self.max_bytes
             for _, length, path in files:
                 if excess <= 0:
                     break
-                if _remove(path):
+                if self._remove(path):
                     excess -= length
             if excess <= 0:
                 os.truncate(descriptor, size)  # from now on, other processes count its size
             return excess <= 0
+
+    def _remove(self, path: Path) -> bool:
+        """Remove a file, unless a process is writing it. Return whether it was removed."""
+        lock = self._lock(path.name.removesuffix(_PART))
+        with suppress(Timeout), lock.acquire(blocking=False):
+            path.unlink(missing_ok=True)
+            with suppress(PermissionError):  # Windows keeps files that are open
+                Path(lock.lock_file).unlink(missing_ok=True)
+            return True
+        return False
 
 
 class CachedTree(Tree):
@@ -288,7 +304,7 @@ class CachedTree(Tree):
                 write_at(descriptor, data, start)
 
     def _key(self, path: str) -> str:
-        options = self.remote.requests.options
+        options = self.remote.client.options
         endpoint = (
             options.get("endpoint_url")
             or dict(options.get("client_kwargs") or {}).get("endpoint_url")
@@ -316,30 +332,6 @@ class _CacheFolder(LocalTree):
         return f"{self._named} (its copy {path})"
 
 
-@contextmanager
-def _locked(path: Path, wait: bool = True) -> Iterator[int | None]:
-    """Create and open a file, and hold its lock.
-
-    Yields None if another process holds the lock and `wait` is False.
-
-    The operating system releases the lock when a process ends for any reason. The lock is released
-    before the file is closed, because a forked process may have inherited the descriptor.
-    """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            yield None
-            return
-        try:
-            yield descriptor
-        finally:
-            fcntl.flock(descriptor, fcntl.LOCK_UN)
-    finally:
-        os.close(descriptor)
-
-
 def _size_of(name: str) -> int:
     """Return the size of a complete file, which is the end of its name."""
     return int(name.rpartition("-")[2])
@@ -356,35 +348,17 @@ def _is_whole(path: Path) -> bool:
         return False
 
 
-def _is_at(path: Path, descriptor: int) -> bool:
-    """Whether a path still refers to an open file."""
-    try:
-        return os.path.samestat(path.stat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
-
-
 def _files(folder: Path) -> Iterator[tuple[int, int, Path]]:
     """Yield the last use, the size and the path of each file in the cache."""
     for place in folder.iterdir():
+        if place.name == _LOCKS:
+            continue
         with suppress(FileNotFoundError, NotADirectoryError), os.scandir(place) as entries:
             for entry in entries:
                 with suppress(FileNotFoundError):  # renamed meanwhile
-                    found = entry.stat()
-                    if stat.S_ISREG(found.st_mode):
-                        yield found.st_atime_ns, found.st_size, Path(entry.path)
-
-
-def _remove(path: Path) -> bool:
-    """Remove a file, unless a process is writing it. Return whether it was removed."""
-    if path.suffix != _PART:
-        path.unlink(missing_ok=True)
-        return True
-    with _locked(path, wait=False) as descriptor:
-        if descriptor is None:
-            return False
-        path.unlink(missing_ok=True)
-        return True
+                    about = entry.stat()
+                    if stat.S_ISREG(about.st_mode):
+                        yield about.st_atime_ns, about.st_size, Path(entry.path)
 
 
 def _digest(text: str) -> str:

@@ -7,6 +7,7 @@ public classes for failed connections.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from typing import NoReturn
@@ -16,13 +17,6 @@ from carlasc.errors import CarlascError, MissingDataError, StorageError
 TEMPORARY: Mapping[str, tuple[str, ...]] = {
     "aiohttp": ("ClientConnectionError", "ClientPayloadError"),
     "aiohttp.http_exceptions": ("HttpProcessingError",),
-    "botocore.exceptions": (
-        "ConnectionError",
-        "HTTPClientError",
-        "FlexibleChecksumError",
-        "IncompleteReadError",
-    ),
-    "botocore.parsers": ("ResponseParserError",),
     "requests.exceptions": ("ConnectionError", "ChunkedEncodingError"),
     "http.client": ("IncompleteRead",),
     "httpx": ("TransportError",),
@@ -32,9 +26,11 @@ TEMPORARY: Mapping[str, tuple[str, ...]] = {
 
 # statuses below 500 after which a request may succeed later
 _BUSY = frozenset({408, 409, 425, 429})
-_BUSY_CODES = frozenset(
-    {"SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "OperationAborted"}
-)
+# of the messages of obstore, only these parts are read: they may hold a signature or a key
+_STATUS = re.compile(r"status code: ([0-9]{3})")
+_CODE = re.compile(r"<Code>(\w+)</Code>")
+# the address at which machines of a cloud ask for credentials
+_METADATA_SERVICE = "169.254.169.254"
 
 
 class WrongAnswerError(Exception):
@@ -47,11 +43,11 @@ def is_temporary(error: BaseException) -> bool:
         return False
     if _is_of_connection(error):
         return True
-    status, code = _status_and_code(error)
-    if code in _BUSY_CODES or status in _BUSY:
-        return True
+    status, _ = _status_and_code(error)
     if status is not None:
-        return status >= 500 and status != 501  # not implemented
+        return status in _BUSY or (status >= 500 and status != 501)  # 501: not implemented
+    if _is_of_obstore(error):
+        return type(error).__name__ == "GenericError" and not _lacks_credentials(error)
     return isinstance(error, WrongAnswerError | TimeoutError | ConnectionError)
 
 
@@ -60,13 +56,6 @@ def is_offline(error: BaseException) -> bool:
     set.
     """
     return type(error).__name__ == "OfflineModeIsEnabled"
-
-
-def exists_error(error: object) -> bool:
-    """Whether a create-only put failed because the file exists."""
-    return isinstance(error, FileExistsError) or (
-        isinstance(error, BaseException) and _status_and_code(error)[0] == 412
-    )
 
 
 def ends_before(error: BaseException) -> bool:
@@ -109,18 +98,24 @@ def fail(where: str, error: BaseException, *, writing: bool = False) -> NoReturn
         ) from None
     if isinstance(error, FileNotFoundError) and not writing:
         raise MissingDataError(where, expected="a file", found="nothing") from None
-    if isinstance(error, PermissionError) or status in (401, 403):
-        raise kind(
-            where,
-            problem=f"{verb}: access was refused ({code or status or 'no permission'})",
-            advice="check the credentials and their permissions",
-        ) from None
-    if "Credential" in type(error).__name__:
+    if _lacks_credentials(error):
         raise kind(
             where,
             problem=f"{verb}: no credentials were found",
             advice="set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or FSSPEC_S3_ANON=true for a "
             "public bucket",
+        ) from None
+    if "incorrectly configured region" in str(error):
+        raise kind(
+            where,
+            problem=f"{verb}: the bucket is in another region",
+            advice="set AWS_REGION to the region of the bucket",
+        ) from None
+    if isinstance(error, PermissionError) or status in (401, 403):
+        raise kind(
+            where,
+            problem=f"{verb}: access was refused ({code or status or 'no permission'})",
+            advice="check the credentials and their permissions",
         ) from None
     if is_offline(error):
         raise kind(
@@ -143,6 +138,8 @@ def describe_failure(error: BaseException) -> str:
     status, code = _status_and_code(error)
     if isinstance(error, WrongAnswerError):
         return str(error)
+    if _is_of_obstore(error) and status is None:
+        return "no answer, or one that does not fit the request"
     parts = [str(status) if status else "", code if code != str(status) else ""]
     if text := " ".join(part for part in parts if part):
         return text
@@ -153,6 +150,14 @@ def describe_failure(error: BaseException) -> str:
         if isinstance(reason, str) and type(error).__module__ == "builtins"
         else name
     )
+
+
+def _is_of_obstore(error: BaseException) -> bool:
+    return type(error).__module__ == "obstore.exceptions"
+
+
+def _lacks_credentials(error: BaseException) -> bool:
+    return _METADATA_SERVICE in str(error)
 
 
 def _is_of_connection(error: BaseException) -> bool:
@@ -169,12 +174,12 @@ def _is_of_connection(error: BaseException) -> bool:
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
-    found: BaseException | None = error
+    cause: BaseException | None = error
     for _ in range(5):
-        if found is None:
+        if cause is None:
             return
-        yield found
-        found = found.__cause__
+        yield cause
+        cause = cause.__cause__
 
 
 def _status_and_code(error: BaseException) -> tuple[int | None, str]:
@@ -183,13 +188,12 @@ def _status_and_code(error: BaseException) -> tuple[int | None, str]:
     """
     # payload errors of aiohttp have another "code"
     for cause in () if _is_of_connection(error) else _causes(error):
+        if match := _STATUS.search(str(cause)):  # obstore; its missing objects are not its errors
+            code = _CODE.search(str(cause))
+            return int(match[1]), code[1] if code else ""
         answer = getattr(cause, "response", None)
-        if isinstance(answer, Mapping):  # botocore
-            status = answer.get("ResponseMetadata", {}).get("HTTPStatusCode")
-            code = str(answer.get("Error", {}).get("Code", ""))
-            return (status if isinstance(status, int) else None), code
         for holder, name in ((cause, "status"), (cause, "code"), (answer, "status_code")):
-            found = getattr(holder, name, None)
-            if isinstance(found, int) and 100 <= found < 600:
-                return found, ""
+            status = getattr(holder, name, None)
+            if isinstance(status, int) and 100 <= status < 600:
+                return status, ""
     return None, ""

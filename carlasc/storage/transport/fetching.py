@@ -8,6 +8,7 @@ its final name when it is complete.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import threading
@@ -15,7 +16,8 @@ import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -42,7 +44,8 @@ from carlasc.storage.transport.failures import (
     fail,
     is_temporary,
 )
-from carlasc.storage.transport.requests import HttpAnswer, Requests
+from carlasc.storage.transport.requests import persist
+from carlasc.storage.transport.web import HttpAnswer, WebClient
 
 _ZIP = b"PK"
 _GONE = (401, 403, 404, 410)
@@ -54,11 +57,9 @@ _Result = TypeVar("_Result")
 
 
 class _ChangedError(Exception):
-    """The file on the server has changed since the transfer began."""
-
-
-class _RangeIgnoredError(Exception):
-    """The server sent the whole file instead of the requested range."""
+    """The file on the server is not the one of which the transfer began, or it came whole where a
+    range was requested.
+    """
 
 
 @dataclass(frozen=True)
@@ -75,20 +76,6 @@ class ServedFile:
     size: int | None
     validator: str | None
     ranges: bool
-
-
-@dataclass
-class _Arrived:
-    """The number of fetched bytes of each block in the .part file, counted from the start of the
-    block.
-    """
-
-    block: int
-    got: dict[int, int] = field(default_factory=dict)
-
-    @property
-    def total(self) -> int:
-        return sum(self.got.values())
 
 
 class FileFetch:
@@ -109,12 +96,7 @@ class FileFetch:
         Raises:
             CarlascError: the server cannot be reached, or the file does not exist or is not a zip.
         """
-        self._url, self._where, self._path, self._connections = (
-            url,
-            without_credentials(url),
-            path,
-            connections,
-        )
+        self._where, self._path, self._connections = without_credentials(url), path, connections
         self._part, self._record = (
             path.with_name(f"{path.name}{end}") for end in (".part", ".part.json")
         )
@@ -124,12 +106,12 @@ class FileFetch:
                 expected="a URL that begins with http:// or https://",
                 found="another URL",
             )
-        self._requests = Requests(url)
+        self._client = WebClient(url, {})
         self.file = self._persist(self._probe)
 
     def remaining(self) -> int:
         """Return how many bytes are left to fetch after an earlier run."""
-        return (self.file.size or 0) - self._load().total
+        return (self.file.size or 0) - sum(self._load().values())
 
     def run(self, advance: Callable[[int], None], most: float) -> int:
         """Fetch the file, continuing an earlier run.
@@ -148,27 +130,20 @@ class FileFetch:
             StorageError: the disk is full or fails.
         """
         for _ in range(_RESTARTS):
-            arrived = self._load()
-            resumed = arrived.total
+            got = self._load()
+            resumed = sum(got.values())
             advance(resumed)
             try:
-                if self.file.ranges and self.file.size:
-                    self._fetch_blocks(arrived, self.file.size, advance)
-                else:
-                    self._fetch_stream(arrived, advance, most)
-                self._finish(arrived)
+                self._fetch(got, advance, most)
+                self._finish(sum(got.values()))
                 return resumed
             except OSError as error:
                 raise storage_error(self._path, error) from error
-            except (_ChangedError, _RangeIgnoredError) as error:
-                advance(-arrived.total)
+            except _ChangedError:
+                advance(-sum(got.values()))
                 self._part.unlink(missing_ok=True)
                 self._record.unlink(missing_ok=True)
-                # otherwise the server wrongly announced range requests
-                changed = isinstance(error, _ChangedError)
-                self.file = (
-                    self._persist(self._probe) if changed else replace(self.file, ranges=False)
-                )
+                self.file = self._persist(self._probe)
         raise FormatError(
             self._where,
             expected="a file that does not change",
@@ -185,35 +160,54 @@ class FileFetch:
         with writing(self._record):
             remove_file(self._record)
 
-    def _fetch_blocks(self, arrived: _Arrived, size: int, advance: Callable[[int], None]) -> None:
-        stop, lock = threading.Event(), threading.Lock()
-        descriptor = os.open(self._part, os.O_RDWR | os.O_CREAT, 0o666)
+    def _fetch(self, got: dict[int, int], advance: Callable[[int], None], most: float) -> None:
+        """Fetch the missing bytes of all blocks.
+
+        Args:
+            got: the number of fetched bytes of each block, counted from its start; updated.
+            advance: called with the number of new bytes.
+            most: maximum size in bytes, if the server does not report the size.
+        """
+        stop, lock, size = threading.Event(), threading.Lock(), self.file.size
+        blocks = range(math.ceil((size or 0) / _BLOCK)) if self.file.ranges else range(1)
+        descriptor = os.open(self._part, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         executor = ThreadPoolExecutor(self._connections, thread_name_prefix="download")
 
-        def fetch(index: int, end: int) -> None:
-            def one_try() -> None:
-                start = index * arrived.block + arrived.got.get(index, 0)
-                for data in self._range(start, end):
-                    write_at(descriptor, data, start)
-                    start += len(data)
-                    with lock:
-                        arrived.got[index] = arrived.got.get(index, 0) + len(data)
-                        advance(len(data))
-                    if stop.is_set():
-                        return
+        def one_try(block: int) -> None:
+            if not self.file.ranges:  # each attempt starts at the first byte
+                advance(-got.pop(block, 0))
+                os.ftruncate(descriptor, 0)
+            place = block * _BLOCK + got.get(block, 0)
+            for data in self._body(place, min((block + 1) * _BLOCK, size or 0)):
+                write_at(descriptor, data, place)
+                place += len(data)
+                with lock:
+                    got[block] = got.get(block, 0) + len(data)
+                    advance(len(data))
+                if stop.is_set():
+                    return
+                if size is None and place > most:
+                    raise FormatError(
+                        self._where, expected=f"at most {most:.0f} bytes", found="more"
+                    )
 
-            self._persist(one_try, lambda: arrived.got.get(index, 0), stop)
+        def fetch(block: int) -> None:
+            # a stream begins again at each attempt: what arrived of it is no progress
+            self._persist(
+                partial(one_try, block),
+                lambda: got.get(block, 0) if self.file.ranges else 0,
+                stop,
+            )
             with lock:
-                self._save(arrived, descriptor)
+                self._save(got, descriptor)
 
         try:
-            os.ftruncate(descriptor, size)
-            ends = [min(start + arrived.block, size) for start in range(0, size, arrived.block)]
+            os.ftruncate(descriptor, size or 0)
             with postponed_interrupts():
                 futures = [
-                    executor.submit(fetch, index, end)
-                    for index, end in enumerate(ends)
-                    if index * arrived.block + arrived.got.get(index, 0) < end
+                    executor.submit(fetch, block)
+                    for block in blocks
+                    if size is None or got.get(block, 0) < min(_BLOCK, size - block * _BLOCK)
                 ]
             done, _ = wait(futures, return_when=FIRST_EXCEPTION)
             for future in done:
@@ -224,29 +218,9 @@ class FileFetch:
             stop.set()
             executor.shutdown(wait=True, cancel_futures=True)
             try:
-                self._save(arrived, descriptor)
+                self._save(got, descriptor)
             finally:
                 os.close(descriptor)
-
-    def _fetch_stream(self, arrived: _Arrived, advance: Callable[[int], None], most: float) -> None:
-        """Fetch from a server without range requests. Each attempt starts at the first byte."""
-
-        def one_try() -> None:
-            advance(-arrived.total)
-            arrived.got.clear()
-            with self._answer({}) as answer, self._part.open("wb") as file:
-                if (self.file.validator, self.file.size) != (_validator(answer), _length(answer)):
-                    raise _ChangedError
-                for data in _exactly(answer, self.file.size):
-                    file.write(data)
-                    arrived.got[0] = arrived.got.get(0, 0) + len(data)
-                    advance(len(data))
-                    if arrived.total > most:
-                        raise FormatError(
-                            self._where, expected=f"at most {most:.0f} bytes", found="more"
-                        )
-
-        self._persist(one_try)
 
     def _probe(self) -> ServedFile:
         """Request the first bytes, to find the size, whether ranges are supported, and whether it
@@ -266,36 +240,41 @@ class FileFetch:
                 _total(answer) if ranges else _length(answer), _validator(answer), ranges
             )
 
-    def _range(self, start: int, end: int) -> Iterator[bytes]:
-        """Yield the bytes [start, end) in pieces.
+    def _body(self, start: int, end: int) -> Iterator[bytes]:
+        """Yield the bytes [start, end) in pieces; the whole file if the server has no ranges.
 
         Checks that all headers of the answer fit the request.
         """
-        file, headers = self.file, {"Range": f"bytes={start}-{end - 1}"}
-        if file.validator is not None and not file.validator.startswith("W/"):
+        file, count = self.file, self.file.size
+        headers = {"Range": f"bytes={start}-{end - 1}"} if file.ranges else {}
+        if file.ranges and file.validator is not None and not file.validator.startswith("W/"):
             headers["If-Range"] = file.validator
         with self._answer(headers) as answer:
             if file.validator is not None and _validator(answer) not in (file.validator, None):
                 raise _ChangedError
-            if answer.status != _PARTIAL:
-                raise _RangeIgnoredError
-            if _total(answer) != file.size:
-                raise _ChangedError
-            expected, found = (
-                f"bytes {start}-{end - 1}/{file.size}",
-                answer.headers.get("Content-Range", ""),
-            )
-            if found != expected:
-                raise WrongAnswerError(f"expected {expected}, found {found}")
-            if _length(answer) not in (None, end - start):
+            if file.ranges:
+                if answer.status != _PARTIAL or _total(answer) != file.size:
+                    raise _ChangedError
+                count, expected = end - start, f"bytes {start}-{end - 1}/{file.size}"
+                if (header := answer.headers.get("Content-Range", "")) != expected:
+                    raise WrongAnswerError(f"expected {expected}, found {header}")
+            if _length(answer) not in (None, count):
+                if not file.ranges:
+                    raise _ChangedError
                 raise WrongAnswerError(
-                    f"expected {end - start} bytes, found a Content-Length of {_length(answer)}"
+                    f"expected {count} bytes, found a Content-Length of {_length(answer)}"
                 )
-            yield from _exactly(answer, end - start)
+            left = count
+            for data in answer.pieces():  # what follows the expected bytes is not read
+                yield data if left is None else data[:left]
+                if left is not None and (left := max(0, left - len(data))) == 0:
+                    return
+            if left:
+                raise WrongAnswerError(f"the connection ended {left} bytes early")
 
     @contextmanager
     def _answer(self, headers: dict[str, str]) -> Iterator[HttpAnswer]:
-        with self._requests.answer(headers) as answer:
+        with self._client.answer(headers) as answer:
             if answer.status in _GONE:
                 raise MissingDataError(
                     self._where,
@@ -317,15 +296,15 @@ class FileFetch:
         If all attempts fail, raise a one-line error about the last failure.
         """
         try:
-            return self._requests.persist(work, count, stop)
-        except (CarlascError, _ChangedError, _RangeIgnoredError):
+            return persist(work, self._client.settings, count, stop)
+        except (CarlascError, _ChangedError):
             raise
         except Exception as error:
             if is_temporary(error):
                 raise CarlascError(
                     self._where,
                     expected="data",
-                    found=f"none in {self._requests.settings.attempts} attempts "
+                    found=f"none in {self._client.settings.attempts} attempts "
                     f"({describe_failure(error)})",
                     advice="run the same command again to continue",
                 ) from None
@@ -333,47 +312,40 @@ class FileFetch:
                 raise  # of the disk
             fail(self._where, error)
 
-    def _load(self) -> _Arrived:
-        """Return the blocks that an earlier run fetched of the same file; empty if the file has
-        changed.
+    @property
+    def _about(self) -> dict[str, object]:
+        """What must be equal for a transfer to be continued."""
+        about = {"url": self._where, "size": self.file.size, "validator": self.file.validator}
+        return {**about, "block": _BLOCK}
+
+    def _load(self) -> dict[int, int]:
+        """Return the number of bytes of each block that an earlier run fetched of the same file;
+        empty if the file has changed, or may have.
         """
-        fresh, file = _Arrived(_BLOCK), self.file
-        if not (self._part.is_file() and self._record.is_file() and file.ranges):
-            return fresh
+        # Without a validator, an equal size does not prove that it is the same file.
+        if not self.file.ranges or self.file.validator is None:
+            return {}
         try:
             values = parse_json(self._record.read_bytes(), str(self._record))
-            arrived = _Arrived(
-                int(values["block"]), {int(k): int(v) for k, v in values["got"].items()}
-            )
-            same = (values["url"], values["size"], values["validator"]) == (
-                self._where,
-                file.size,
-                file.validator,
-            )
-        except (FormatError, KeyError, TypeError, ValueError, AttributeError):
-            return fresh
-        same = same and arrived.block > 0
-        # Without a validator, an equal size does not prove that it is the same file.
-        return (
-            arrived
-            if same and file.validator is not None and self._part.stat().st_size == file.size
-            else fresh
-        )
+            got = {int(block): int(count) for block, count in values.pop("got").items()}
+            same = values == self._about and self._part.stat().st_size == self.file.size
+        except (FormatError, FileNotFoundError, KeyError, TypeError, ValueError, AttributeError):
+            return {}
+        return got if same else {}
 
-    def _save(self, arrived: _Arrived, descriptor: int) -> None:
+    def _save(self, got: dict[int, int], descriptor: int) -> None:
         """Record the fetched bytes, after syncing them to the disk."""
         sync_file(descriptor)
-        got = {str(index): count for index, count in sorted(arrived.got.items())}
-        about = {"url": self._where, "size": self.file.size, "validator": self.file.validator}
-        write_json(self._record, {**about, "block": arrived.block, "got": got})
+        counts = {str(block): count for block, count in sorted(got.items())}
+        write_json(self._record, {**self._about, "got": counts})
 
-    def _finish(self, arrived: _Arrived) -> None:
+    def _finish(self, total: int) -> None:
         """Rename the file if it is complete: it has all bytes, and the central directory at the end
         of a zip.
         """
         size, expected = self._part.stat().st_size, self.file.size
-        if expected is not None and (arrived.total != expected or size != expected):
-            found = str(min(size, arrived.total))
+        if expected is not None and (total != expected or size != expected):
+            found = str(min(size, total))
             raise FormatError(
                 self._path,
                 expected=f"{expected} bytes",
@@ -389,20 +361,6 @@ class FileFetch:
             sync_file(file.fileno())
         rename(self._part, self._path)
         self.discard_record()
-
-
-def _exactly(answer: HttpAnswer, count: int | None) -> Iterator[bytes]:
-    """Yield the body of an answer, and check that it has `count` bytes, if given.
-
-    Further bytes are not read.
-    """
-    left = count
-    for data in answer.pieces():
-        yield data if left is None else data[:left]
-        if left is not None and (left := max(0, left - len(data))) == 0:
-            return
-    if left:
-        raise WrongAnswerError(f"the connection ended {left} bytes early")
 
 
 def _validator(answer: HttpAnswer) -> str | None:

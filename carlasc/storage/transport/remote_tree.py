@@ -7,37 +7,39 @@ import io
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from carlasc.errors import CarlascError, MissingDataError, without_credentials
-from carlasc.storage.transport.failures import WrongAnswerError, bucket_is_missing, fail
-from carlasc.storage.transport.requests import Request, Requests
-from carlasc.storage.transport.servers import check_size
+from carlasc.storage.transport.clients import HUB, Client, FileSystemClient, HubClient
+from carlasc.storage.transport.failures import WrongAnswerError, fail
+from carlasc.storage.transport.object_stores import SCHEMES, ObjectStoreClient
+from carlasc.storage.transport.requests import send
 from carlasc.storage.transport.trees import LocalTree, Tree, check_length, is_url
+from carlasc.storage.transport.web import WebClient
 
 _BLOCK = 1 << 18  # bytes per block of a remote file
 _KEPT = 64  # blocks
 
-# Names that file systems use for a digest of the content, or the time of the last change.
-_CHANGES = (
-    "ETag",
-    "etag",
-    "Content-MD5",
-    "Digest",
-    "md5Hash",
-    "Last-Modified",
-    "LastModified",
-    "last_modified",
-    "mtime",
-    "created",
-    "blob_id",
-)
+_Answer = TypeVar("_Answer")
+
+
+def _client(url: str, options: Mapping[str, Any]) -> Client:
+    scheme = url.partition("://")[0]
+    if scheme in SCHEMES:
+        return ObjectStoreClient(url, options)
+    if scheme in ("http", "https"):
+        return WebClient(url, options)
+    return (HubClient if scheme == HUB else FileSystemClient)(url, options)
 
 
 class RemoteTree(Tree):
-    """A folder, or a single file (path ""), at any URL that fsspec supports: http, s3, memory, ...
+    """A folder, or a single file (path ""), at any URL: object stores, http, and all others that
+    fsspec supports.
 
     A folder is listed once. `size`, `read` and `paths` send a request each time.
+
+    Attributes:
+        client: sends the requests.
     """
 
     def __init__(self, url: str, options: Mapping[str, Any] | None = None) -> None:
@@ -53,7 +55,7 @@ class RemoteTree(Tree):
             mark + query,
         )
         self.location = without_credentials(self._base)
-        self.requests = Requests(url.rstrip("/"), options)
+        self.client = _client(url.rstrip("/"), options or {})
         self._listed: dict[str, dict[str, bool]] = {}
         self._sizes: dict[str, int] = {}  # sizes of files in listed folders
 
@@ -76,34 +78,21 @@ class RemoteTree(Tree):
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the folder, once."""
         if folder not in self._listed:
-            url = self.url(folder)
-            if url.startswith("http") and not self._query:
-                url += "/"
-            (found,) = self.requests.send([Request("ls", url, {"detail": True})])
-            if isinstance(found, FileNotFoundError | NotADirectoryError) and not bucket_is_missing(
-                found
-            ):
-                found = []
-            elif isinstance(found, Exception):
-                fail(self.where(folder), found)
-            listed, own = {}, self._own_name(folder)
-            for entry in found:
-                name = str(entry["name"])
-                folder_like = entry["type"] == "directory" or name.endswith("/")
-                base = name.rstrip("/").rpartition("/")[2]
-                if base and name.strip("/") != own and "?" not in base:
-                    listed[base] = folder_like
-                    if not folder_like and isinstance(entry.get("size"), int):
-                        self._sizes[f"{folder}/{base}" if folder else base] = entry["size"]
+            listed: dict[str, bool] = {}
+            for name, size in self._ask(folder, self.client.entries, self.url(folder)).items():
+                base = name.rstrip("/")
+                listed[base] = name != base
+                if size is not None:
+                    self._sizes[f"{folder}/{base}" if folder else base] = size
             self._listed[folder] = listed
         return self._listed[folder]
 
-    def _own_name(self, folder: str) -> str:
-        """Return the name of the folder itself in its listing: object stores list it among its
-        files.
-        """
-        place = f"{self._base}/{folder}" if folder else self._base
-        return (place if place.startswith("http") else self.requests.path_of(place)).strip("/")
+    def _ask(self, path: str, function: Callable[..., _Answer], *arguments: Any) -> _Answer:
+        """Send one request. An error names the path."""
+        (answer,) = send([partial(function, *arguments)], self.client.settings)
+        if isinstance(answer, Exception):
+            fail(self.where(path), answer)
+        return answer
 
     def refresh(self) -> None:
         """Discard cached listings, because other processes may have written files."""
@@ -142,18 +131,8 @@ class RemoteTree(Tree):
 
     def sizes(self, folder: str = "") -> dict[str, int]:
         """Return the sizes of all files below a folder, or of the file itself, by path."""
-        (found,) = self.requests.send([Request("find", self.url(folder), {"detail": True})])
-        if isinstance(found, FileNotFoundError) and not bucket_is_missing(found):
-            return {}
-        if isinstance(found, Exception):
-            fail(self.where(folder), found)
-        root = self.requests.path_of(self._base).rstrip("/") + "/"
-        sizes = {}
-        for name, about in found.items():
-            place = name if name.startswith("/") == root.startswith("/") else f"/{name}"
-            if place.startswith(root) and not place.endswith("/"):
-                sizes[place.removeprefix(root)] = about["size"]
-        return sizes
+        files = self._ask(folder, self.client.files, self.url(folder))
+        return {"/".join(filter(None, (folder, name))): size for name, size in files.items()}
 
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Fetch the file."""
@@ -161,31 +140,39 @@ class RemoteTree(Tree):
 
     def read_range(self, path: str, start: int, end: int) -> bytes:
         """Fetch the range."""
-        return self.read_ranges([(path, start, end)])[0]
+        return bytes(self.read_ranges([(path, start, end)])[0])
 
     def read_many(self, paths: Sequence[str], size: int | None = None) -> list[bytes | memoryview]:
         """Fetch the files, several at a time.
 
         Their lengths are checked if their folder has been listed.
         """
-        requests = [Request("get", self.url(path), {}, self._length_check(path)) for path in paths]
-        answers = self.requests.send(requests)
-        for place, (path, answer) in enumerate(zip(paths, answers, strict=True)):
-            # the file may have been replaced since the listing
-            if isinstance(answer, WrongAnswerError):
+        answers: dict[str, bytes | Exception] = {}
+        missing = list(paths)
+        for _ in range(2):
+            asked = [partial(self._get, path) for path in missing]
+            answers |= zip(missing, send(asked, self.client.settings), strict=True)
+            missing = [path for path in missing if isinstance(answers[path], WrongAnswerError)]
+            for path in missing:  # the files may have been replaced since the listing
                 self._sizes[path] = self._size(path)
-                (answers[place],) = self.requests.send(
-                    [Request("get", self.url(path), {}, self._length_check(path))]
-                )
-            if isinstance(answers[place], Exception):
-                fail(self.where(path), answers[place])
-        return [bytes(data) for data in answers]
+        return [self._data(path, answers[path]) for path in paths]
 
-    def _length_check(self, path: str) -> Callable[[bytes], None] | None:
-        expected = self._sizes.get(path)
-        return None if expected is None else partial(check_size, expected)
+    def _get(
+        self, path: str, start: int | None = None, end: int | None = None, size: int | None = None
+    ) -> bytes:
+        """Send one request, and check the length of the answer, if it is known."""
+        data = self.client.get(self.url(path), start, end)
+        expected = self._sizes.get(path) if start is None else size
+        if expected is not None and len(data) != expected:
+            raise WrongAnswerError(f"{len(data)} bytes instead of {expected}")
+        return data
 
-    def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes]:  # type: ignore[override]
+    def _data(self, path: str, answer: bytes | Exception) -> bytes:
+        if isinstance(answer, Exception):
+            fail(self.where(path), answer)
+        return answer
+
+    def read_ranges(self, ranges: Sequence[tuple[str, int, int]]) -> list[bytes | memoryview]:
         """Fetch the ranges, several at a time."""
         sizes = {
             path: self._size(path) for path in {path for path, start, _ in ranges if start < 0}
@@ -194,29 +181,19 @@ class RemoteTree(Tree):
             (p, max(0, sizes[p] + s), sizes[p] + e) if s < 0 else (p, s, e) for p, s, e in ranges
         ]
         asked = [part for part in wanted if part[1] < part[2]]
-        answers = iter(
-            self.requests.send(
-                [Request("get", self.url(p), {"start": s, "end": e}) for p, s, e in asked]
-            )
-        )
+        answers = iter(send([partial(self._get, *part) for part in asked], self.client.settings))
         return [self._checked(part, next(answers)) if part[1] < part[2] else b"" for part in wanted]
 
-    def _checked(self, part: tuple[str, int, int], answer: Any) -> bytes:
+    def _checked(self, part: tuple[str, int, int], answer: bytes | Exception) -> bytes:
         """Return an answer of the right length.
 
         After a short answer the request is sent again, unless the file ends there.
         """
         path, start, end = part
-        if isinstance(answer, Exception):
-            fail(self.where(path), answer)
-        if len(answer) != end - start and self._size(path) >= end:
-            check = partial(check_size, end - start)
-            (answer,) = self.requests.send(
-                [Request("get", self.url(path), {"start": start, "end": end}, check)]
-            )
-            if isinstance(answer, Exception):
-                fail(self.where(path), answer)
-        return check_length(bytes(answer), end - start, self.where(path))
+        data = self._data(path, answer)
+        if len(data) != end - start and self._size(path) >= end:
+            data = self._ask(path, self._get, *part, end - start)
+        return check_length(data, end - start, self.where(path))
 
     def open(self, path: str) -> Any:
         """Open a file as a file object, which fetches blocks on demand.
@@ -229,8 +206,8 @@ class RemoteTree(Tree):
         """Return a file's size in bytes; None if it does not exist or is a folder (or a page that
         lists one).
         """
-        found = self._about(path)
-        return None if found is None else found["size"]
+        about = self._ask(path, self.client.about, self.url(path))
+        return None if about is None else about[0]
 
     def version(self, path: str) -> tuple[int, str]:
         """Return the size of a file in bytes, and a text that changes with the file, if the server
@@ -241,31 +218,13 @@ class RemoteTree(Tree):
         Raises:
             MissingDataError: the file does not exist.
         """
-        self.requests.fs.invalidate_cache(self.url(path))
-        found = self._about(path)
-        if found is None:
+        about = self._ask(path, self.client.about, self.url(path))
+        if about is None:
             raise MissingDataError(self.where(path), expected="a file", found="nothing")
-        return found["size"], " ".join(str(found[name]) for name in _CHANGES if found.get(name))
-
-    def _about(self, path: str) -> dict[str, Any] | None:
-        """Return the fsspec info of a file; None if it does not exist or is a folder (or a page
-        that lists one).
-        """
-        (found,) = self.requests.send([Request("info", self.url(path))])
-        if isinstance(found, FileNotFoundError | IsADirectoryError) and not bucket_is_missing(
-            found
-        ):
-            return None
-        if isinstance(found, Exception):
-            fail(self.where(path), found)
-        folder = found.get("type") == "directory" or found.get("mimetype") == "text/html"
-        return None if folder else found
+        return about
 
     def _size(self, path: str) -> int:
-        size = self.size(path)
-        if size is None:
-            raise MissingDataError(self.where(path), expected="a file", found="nothing")
-        return size
+        return self.version(path)[0]
 
     def check_ranges(self, path: str = "") -> None:
         """Request one byte to check for range requests: without them, each read would transfer the
@@ -276,9 +235,7 @@ class RemoteTree(Tree):
         """
         if not self._base.startswith("http"):
             return
-        (answer,) = self.requests.send(
-            [Request("get", self.url(path), {"start": 0, "end": 1})], attempts=2
-        )
+        (answer,) = send([partial(self._get, path, 0, 1)], self.client.settings, attempts=2)
         if isinstance(answer, WrongAnswerError):
             raise CarlascError(
                 self.where(path),
@@ -286,8 +243,7 @@ class RemoteTree(Tree):
                 found="a server without them",
                 advice="download the file first",
             )
-        if isinstance(answer, Exception):
-            fail(self.where(path), answer)
+        self._data(path, answer)
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_listed": {}, "_sizes": {}}  # a worker process lists folders again

@@ -10,22 +10,19 @@ import os
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.running.spreading import Run
 from carlasc.storage.files import leads_outside, write_atomic, write_many
-from carlasc.storage.transport.failures import exists_error, fail
+from carlasc.storage.transport.clients import HUB
+from carlasc.storage.transport.failures import fail
 from carlasc.storage.transport.remote_tree import RemoteTree
-from carlasc.storage.transport.requests import Request
-from carlasc.storage.transport.servers import HUB
+from carlasc.storage.transport.requests import send
 from carlasc.storage.transport.trees import LocalTree, Tree, is_url
 
-# schemes of file systems with a create-only put
-_EXCLUSIVE = frozenset({"s3", "s3a", "gs", "gcs", "memory"})
-_MARK = "carlasc-writer"
 _MOST_REMOVED = 1000  # objects in one request: the limit of S3
 
 
@@ -152,8 +149,8 @@ class RemoteTarget(Target):
     Folders need not be created.
 
     Attributes:
-        exclusive: whether the store has a create-only put, as S3 ("If-None-Match: *") and Google
-            Cloud Storage do. In other stores, `put` with `create` first checks whether the file
+        exclusive: whether the store has a create-only put, as S3 ("If-None-Match: *"), Google
+            Cloud Storage and Azure do. In others, `put` with `create` first checks whether the file
             exists, so that two processes may both succeed.
     """
 
@@ -168,21 +165,17 @@ class RemoteTarget(Target):
         """
         self.tree = RemoteTree(url, options)
         self.location = self.tree.location
-        if url.startswith("http"):
+        readable = {"http": "a web server, which can only be read"}
+        readable["https"] = readable["http"]
+        readable[HUB] = "the Hugging Face Hub, where each file would be a commit"
+        if found := readable.get(self.tree.client.scheme):
             raise ArgumentError(
                 self.location,
                 expected="a folder, or a URL of an object store",
-                found="a web server, which can only be read",
-                advice="write to a local folder, then upload it",
+                found=found,
+                advice="write to a local folder, then upload it (Hub: `hf upload-large-folder`)",
             )
-        if self.tree.requests.scheme == HUB:
-            raise ArgumentError(
-                self.location,
-                expected="a folder, or a URL of an object store",
-                found="the Hugging Face Hub, where each file would be a commit",
-                advice="write to a local folder, then upload it with `hf upload-large-folder`",
-            )
-        self.exclusive = url.partition("://")[0] in _EXCLUSIVE
+        self.exclusive = self.tree.client.exclusive
 
     def below(self, folder: str) -> RemoteTarget:
         """Return a folder in this one."""
@@ -192,45 +185,18 @@ class RemoteTarget(Target):
         return target
 
     def put(self, path: str, data: bytes | memoryview, *, create: bool = False) -> bool:
-        """Write an object with one request.
-
-        If the answer to a create-only put is lost, the put is sent again and finds its own object.
-        In S3, a mark in the object identifies its writer; in other stores, such a put is reported
-        as if the file had existed.
-        """
-        request = self._request(path, data)
-        if create and not self.exclusive and self.tree.size(path) is not None:
+        """Write an object with one request."""
+        mark = os.urandom(16).hex() if create else None
+        try:
+            self._put({path: data}, mark)
+        except FileExistsError:
             return False
-        if not (create and self.exclusive):
-            self._send({path: data}, [request])
-            return True
-        mark = os.urandom(16).hex()
-        options = {"mode": "create"} | (
-            {"Metadata": {_MARK: mark}} if self.tree.requests.is_s3 else {}
-        )
-        (answer,) = self.tree.requests.send([replace(request, options=options)])
-        if isinstance(answer, Exception):
-            if not exists_error(answer):
-                fail(self.tree.where(path), answer, writing=True)
-            if not self._has_mark(path, mark):
-                return False
-        self.tree.note(path, len(data))
         return True
-
-    def _has_mark(self, path: str, mark: str) -> bool:
-        if not self.tree.requests.is_s3:
-            return False
-        (found,) = self.tree.requests.send([Request("metadata", self.tree.url(path))])
-        if isinstance(found, FileNotFoundError):
-            return False  # it was removed meanwhile
-        if isinstance(found, Exception):
-            fail(self.tree.where(path), found, writing=True)
-        return found.get(_MARK) == mark
 
     def put_many(self, *groups: Mapping[str, bytes | memoryview]) -> None:
         """Write the objects of each group in parallel."""
         for group in groups:
-            self._send(group, [self._request(path, data) for path, data in group.items()])
+            self._put(group)
 
     def paths(self, folder: str = "") -> Iterator[str]:
         """List all objects below the folder, 1000 per request."""
@@ -242,27 +208,24 @@ class RemoteTarget(Target):
 
     def remove_many(self, paths: Iterable[str]) -> None:
         """Remove objects, in S3 1000 per request. Missing objects are ignored."""
-        found = [self._checked(path) for path in paths]
-        urls = [self.tree.url(name) for name in found]
-        if self.tree.requests.is_s3:
-            batches = [
-                urls[start : start + _MOST_REMOVED] for start in range(0, len(urls), _MOST_REMOVED)
-            ]
-            requests = [Request("rm", batch) for batch in batches]
-        else:
-            requests = [Request("rm_file", url) for url in urls]
-        for answer in self.tree.requests.send(requests):
-            if isinstance(answer, Exception) and not isinstance(answer, FileNotFoundError):
+        names = [self._checked(path) for path in paths]
+        client, urls = self.tree.client, [self.tree.url(name) for name in names]
+        batches = [urls[i : i + _MOST_REMOVED] for i in range(0, len(urls), _MOST_REMOVED)]
+        for answer in send([partial(client.remove, batch) for batch in batches], client.settings):
+            if isinstance(answer, Exception):
                 fail(self.location, answer, writing=True)
-        for name in found:
+        for name in names:
             self.tree.note(name, None)
 
-    def _request(self, path: str, data: bytes | memoryview) -> Request:
-        return Request("pipe_file", self.tree.url(self._checked(path)), data=bytes(data))
-
-    def _send(self, files: Mapping[str, bytes | memoryview], requests: list[Request]) -> None:
-        answers = self.tree.requests.send(requests)
-        for path, answer in zip(files, answers, strict=True):
+    def _put(self, files: Mapping[str, bytes | memoryview], mark: str | None = None) -> None:
+        client = self.tree.client
+        puts = [
+            partial(client.put, self.tree.url(self._checked(path)), bytes(data), mark)
+            for path, data in files.items()
+        ]
+        for path, answer in zip(files, send(puts, client.settings), strict=True):
+            if isinstance(answer, FileExistsError):
+                raise answer
             if isinstance(answer, Exception):
                 fail(self.tree.where(path), answer, writing=True)
         for path, data in files.items():

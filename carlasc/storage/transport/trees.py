@@ -17,6 +17,8 @@ from carlasc.errors import CarlascError, FormatError, MissingDataError
 
 # Minimum size of mapped ranges. Reading the megabyte of a scan is faster than mapping its pages.
 _MAPPED = 1 << 22
+# Opening a pipe would hang without a writer; Windows would change the ends of lines.
+_READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 class Tree(ABC):
@@ -104,8 +106,8 @@ class LocalTree(Tree):
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """List the folder."""
         try:
-            with os.scandir(self.root / folder) as found:
-                return {entry.name: entry.is_dir() for entry in found}
+            with os.scandir(self.root / folder) as entries:
+                return {entry.name: entry.is_dir() for entry in entries}
         except (FileNotFoundError, NotADirectoryError):
             return {}
         except OSError as error:
@@ -120,12 +122,12 @@ class LocalTree(Tree):
     def read(self, path: str, size: int | None = None) -> bytes | memoryview:
         """Read the file, or map it into memory."""
         with self._opened(path) as descriptor:
-            found = os.fstat(descriptor).st_size
+            size = os.fstat(descriptor).st_size
             if not self.mapped:
-                return os.pread(descriptor, found, 0)
-            if found == 0:
+                return os.read(descriptor, size)
+            if size == 0:
                 return b""  # an empty file, such as an empty scan, cannot be mapped
-            return memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
+            return memoryview(mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ))
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Read the range, or map it into memory if it is large."""
@@ -137,15 +139,15 @@ class LocalTree(Tree):
                 raise _shorter(end - start, max(0, size - start), self.where(path))
             if end - start >= _MAPPED:
                 return _map_range(descriptor, start, end)
-            data = os.pread(descriptor, end - start, start)
+            os.lseek(descriptor, start, os.SEEK_SET)
+            data = os.read(descriptor, end - start)
         return check_length(data, end - start, self.where(path))
 
     @contextmanager
     def _opened(self, path: str) -> Iterator[int]:
         path = f"{self.location}/{path}" if path else self.location
         try:
-            # Opening a pipe would hang without a writer.
-            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+            descriptor = os.open(path, _READING)
             try:
                 if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                     raise FormatError(path, expected="a file", found="a folder, a pipe or a device")
@@ -161,11 +163,13 @@ class LocalTree(Tree):
 def _map_range(descriptor: int, start: int, end: int) -> memoryview:
     """Map the bytes [start, end) of an open file into memory. The file must be long enough."""
     skipped = start % mmap.ALLOCATIONGRANULARITY
-    # read all pages at once (Linux only)
-    flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
-    mapped = mmap.mmap(
-        descriptor, end - start + skipped, flags, mmap.PROT_READ, offset=start - skipped
-    )
+    length, offset = end - start + skipped, start - skipped
+    if os.name == "nt":
+        mapped = mmap.mmap(descriptor, length, access=mmap.ACCESS_READ, offset=offset)
+    else:
+        # read all pages at once (Linux only)
+        flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
+        mapped = mmap.mmap(descriptor, length, flags, mmap.PROT_READ, offset=offset)
     return memoryview(mapped)[skipped:]
 
 

@@ -53,8 +53,8 @@ class ZipTree(Tree):
 
     def entries(self, folder: str = "") -> Mapping[str, bool]:
         """Return the names in a folder, from the central directory."""
-        found = self._index.folders.get(folder, {})
-        return {name: number < 0 for name, number in found.items()}
+        names = self._index.folders.get(folder, {})
+        return {name: number < 0 for name, number in names.items()}
 
     def is_file(self, path: str) -> bool:
         """Whether a member of that name exists."""
@@ -81,8 +81,8 @@ class ZipTree(Tree):
             (self.path, int(self._index.columns["offset"][m]), self._index.end_of(m))
             for m in members
         ]
-        found = zip(paths, members, self.tree.read_ranges(ranges), strict=True)
-        return [self._extract(path, member, memoryview(data)) for path, member, data in found]
+        contents = zip(paths, members, self.tree.read_ranges(ranges), strict=True)
+        return [self._extract(path, member, memoryview(data)) for path, member, data in contents]
 
     def read_range(self, path: str, start: int, end: int) -> bytes | memoryview:
         """Return a part of a member. The whole member is read, because it may be compressed."""
@@ -214,16 +214,16 @@ def _find_directory(tree: Tree, path: str) -> tuple[int, int, int]:
         tail = bytes(tree.read_range(path, -_TAIL, 0))
     except FormatError as error:
         raise _damaged(where, "none") from error
-    found = tail.rfind(b"PK\x05\x06")
-    if found < 0 or len(tail) < found + _END.size:
+    place = tail.rfind(b"PK\x05\x06")
+    if place < 0 or len(tail) < place + _END.size:
         raise FormatError(
             where,
             expected="a zip's end record",
             found="none",
             advice="the zip may be truncated: fetch it again",
         )
-    _, disk, _, _, count, size, start, _ = _END.unpack_from(tail, found)
-    locator = found - _END64_LOCATOR.size
+    _, disk, _, _, count, size, start, _ = _END.unpack_from(tail, place)
+    locator = place - _END64_LOCATOR.size
     if locator >= 0 and tail[locator : locator + 4] == b"PK\x06\x07":
         _, _, offset, _ = _END64_LOCATOR.unpack_from(tail, locator)
         try:
@@ -264,7 +264,7 @@ def _walk(data: bytes, count: int, where: str) -> NDArray[np.int64]:
 
 
 def _columns(data: bytes, positions: NDArray[np.int64], where: str) -> dict[str, NDArray[np.int64]]:
-    """Return the fixed fields of all records, with values from the 64-bit extra field if it exists."""
+    """Return the fixed fields of all records, with the values of 64-bit extra fields."""
     raw = np.frombuffer(data, np.uint8)
 
     def column(offset: int, width: int) -> NDArray[np.int64]:

@@ -99,8 +99,8 @@ class StoredField:
         Args:
             typical: returns the shape of a grid, or (number of elements of a typical frame,).
         """
-        if (found := self.layout()) is not None:
-            return found
+        if (field_layout := self.layout()) is not None:
+            return field_layout
         planned = FieldLayout.plan(self.field, self.options, typical())
         self.target.put(
             f"{self.node}/{METADATA}", to_json(group_metadata(planned.attributes)), create=True
@@ -108,11 +108,11 @@ class StoredField:
         return self._known_layout()
 
     def _known_layout(self) -> FieldLayout:
-        if (found := self.layout()) is None:
+        if (field_layout := self.layout()) is None:
             raise FormatError(
                 self.where, expected="the field", found="none", advice="another program removed it"
             )
-        return found
+        return field_layout
 
     def has(self, frame: int) -> bool:
         """Whether a frame exists.
@@ -154,18 +154,18 @@ class StoredField:
 
     def _list(self) -> None:
         """Read the tables of all blocks that may have changed."""
-        found = {
+        tables = {
             path: block
             for path in self.target.paths(f"{self.node}/{BLOCKS}")
             if (block := block_of(path)) is not None
         }
         changed = [
             path
-            for path, block in found.items()
+            for path, block in tables.items()
             if len(self._tables.get(block) or {}) < self.options.block
         ]
         for path, data in zip(changed, self.target.tree.read_many(changed), strict=True):
-            self._tables[found[path]] = self._parse(data, path)
+            self._tables[tables[path]] = self._parse(data, path)
         self._listed_s = time.monotonic()
         self._denied = set()
 
@@ -185,29 +185,31 @@ class StoredField:
     def read(self, frame: int) -> NDArray[np.generic] | None:
         """Read a frame; None if it does not exist."""
         block = frame // self.options.block
-        found = self.layout()
-        if found is None:
+        field_layout = self.layout()
+        if field_layout is None:
             return None
         if not self._exists(frame):
             self._tables[block] = self.table(block)
         needed = (self._tables[block] or {}).get(frame)
         if needed is None:
             return None
-        counts = {name: np.array([needed.get(name, 0)]) for name in found.columns}
+        counts = {name: np.array([needed.get(name, 0)]) for name in field_layout.columns}
         local = isinstance(self.target, LocalTarget)
         field = ArrayField(
             self.where,
-            found,
+            field_layout,
             np.array([frame]),
             counts,
-            lambda name: self._array(found, name, block),
+            lambda name: self._array(field_layout, name, block),
             local=local,
         )
         return field.read([frame])[0]
 
-    def _array(self, found: FieldLayout, name: str, block: int) -> ZarrArray:
+    def _array(self, field_layout: FieldLayout, name: str, block: int) -> ZarrArray:
         size = self.options.block
-        metadata = column_metadata(found, found.columns[name], size, (block + 1) * size)
+        metadata = column_metadata(
+            field_layout, field_layout.columns[name], size, (block + 1) * size
+        )
         return ZarrArray.from_metadata(self.target.tree, f"{self.node}/{name}", metadata)
 
     def columns(self, block: int, frames: Mapping[int, EncodedFrame]) -> list[str]:
@@ -227,8 +229,8 @@ class StoredField:
 
         Existing frames are kept, unless `frames` replaces them.
         """
-        found = self._known_layout()
-        array = self._array(found, name, block)
+        field_layout = self._known_layout()
+        array = self._array(field_layout, name, block)
         slots = array.slots
         path, room = array.file(block), array.per_shard or 1
         places = {frame: frame % self.options.block * slots for frame in frames}

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, reading
+from carlasc.storage.files import damaged
 from carlasc.storage.packed.array_layout import FieldLayout
 from carlasc.storage.packed.chunks import (
     BITSHUFFLE,
@@ -32,7 +33,10 @@ _SHUFFLES = {"noshuffle": NO_SHUFFLE, "shuffle": SHUFFLE, "bitshuffle": BITSHUFF
 _LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
 _CRC = {"name": "crc32c"}
 _CHECKSUM = 4  # bytes
+# A cyclic checksum leaves the same remainder for every message that is followed by its own
+# checksum. So one pass over both verifies the message, without cutting the checksum off first.
 _RESIDUE = 0x48674BC7  # crc32c of any bytes followed by their crc32c
+# The specification of "sharding_indexed" fixes this number for both fields of a missing chunk.
 _ABSENT = 2**64 - 1  # offset and length of a missing chunk
 
 
@@ -68,17 +72,19 @@ class ZarrArray(StoredArray):
             if not len(shape) == len(outer) == len(chunk) > 0:
                 raise ValueError(f"shape {shape}, chunks {outer} of {chunk}")
             encoding = encoding_of(codecs)
+            # A shard holds whole frames, so the number of a shard follows from the first axis
+            # alone: `file` and `locate` rest on this.
             if any(n > limit for n, limit in zip(shape[1:], outer[1:], strict=True)):
                 raise ValueError(
                     f"shape {shape} in shards of {outer}, which divide other axes than the first"
                 )
-            found = cls(tree, node, dtype, shape, chunk, encoding)
-            found.per_shard = outer[0] // chunk[0] * found.slots if sharded else None
-            found._index_first = (
+            opened = cls(tree, node, dtype, shape, chunk, encoding)
+            opened.per_shard = outer[0] // chunk[0] * opened.slots if sharded else None
+            opened._index_first = (
                 sharded and metadata["codecs"][0]["configuration"].get("index_location") == "start"
             )
-        found._indices = {}
-        return found
+        opened._indices = {}
+        return opened
 
     _index_first: bool
     _indices: dict[int, ShardIndex]
@@ -91,6 +97,7 @@ class ZarrArray(StoredArray):
         per_shard = self.per_shard
         if per_shard is None:
             return [(self.file(number), 0, -1) for number in numbers]
+        # Most calls ask for shards whose index is known: they make no set, and sort nothing.
         if any(number // per_shard not in self._indices for number in numbers):
             self._read_indices({number // per_shard for number in numbers})
         places = []
@@ -98,12 +105,7 @@ class ZarrArray(StoredArray):
             shard, slot = divmod(number, per_shard)
             place = self._indices[shard].place(slot)
             if place is None:
-                raise FormatError(
-                    self.tree.where(self.file(shard)),
-                    expected=f"chunk {number}",
-                    found="none",
-                    advice="the store is damaged",
-                )
+                raise damaged(self.tree.where(self.file(shard)), f"chunk {number}", "none")
             places.append((self.file(shard), *place))
         return places
 
@@ -117,12 +119,7 @@ class ZarrArray(StoredArray):
                 ]
             return super().fetch(numbers)
         except MissingDataError as error:
-            raise FormatError(
-                error.where,
-                expected=error.expected,
-                found=error.found,
-                advice="the store is damaged",
-            ) from error
+            raise damaged(error.where, error.expected, error.found) from error
 
     def files(self, numbers: Sequence[int]) -> list[str]:
         """Return the shards that hold some chunks."""
@@ -140,14 +137,18 @@ class ZarrArray(StoredArray):
         return f"{self.name}/c/{'/'.join([str(number), *['0'] * (len(self.shape) - 1)])}"
 
     def _read_indices(self, shards: set[int]) -> None:
+        # Another thread may read the same index meanwhile: it stores equal values, so no lock is
+        # needed. Sorted, so that requests do not depend on the order of a set.
         missing = sorted(shards - self._indices.keys())
         if not missing:
             return
+        # All indices have one size, because also a missing chunk has its row. An index at the end
+        # is therefore found from the end of the file, without asking for the size of the file.
         size = index_bytes(self.per_shard or 1)
         start, end = (0, size) if self._index_first else (-size, 0)
         files = [self.file(shard) for shard in missing]
-        found = self.tree.read_ranges([(file, start, end) for file in files])
-        for shard, file, data in zip(missing, files, found, strict=True):
+        indices = self.tree.read_ranges([(file, start, end) for file in files])
+        for shard, file, data in zip(missing, files, indices, strict=True):
             self._indices[shard] = ShardIndex(
                 memoryview(data), self.per_shard or 1, f"the index of {file}"
             )
@@ -168,13 +169,10 @@ class ShardIndex:
             FormatError: the index is cut short, or its checksum does not match.
         """
         if len(data) != index_bytes(per_shard):
-            raise FormatError(
-                what,
-                expected=f"{index_bytes(per_shard)} bytes",
-                found=str(len(data)),
-                advice="the store is damaged",
-            )
+            raise damaged(what, f"{index_bytes(per_shard)} bytes", str(len(data)))
         table = np.frombuffer(without_checksum(data, what), "<u8").reshape(-1, 2)
+        # Only existing chunks are kept, in rising order of their slots: `place` searches by
+        # halving, and a shard of a field with few frames takes little memory.
         slots = np.flatnonzero(table[:, 0] != _ABSENT)
         # access to one number is faster than in a NumPy array
         self.slots = array("q", slots.astype("=i8").tobytes())
@@ -205,6 +203,9 @@ def join_shard(chunks: Mapping[int, bytes | memoryview], per_shard: int) -> byte
         chunks: results of `encode_chunk` by their number in the shard.
         per_shard: maximum number of chunks of the shard.
     """
+    # The index comes first, so that a reader that fetches a whole shard, or its beginning, needs no
+    # second request. Chunks follow in the order of their slots, whatever the order in which they
+    # were made: equal chunks give equal bytes.
     table = np.full((per_shard, 2), _ABSENT, "<u8")
     offset = index_bytes(per_shard)
     for slot in sorted(chunks):
@@ -221,15 +222,11 @@ def split_shard(data: bytes | memoryview, per_shard: int, what: str) -> dict[int
     """
     view = memoryview(data)
     index = ShardIndex(view[: index_bytes(per_shard)], per_shard, what)
-    found = {slot: place for slot in index.slots if (place := index.place(slot)) is not None}
-    if any(end > len(view) for _, end in found.values()):
-        raise FormatError(
-            what,
-            expected="chunks inside the file",
-            found="a chunk outside of it",
-            advice="the store is damaged",
-        )
-    return {slot: view[start:end] for slot, (start, end) in found.items()}
+    places = {slot: place for slot in index.slots if (place := index.place(slot)) is not None}
+    # Offsets are unsigned, so that a chunk can lie outside of the file only beyond its end.
+    if any(end > len(view) for _, end in places.values()):
+        raise damaged(what, "chunks inside the file", "a chunk outside of it")
+    return {slot: view[start:end] for slot, (start, end) in places.items()}
 
 
 def index_bytes(per_shard: int) -> int:

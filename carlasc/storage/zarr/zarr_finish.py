@@ -15,7 +15,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from carlasc.errors import ConflictError, FormatError, MissingDataError
-from carlasc.storage.files import parse_json, remove_stale, to_json
+from carlasc.storage.files import damaged, parse_json, remove_stale, to_json
 from carlasc.storage.packed.array_layout import (
     FIELD,
     SEQUENCE,
@@ -126,22 +126,14 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
             target.location, expected=f"a zarr store of version {VERSION}", found="none"
         )
     if not isinstance(block := root.get("block"), int) or block < 1:
-        raise FormatError(
-            target.location,
-            expected="a number of frames in block",
-            found=repr(block),
-            advice="the store is damaged",
-        )
+        raise damaged(target.location, "a number of frames in block", repr(block))
     groups = _groups(target, paths)
     result, nodes, sequences = FinishedStore(target.location), StoreNodes(), dict[str, str]()
     for node, attributes in groups.items():
         if attributes.get("type") == SEQUENCE:
             if not {"path", "split", "name", "coordinates"} <= attributes.keys():
-                raise FormatError(
-                    f"{target.location}/{node}",
-                    expected="the attributes of a sequence",
-                    found="some missing",
-                    advice="the store is damaged",
+                raise damaged(
+                    f"{target.location}/{node}", "the attributes of a sequence", "some missing"
                 )
             sequences[attributes["path"]] = node
             inside = [path for path in paths if path.startswith(f"{node}/")]
@@ -162,7 +154,7 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
         target.put(METADATA, to_json(group_metadata(root | {"complete": False})))
     target.put_many(
         nodes.files
-        | {f"{node}/{METADATA}": to_json(found) for node, found in nodes.metadata.items()}
+        | {f"{node}/{METADATA}": to_json(metadata) for node, metadata in nodes.metadata.items()}
     )
     all_nodes = dict(sorted(nodes.metadata.items()))
     target.put(METADATA, to_json(group_metadata(about | {"sequences": sequences}, all_nodes)))
@@ -173,12 +165,12 @@ def _write_metadata(target: Target, paths: list[str], incomplete: bool) -> Finis
 def _groups(target: Target, paths: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return the attributes of the groups of sequences and fields."""
     files = [path for path in paths if path.endswith(f"/{METADATA}")]
-    found = {}
+    attributes = {}
     for path, data in zip(files, target.tree.read_many(files), strict=True):
         metadata = parse_json(bytes(data), target.tree.where(path))
         if metadata.get("node_type") == "group":
-            found[path.removesuffix(f"/{METADATA}")] = metadata.get("attributes", {})
-    return found
+            attributes[path.removesuffix(f"/{METADATA}")] = metadata.get("attributes", {})
+    return attributes
 
 
 def _finish_sequence(
@@ -262,12 +254,12 @@ def format_expected(frames: Mapping[str, set[int]]) -> bytes:
     """Return the announced frames as bytes: ranges [first, end) by field."""
     ranges: dict[str, list[list[int]]] = {}
     for name in sorted(frames):
-        found = ranges.setdefault(name, [])
+        stretches = ranges.setdefault(name, [])
         for frame in sorted(frames[name]):
-            if found and found[-1][1] == frame:
-                found[-1][1] += 1
+            if stretches and stretches[-1][1] == frame:
+                stretches[-1][1] += 1
             else:
-                found.append([frame, frame + 1])
+                stretches.append([frame, frame + 1])
     return to_json(ranges)
 
 
@@ -278,10 +270,10 @@ def parse_expected(data: bytes, where: str) -> dict[str, set[int]]:
         FormatError: they are damaged.
     """
     try:
-        found = parse_json(data, where).items()
+        tables = parse_json(data, where).items()
         return {
             name: {frame for first, end in ranges for frame in range(first, end)}
-            for name, ranges in found
+            for name, ranges in tables
         }
     except (TypeError, ValueError) as error:
         raise FormatError(

@@ -131,7 +131,7 @@ class ZarrWriter(SequenceWriter):
     def expect(
         self, frames: Mapping[str, Iterable[int]], rows: Mapping[str, int] | None = None
     ) -> None:
-        """Record the announced frames, so that the store is not finished without them by accident."""
+        """Record the announced frames, so that the store is not finished without them."""
         self._rows.update(rows or {})
         path = f"{self.group}/{EXPECTED}"
         there = self.target.read(path)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.errors import FormatError, MissingDataError, import_extra, reading
-from carlasc.storage.files import parse_json
+from carlasc.storage.files import damaged, parse_json
 from carlasc.storage.packed.array_source import ArraySource, ArrayStore
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.storage.transport.trees import Tree
@@ -82,22 +82,14 @@ class ZarrStore(ArrayStore):
         try:
             return bytes(self.tree.read(node))
         except MissingDataError as error:
-            raise FormatError(
-                error.where,
-                expected=error.expected,
-                found=error.found,
-                advice="the store is damaged",
-            ) from error
+            raise damaged(error.where, error.expected, error.found) from error
 
     def array(self, node: str) -> ZarrArray:
         """Return an array whose chunks can be read."""
         metadata = self._metadata(node)
         if metadata is None or metadata.get("node_type") != "array":
-            raise FormatError(
-                f"{self.location}/{node}",
-                expected="an array",
-                found="none" if metadata is None else "a group",
-                advice="the store is damaged",
+            raise damaged(
+                f"{self.location}/{node}", "an array", "none" if metadata is None else "a group"
             )
         return ZarrArray.from_metadata(self.tree, node, metadata)
 
@@ -142,10 +134,5 @@ class ZarrStore(ArrayStore):
 
 def _mapping(value: Any, where: str, name: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise FormatError(
-            where,
-            expected=f"an object in {name}",
-            found=type(value).__name__,
-            advice="the store is damaged",
-        )
+        raise damaged(where, f"an object in {name}", type(value).__name__)
     return value

@@ -30,7 +30,7 @@ from carlasc.core.geometry import Transform, quaternions_of
 from carlasc.core.grids import Grid
 from carlasc.core.scans import Scan
 from carlasc.errors import import_extra
-from carlasc.storage.packed.output import PatientFile
+from carlasc.storage.packed.output import DeferredErrorFile
 from carlasc.viewing import colors as palette
 from carlasc.viewing.recordings.content import RecordedFrame, class_surfaces
 from carlasc.viewing.scene import GridPanel, SceneReader
@@ -56,7 +56,7 @@ class FoxgloveWriter:
         self._types: Any = import_extra("foxglove.channels", "foxglove")
         self._reader, self._channels = reader, dict[str, Any]()
         self._context = foxglove.Context()
-        self._output = PatientFile(path, None)
+        self._output = DeferredErrorFile(path, None)
         self._writer = foxglove.open_mcap(self._output, context=self._context)
         self._writer.write_metadata(
             "carlasc", {"sequence": reader.name, "classes": reader.table.name}

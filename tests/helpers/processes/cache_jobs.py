@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import hashlib
-import resource
 from pathlib import Path
 from typing import Any
 
@@ -26,5 +25,7 @@ def read_files(
     """Put the digest of each file into a queue."""
     caching._PIECE = PIECE
     if largest_file is not None:  # writing beyond it fails, as on a full disk
+        import resource  # POSIX alone has it
+
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
     digests.put([hashlib.sha256(bytes(tree.read(path))).hexdigest() for path in paths])

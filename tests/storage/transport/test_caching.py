@@ -16,7 +16,9 @@ from pathlib import Path
 import fsspec
 import numpy as np
 import pytest
+from filelock import FileLock
 from helpers.datasets.sequences import files_of, write_dataset
+from helpers.parts import raises
 from helpers.processes.cache_jobs import PIECE, read_files, tree_at
 from helpers.servers.range_server import Served, serve_folder
 
@@ -29,6 +31,8 @@ from carlasc.storage.transport.caching import CachedTree
 from carlasc.storage.transport.remote_tree import RemoteTree
 from carlasc.testing import SourceContract
 from carlasc.testing.data import WHOLE
+
+pytestmark = pytest.mark.posix("fork, and limits of the size of files")
 
 pytest.importorskip("aiohttp")
 
@@ -170,7 +174,7 @@ def test_processes_together_keep_to_the_size(served, tmp_path):
     started = [start(tree_at(served.url, tmp_path / "cache", max_bytes=4 * SIZE), [f"{k}.bin" for k in order])
                for order in ((0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0))]  # fmt: skip
     while any(process.is_alive() and digests.empty() for process, digests in started):
-        with caching._locked(tmp_path / "cache" / ".lock"):  # files come and go under this lock
+        with FileLock(tmp_path / "cache" / ".locks" / ".lock"):  # files come and go under this lock
             largest = max(largest, sum(kept(tmp_path / "cache").values()))
     for (process, digests), order in zip(
         started, ((0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)), strict=True
@@ -236,7 +240,7 @@ def test_a_fetch_ahead_does_not_wait_for_another_process(served, tmp_path):
 
 def test_stores_of_one_name_behind_two_endpoints_are_kept_apart(tmp_path):
     options = ({"endpoint_url": "http://a"}, {"client_kwargs": {"endpoint_url": "http://b"}}, {})
-    pytest.importorskip("s3fs")
+    pytest.importorskip("obstore")
     keys = {
         CachedTree(RemoteTree("s3://bucket/x", o), Cache(tmp_path))._key("zarr.json")
         for o in options
@@ -297,9 +301,7 @@ def test_errors_name_the_remote_file(served, tmp_path):
 
 
 def test_bad_caches_are_refused(served, tmp_path):
-    with pytest.raises(
-        ArgumentError, match="max_bytes: expected a number of bytes above 0, found 0"
-    ):
+    with raises(ArgumentError, where="max_bytes", expected="a number of bytes above 0", found="0"):
         Cache(tmp_path, 0)
     (tmp_path / "file").touch()
     with pytest.raises(StorageError, match="cannot be used as a cache: .*choose another folder"):

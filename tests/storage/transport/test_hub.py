@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from helpers.datasets.sequences import FRAMES, files_of, write_dataset
+from helpers.parts import raises
 from helpers.servers.hub_server import Hub, hub_server
 from storage.transport.test_zipped import write_zip
 from typer.testing import CliRunner
@@ -224,9 +225,7 @@ def test_offline_is_one_line_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_nothing_is_written_to_the_hub() -> None:
-    with pytest.raises(
-        ArgumentError, match="found the Hugging Face Hub, where each file would be a commit"
-    ):
+    with raises(ArgumentError, found="the Hugging Face Hub, where each file would be a commit"):
         RemoteTarget(URL)
 
 

@@ -6,6 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
+from helpers.parts import raises
 
 from carlasc.errors import CarlascError, FormatError, MissingDataError
 from carlasc.storage.files import leads_outside
@@ -69,7 +70,7 @@ def test_listings_tell_files_from_folders(tree: LocalTree) -> None:
 
 
 def test_errors_name_the_file(tree: LocalTree) -> None:
-    with pytest.raises(MissingDataError, match=r"/absent: expected a file, found nothing"):
+    with raises(MissingDataError, where="/absent", expected="a file", found="nothing"):
         pickle.loads(pickle.dumps(tree)).read("absent")
     with pytest.raises(CarlascError, match=r"/inside"):
         tree.read_range("inside", 0, 1)

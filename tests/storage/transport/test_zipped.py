@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets.sequences import files_of, write_dataset
+from helpers.parts import raises
 
 import carlasc
 from carlasc.errors import FormatError, MissingDataError
@@ -100,7 +101,7 @@ def test_a_wrong_end_record_is_one_clear_error(archive: Path, offset: int, value
     width = "<H" if offset == 10 else "<I"
     struct.pack_into(width, data, end + offset, value)
     archive.write_bytes(data)
-    with pytest.raises(FormatError, match=r"data\.zip: expected a zip's central directory"):
+    with raises(FormatError, where=r"data\.zip", expected="a zip's central directory"):
         carlasc.open(archive).sequences()
 
 
@@ -121,8 +122,8 @@ def test_a_directory_that_points_elsewhere_names_the_member(
     record = data.index(b"PK\x01\x02", data.rindex(name) - 46)
     struct.pack_into("<I", data, record + 42, 11)
     archive.write_bytes(data)
-    with pytest.raises(
-        FormatError, match=r"velodyne/000005\.bin: expected a member's header at byte 11"
+    with raises(
+        FormatError, where=r"velodyne/000005\.bin", expected="a member's header at byte 11"
     ):
         carlasc.open(archive).sequences()[WHOLE].read("points", 5)
 
@@ -212,7 +213,7 @@ def test_an_empty_zip_says_what_was_looked_for(tmp_path: Path) -> None:
 
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / "data.zip").write_bytes(b"<html>sign in first</html>")
-    with pytest.raises(FormatError, match=r"data\.zip: expected .*none of these"):
+    with raises(FormatError, where=r"data\.zip", found="none of these"):
         carlasc.open(tmp_path / "data.zip")
     (tmp_path / "empty.zip").write_bytes(b"")
     with pytest.raises(FormatError, match=r"empty\.zip: .*cut short"):
@@ -254,14 +255,14 @@ def read_scan(path: Path, data: bytes) -> bytes:
 def test_an_encrypted_member_says_to_unpack(tmp_path: Path) -> None:
     path, data, start, _ = tiny(tmp_path)
     data[start + 8] |= 1
-    with pytest.raises(FormatError, match="found an encrypted one: unpack the zip"):
+    with raises(FormatError, found="an encrypted one", advice="unpack the zip"):
         read_scan(path, data)
 
 
 def test_a_part_of_several_zips_says_to_join_them(tmp_path: Path) -> None:
     path, data, _, end = tiny(tmp_path)
     struct.pack_into("<H", data, end + 4, 1)
-    with pytest.raises(FormatError, match="found a part of a split zip: join the parts"):
+    with raises(FormatError, found="a part of a split zip", advice="join the parts"):
         read_scan(path, data)
 
 
@@ -312,7 +313,7 @@ def test_a_size_of_64_bits_is_read_or_is_one_clear_error(
     if fits:
         assert read_scan(path, widen(data, start, end, extra)) == bytes(range(160))
     else:
-        with pytest.raises(FormatError, match="found no 64-bit sizes of member 0"):
+        with raises(FormatError, found="no 64-bit sizes of member 0"):
             read_scan(path, widen(data, start, end, extra))
 
 
@@ -320,9 +321,11 @@ def test_a_size_of_64_bits_is_read_or_is_one_clear_error(
 def test_a_locator_that_points_elsewhere_is_one_clear_error(tmp_path: Path, offset: int) -> None:
     path, data, _, end = tiny(tmp_path)
     data[end:end] = struct.pack("<4sLQL", b"PK\x06\x07", 0, offset, 1)
-    with pytest.raises(
+    with raises(
         FormatError,
-        match=r"tiny\.zip: expected a zip's central directory, found .*64-bit end record",
+        where=r"tiny\.zip",
+        expected="a zip's central directory",
+        found=".*64-bit end record",
     ):
         read_scan(path, data)
 
@@ -330,7 +333,7 @@ def test_a_locator_that_points_elsewhere_is_one_clear_error(tmp_path: Path, offs
 def test_a_member_beyond_the_directory_is_one_clear_error(tmp_path: Path) -> None:
     path, data, start, _ = tiny(tmp_path)
     struct.pack_into("<I", data, start + 20, 100_000)
-    with pytest.raises(FormatError, match="found a member beyond the directory"):
+    with raises(FormatError, found="a member beyond the directory"):
         read_scan(path, data)
 
 
@@ -338,7 +341,7 @@ def test_bytes_behind_the_last_record_of_the_directory_are_one_clear_error(tmp_p
     path, data, start, end = tiny(tmp_path)
     struct.pack_into("<I", data, end + 12, end - start + 5)
     data[end:end] = bytes(5)
-    with pytest.raises(FormatError, match="found 1 members in"):
+    with raises(FormatError, found="1 members in"):
         read_scan(path, data)
 
 
@@ -347,9 +350,9 @@ def test_a_range_beyond_the_end_of_a_member_is_one_clear_error(tmp_path: Path) -
     tree = ZipTree(LocalTree(tmp_path), path.name)
     assert bytes(tree.read_range("velodyne/000000.bin", -10, -5)) == bytes(range(150, 155))
     assert bytes(tree.read_range("velodyne/000000.bin", 150, 160)) == bytes(range(150, 160))
-    with pytest.raises(FormatError, match="expected at least 161 bytes, found 160"):
+    with raises(FormatError, expected="at least 161 bytes", found="160"):
         tree.read_range("velodyne/000000.bin", 150, 161)
-    with pytest.raises(MissingDataError, match="expected a file, found nothing"):
+    with raises(MissingDataError, expected="a file", found="nothing"):
         tree.read("velodyne/000001.bin")
 
 

@@ -114,7 +114,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {
     ("docs/sets/kitti-raw.md", "10 s"): "how long a drive of the data set is, by its authors",
     ("docs/sets/kitti-raw.md", "0.1 s"): "how long the scanner needs for a turn, by its maker",
     ("docs/sets/nuscenes.md", "20 s"): "how long a drive of the data set is, by its authors",
-    ("docs/storage.md", "100 MiB"): "from where on s3fs sends parts",
+    ("docs/storage.md", "100 MiB"): "from where on objects are sent in parts",
     ("docs/studies/networks.md", "## Published results"): "the numbers of the paper",
 }
 

@@ -1,0 +1,302 @@
+"""The client of S3, Google Cloud Storage and Azure, through obstore.
+
+obstore signs, sends and checks requests; this module translates options and errors. Its own retries
+are turned off, so that one rule holds for every server (`requests`).
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import threading
+from collections.abc import Iterable, Mapping
+from datetime import timedelta
+from importlib.machinery import ExtensionFileLoader, ModuleSpec
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any, cast
+
+from carlasc.errors import ArgumentError, CarlascError, import_extra, without_credentials
+from carlasc.storage.transport.clients import Client
+from carlasc.storage.transport.failures import (
+    WrongAnswerError,
+    bucket_is_missing,
+    ends_before,
+)
+
+SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl")
+"""Schemes of object stores."""
+
+PRIVATE = "obstore._obstore"
+"""The compiled module of obstore, an undocumented name."""
+
+_S3 = ("s3", "s3a")
+_MARK = "carlasc-writer"
+_PART_BYTES = 100 << 20  # larger objects are sent in parts of this size
+# An upload has no other limit than this multiple of the time without data from the server: the
+# server is silent while it receives.
+_UPLOAD_TIMES = 10
+# names of options of fsspec's file systems -> names of obstore
+_S3_NAMES = {
+    "key": "access_key_id",
+    "secret": "secret_access_key",
+    "token": "session_token",
+    "endpoint_url": "endpoint",
+    "region_name": "region",
+    "anon": "skip_signature",
+}
+
+
+class ObjectStoreClient(Client):
+    """The client of a bucket."""
+
+    exclusive = True
+
+    def __init__(self, url: str, options: Mapping[str, Any]) -> None:
+        super().__init__(url, options)
+        import_extra("obstore", "remote")
+        self._root = "/".join(url.split("/", 3)[:3])
+
+    def open(self) -> tuple[Any, Any]:
+        """Return two stores of the bucket, to read and to write: they have other time limits."""
+        config = self._config()
+        address = str(
+            config.get("endpoint") or _variable("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL")
+        )
+        silence = timedelta(seconds=self.settings.timeout_s)
+        limits = (
+            {"read_timeout": silence, "timeout": timedelta(days=1)},
+            {"timeout": silence * _UPLOAD_TIMES},
+        )
+        if self.scheme in _S3:
+            provider = self._profile(config)
+            if address:
+                config["endpoint"] = address
+        else:
+            provider = None
+        root = self._root.replace("s3a://", "s3://").replace("gcs://", "gs://")
+        library = _library()
+        try:
+            reading, writing = (
+                library.store.from_url(
+                    root,
+                    config=config,
+                    client_options={
+                        "allow_http": address.startswith("http://"),
+                        "connect_timeout": silence,
+                        **limit,
+                    },
+                    retry_config={"max_retries": 0},
+                    credential_provider=provider,
+                )
+                for limit in limits
+            )
+        except library.exceptions.UnknownConfigurationKeyError as error:
+            name = str(error).split("'")[1]
+            raise ArgumentError(
+                name,
+                expected="a storage option",
+                found="a name that the store does not know",
+                advice="see the page on storage",
+            ) from None
+        except (library.exceptions.BaseError, ValueError, TypeError):
+            raise CarlascError(
+                without_credentials(self.url),
+                problem="cannot be opened",
+                advice="check the URL and the storage options",
+            ) from None
+        return reading, writing
+
+    def _config(self) -> dict[str, Any]:
+        """Return the options, and those in variables such as FSSPEC_S3_ANON, in obstore's names."""
+        from fsspec.config import conf
+
+        given = {**conf.get(self.scheme, {}), **self.options}
+        given |= given.pop("client_kwargs", {})
+        if self.scheme in _S3:
+            return {_S3_NAMES.get(name, name): value for name, value in given.items()}
+        if given.get("token") == "anon" or given.pop("anon", False):
+            given["skip_signature"] = True
+        if token := given.pop("token", None) if self.scheme in ("gs", "gcs") else None:
+            given |= {} if token == "anon" else {"service_account": token}
+        return given
+
+    @staticmethod
+    def _profile(config: dict[str, Any]) -> Any:
+        """Return the credentials of ~/.aws, unless others are given, which obstore finds itself.
+
+        boto3 reads them, because they may name roles and programs.
+        """
+        profile = config.pop("profile", None) or _variable("AWS_PROFILE")
+        given = "access_key_id" in config or str(config.get("skip_signature")).lower() == "true"
+        if given or (not profile and _variable("AWS_ACCESS_KEY_ID")):
+            return None
+        files = ("AWS_SHARED_CREDENTIALS_FILE", "AWS_CONFIG_FILE")
+        if not (profile or _variable(*files) or (Path.home() / ".aws").is_dir()):
+            return None
+        session = import_extra("boto3", "remote").Session(profile_name=profile or None)
+        if session.get_credentials() is None:
+            return None
+        region = _variable("AWS_REGION", "AWS_DEFAULT_REGION") or session.region_name
+        config.setdefault("region", region or "us-east-1")
+        _library()
+        return importlib.import_module("obstore.auth.boto3").Boto3CredentialProvider(session)
+
+    def _key(self, url: str) -> str:
+        return url[len(self._root) :].strip("/")
+
+    def get(self, url: str, start: int | None = None, end: int | None = None) -> bytes:
+        """Return bytes of an object. obstore compares the range that it receives.
+
+        A whole object is requested as the range from its first byte: that answer names the size of
+        the object, so that a short one is noticed.
+        """
+        store, key = self.connection[0], self._key(url)
+        try:
+            if start is not None and end is not None:
+                return bytes(_library().get_range(store, key, start=start, end=end))
+            answer = _library().get(store, key, options={"range": {"offset": 0}})
+            data = bytes(answer.bytes())
+        except Exception as error:
+            if ends_before(error):  # also for an empty object
+                return b""
+            raise
+        if len(data) != answer.meta["size"]:
+            raise WrongAnswerError(f"{len(data)} bytes instead of {answer.meta['size']}")
+        return data
+
+    def about(self, url: str) -> tuple[int, str] | None:
+        """Describe an object."""
+        store, key = self.connection[0], self._key(url)
+        if not key:
+            return None
+        try:
+            about = _library().head(store, key)
+        except FileNotFoundError:
+            try:  # the answer to HEAD does not say whether the bucket exists
+                _library().get(store, key)
+            except FileNotFoundError as error:
+                if bucket_is_missing(error):
+                    raise
+            return None
+        return about["size"], f"{about['e_tag'] or ''} {about['last_modified']}"
+
+    def entries(self, url: str) -> dict[str, int | None]:
+        """List a folder."""
+        key = self._key(url)
+        listed = _library().list_with_delimiter(self.connection[0], key)
+        names: dict[str, int | None] = {
+            f"{prefix.rstrip('/').rpartition('/')[2]}/": None
+            for prefix in listed["common_prefixes"]
+        }
+        for entry in listed["objects"]:
+            if entry["path"] != key:  # some programs store an object for the folder itself
+                names[entry["path"].rpartition("/")[2]] = entry["size"]
+        return names
+
+    def files(self, url: str) -> dict[str, int]:
+        """List all objects below a folder."""
+        key = self._key(url)
+        listed = _library().list(self.connection[0], key).collect()
+        if not listed and (about := self.about(url)) is not None:
+            return {"": about[0]}
+        return {
+            entry["path"].removeprefix(key).lstrip("/"): entry["size"]
+            for entry in listed
+            if entry["path"] != key
+        }
+
+    def put(self, url: str, data: bytes, mark: str | None = None) -> None:
+        """Write an object with one request, or in parts if it is large and replaces another.
+
+        If the answer to a create-only put is lost, the put is sent again and finds its own object:
+        it has the mark.
+        """
+        library, store, key = _library(), self.connection[1], self._key(url)
+        if mark is None:
+            library.put(store, key, data, chunk_size=_PART_BYTES)
+            return
+        try:
+            library.put(store, key, data, mode="create", attributes={_MARK: mark})
+        except library.exceptions.AlreadyExistsError:
+            try:
+                attributes = library.get(self.connection[0], key, options={"head": True}).attributes
+            except FileNotFoundError:  # it was removed meanwhile
+                attributes = {}
+            if attributes.get(_MARK) != mark:
+                raise FileExistsError(url) from None
+
+    def remove(self, urls: Iterable[str]) -> None:
+        """Remove objects, in S3 1000 per request."""
+        keys, store = [self._key(url) for url in urls], self.connection[1]
+        if self.scheme in _S3:
+            _library().delete(store, keys)
+            return
+        for key in keys:  # other stores fail for an object that does not exist
+            try:
+                _library().delete(store, key)
+            except FileNotFoundError:
+                continue
+
+
+def _variable(*names: str) -> str:
+    """Return the first environment variable that is set; otherwise an empty string."""
+    return next(filter(None, map(os.environ.get, names)), "")
+
+
+class _Library:
+    """obstore in this process; in a forked process a second copy of it.
+
+    Its threads (of tokio) do not survive a fork: a request in the child would wait for ever, and
+    the loaders of PyTorch fork their workers. They belong to the loaded file, so that a copy of the
+    file, which needs no name on Linux, has threads of its own.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._used = self._lost = False  # whether its threads exist, or were lost by a fork
+        self._file = ""  # the installed file, of which copies are made
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._after_fork)
+
+    def _after_fork(self) -> None:
+        self._lock, self._lost = threading.Lock(), self._used  # a lost thread may hold the old lock
+
+    def __call__(self) -> ModuleType:
+        """Return the library.
+
+        Raises:
+            CarlascError: its threads were lost, on a system other than Linux.
+        """
+        with self._lock:
+            if self._lost:
+                self._load_copy()
+            self._used, self._lost = True, False
+            importlib.import_module("obstore.store")
+            self._file = self._file or str(sys.modules[PRIVATE].__file__)
+            return sys.modules["obstore"]
+
+    def _load_copy(self) -> None:
+        if not sys.platform.startswith("linux"):
+            raise CarlascError(
+                "a forked process",
+                problem="cannot send requests to object stores",
+                advice='start processes with the method "spawn"',
+            )
+        content = Path(self._file).read_bytes()
+        for name in [name for name in sys.modules if name.partition(".")[0] == "obstore"]:
+            del sys.modules[name]
+        with open(os.memfd_create("obstore"), "wb") as file:
+            file.write(content)
+            file.flush()
+            place = f"/proc/self/fd/{file.fileno()}"
+            loader = ExtensionFileLoader(PRIVATE, place)
+            spec = spec_from_file_location(PRIVATE, place, loader=loader)
+            module = module_from_spec(cast("ModuleSpec", spec))
+            sys.modules[PRIVATE] = module
+            loader.exec_module(module)
+
+
+_library = _Library()
