@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -11,7 +12,7 @@ import typer
 import carlasc
 from carlasc.cli.common import Json, echo, file_option, place_argument, print_json, report_failures
 from carlasc.cli.flags import Flags, OneWorkerFlags
-from carlasc.errors import MissingDataError, count
+from carlasc.errors import FormatError, MissingDataError, count
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,15 @@ class DetailFlags(Flags):
             "--citation", metavar="FILE", text="A BibTeX file that says how to cite the data."
         ),
     ] = None
+    statements: Annotated[
+        Path | None,
+        file_option(
+            "--statements",
+            metavar="FILE",
+            text="A TOML file with what only the author knows, such as "
+            "personalSensitiveInformation: names and texts of Croissant's RAI fields.",
+        ),
+    ] = None
     url: Annotated[
         str | None,
         typer.Option(
@@ -62,13 +72,25 @@ class DetailFlags(Flags):
 
     def details(self) -> carlasc.CardDetails:
         """Return the details of the card."""
-        if self.citation is not None and not self.citation.is_file():
-            raise MissingDataError(
-                self.citation, expected="a BibTeX file", found="nothing", advice="check the path"
-            )
-        citation = None if self.citation is None else self.citation.read_text(errors="replace")
+        texts = {}
+        for name, kind in (("citation", "a BibTeX file"), ("statements", "a TOML file")):
+            file: Path | None = getattr(self, name)
+            if file is not None and not file.is_file():
+                raise MissingDataError(
+                    file, expected=kind, found="nothing", advice="check the path"
+                )
+            texts[name] = None if file is None else file.read_text(errors="replace")
+        try:
+            statements = tomllib.loads(texts["statements"] or "")
+        except tomllib.TOMLDecodeError as error:
+            raise FormatError(self.statements, problem=f"no TOML: {error}") from error
         return carlasc.CardDetails(
-            **{**vars(self), "authors": self.authors or (), "citation": citation}
+            **{
+                **vars(self),
+                "authors": self.authors or (),
+                "citation": texts["citation"],
+                "statements": statements,
+            }
         )
 
 

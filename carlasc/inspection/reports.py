@@ -102,23 +102,37 @@ def report(
         for _, sequence, name in grids:
             _check_writable(sequence, name)
     makers = [_ReportMaker(sequence, name) for _, sequence, name in grids]
-    existing = {} if remake else {row: maker.existing() for row, maker in enumerate(makers)}
-    reports = {row: one for row, one in existing.items() if one is not None}
+    reports: dict[int, Report] = {}
+    for row, (_, sequence, name) in enumerate([] if remake else grids):
+        if (existing := report_beside(sequence, name)) is not None:
+            reports[row] = existing
     missing = [row for row in range(len(makers)) if row not in reports]
     measured = _measure_all([makers[row] for row in missing], run)
     failures: list[FrameFailure] = []
     for row, results in zip(missing, measured, strict=True):
         failures += [result for result in results if isinstance(result, FrameFailure)]
         reports[row] = makers[row].make(results)
-    found: dict[str, Report] = {}
+    by_grid: dict[str, Report] = {}
     for row, (path, sequence, name) in enumerate(grids):
         one = reports[row]
         if holdout and one.holdout is None:
             one = replace(one, holdout=makers[row].held_out(run))
         if save and isinstance(sequence, FolderSequence):
             write_output(sequence.folder / layout.report_file(name), one.to_json())
-        found[f"{path}/{name}" if path else name] = one
-    return ReportResult(opened.location, found, tuple(failures))
+        by_grid[f"{path}/{name}" if path else name] = one
+    return ReportResult(opened.location, by_grid, tuple(failures))
+
+
+def report_beside(sequence: Sequence, grid: str) -> Report | None:
+    """Return the report beside a grid; None if there is none.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    name = layout.report_file(grid)
+    if name not in sequence.documents():
+        return None
+    return Report.from_json(sequence.read_document(name), f"{sequence.location}/{name}")
 
 
 _Measured = FrameFacts | FrameFailure
@@ -160,15 +174,6 @@ class _ReportMaker:
         self.sequence, self.grid = sequence, grid
         self.frames: list[int] = sequence.frames(f"{grid}/labels").tolist()
         self.inputs = _inputs_of(sequence, grid)
-
-    def existing(self) -> Report | None:
-        """Return the report beside the grid; None if there is none."""
-        name = layout.report_file(self.grid)
-        if name not in self.sequence.documents():
-            return None
-        return Report.from_json(
-            self.sequence.read_document(name), f"{self.sequence.location}/{name}"
-        )
 
     @property
     def steps_before(self) -> int:
