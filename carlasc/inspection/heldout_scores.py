@@ -28,10 +28,7 @@ sensor (x forward), metres.
 _RETURNS, _FREE, _UNKNOWN, _PASSED, _PASSED_OBJECT, _MISSED = range(6)
 _SOLID, _OBJECT = 1, 2  # bits of a voxel: it is occupied; its class is not ground
 # histogram of the errors of the first hit; the last bin holds all larger ones
-_STEP_M, _STEPS = (
-    0.02,
-    500,
-)
+_STEP_M, _STEPS = (0.02, 500)
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from carlasc.errors import (
-    DependencyError,
-    carlasc_version,
-    describe,
-    import_extra,
-    install_command,
-)
+from carlasc.errors import DependencyError, carlasc_version, describe, import_extra, install_command
 from carlasc.running import count_cores
 from carlasc.running.pools import ONE_THREAD
 from carlasc.storage.files import is_durable

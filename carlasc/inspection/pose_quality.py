@@ -30,10 +30,7 @@ quality of grids.
 
 _RUN = 30  # scans of a run
 # frames by which poses are moved for another start, which must be better by this factor
-_SHIFTS, _BETTER = (
-    (-2, 2),
-    0.9,
-)
+_SHIFTS, _BETTER = ((-2, 2), 0.9)
 _AGREE_M = 0.03  # scans that agree within this distance are aligned
 _LEVER_M = 15.0  # a turn counts by what it moves at this distance
 

@@ -154,8 +154,7 @@ def _section(name: str, report: Report) -> str:
         if held_out and held_out["by_distance"]
         else "",
         actors=_part(
-            "Moving actors by frame",
-            f"{_timeline(actors, report.frames)}\n{_actor_table(actors)}",
+            "Moving actors by frame", f"{_timeline(actors, report.frames)}\n{_actor_table(actors)}"
         )
         if actors
         else "",

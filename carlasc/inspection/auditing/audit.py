@@ -52,11 +52,7 @@ _SHOWN = 4  # number of frames in pictures
 _REACH = 30  # frames before and after a stretch in which actors matter
 _BLOCK = 400  # frames for which actors are found together
 # name of the files of sums, and of other entries in them
-_SUMS, _WORST, _KEY = (
-    "audit",
-    "worst",
-    "key",
-)
+_SUMS, _WORST, _KEY = ("audit", "worst", "key")
 
 # a wrong frame: path, frame of the grid, frame of the scan, wrong voxels
 _Row = tuple[str, int, int, int]

@@ -25,21 +25,11 @@ from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 HEIGHTS = 4  # shares are also computed for this number of layers of equal height
 MAX_ID = 511  # larger ids of classes count as this one
 # points of a frame that are thinned evenly in space, and rays that are followed
-_SPREAD, _RAYS = (
-    20_000,
-    8000,
-)
+_SPREAD, _RAYS = (20_000, 8000)
 # points that are kept of these in a frame, and in all frames
-_LEAST, _MOST, _IN_ALL = (
-    500,
-    2500,
-    250_000,
-)
+_LEAST, _MOST, _IN_ALL = (500, 2500, 250_000)
 # frames before and after, in which the paths of actors are checked
-_TIMES = (
-    *range(-20, -1, 2),
-    *range(2, 21, 2),
-)
+_TIMES = (*range(-20, -1, 2), *range(2, 21, 2))
 _APART = 20  # frames between the scans that show a drift
 _CLEAR_RAYS = 3  # an occupied voxel that this number of rays cross is a phantom
 # an actor may be larger than its body by this, because bodies are measured on a few sides only

@@ -25,10 +25,7 @@ _TRAIL, _TRAIL_VOXELS = 0.1, 30  # of the path of an actor
 _ERASED, _ERASED_VOXELS = 0.2, 40  # of the voxels in which an actor was seen
 _DOUBLED = 0.05  # of the columns with ground
 # least share of the points of a class under another class, and largest share under its own
-_EXPLAINED, _OWN = (
-    0.5,
-    0.3,
-)
+_EXPLAINED, _OWN = (0.5, 0.3)
 # largest share under its own class, for thin markings, which lose their voxels in any case
 _NONE = 0.002
 _SHOWN = 4
