@@ -93,11 +93,12 @@ def report(
         if grid in (None, name) and sequence.predicted_by(name) is None
     ]
     if not grids:
-        expected, advice = (
-            "a grid" if grid is None else f"the grid {grid}",
-            "make grids with `carlasc regrid`",
+        raise MissingDataError(
+            opened.location,
+            expected="a grid" if grid is None else f"the grid {grid}",
+            found="none",
+            advice="make grids with `carlasc regrid`",
         )
-        raise MissingDataError(opened.location, expected=expected, found="none", advice=advice)
     if save:
         for _, sequence, name in grids:
             _check_writable(sequence, name)
