@@ -373,11 +373,9 @@ def test_a_set_that_forbids_passing_on_is_refused_with_the_reason(
     tmp_path: Path, license_: str
 ) -> None:
     root = licensed(write_dataset(tmp_path / "data"), {SCANS: license_})
-    with pytest.raises(
-        CarlascError,
-        match=r"found CC BY-(NC-)?ND \d\.0 of set of Val, which forbids that: publish instead how",
-    ):
+    with pytest.raises(CarlascError) as caught:
         write_card(root, **SAID, pictures=False)
+    assert "ND" in caught.value.found and "set of Val" in caught.value.found
     assert not (root / "README.md").exists()
 
 
@@ -386,18 +384,19 @@ def test_a_licence_in_the_data_that_nobody_knows_is_one_line(
     tmp_path: Path, license_: object
 ) -> None:
     root = licensed(write_dataset(tmp_path / "data"), {WHOLE: license_})
-    with pytest.raises(
-        FormatError, match=r"carlasc\.json: expected the name of a licence, .* look it up"
-    ):
+    with pytest.raises(FormatError) as caught:
         write_card(root, **SAID, pictures=False)
+    assert (caught.value.where, caught.value.found) == (
+        f"{root / WHOLE}/carlasc.json",
+        repr(license_),
+    )
 
 
 def test_an_unknown_licence_names_those_that_are_near(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
-    with pytest.raises(
-        ArgumentError, match=r"license: expected .*cc-by-sa-4\.0.*, found 'cc-by-sa-5\.0'"
-    ):
+    with pytest.raises(ArgumentError) as caught:
         write_card(root, license="cc-by-sa-5.0", pictures=False)
+    assert caught.value.where == "license" and "cc-by-sa-4.0" in caught.value.expected
 
 
 def test_a_licence_of_your_own_is_named_by_its_address(
@@ -417,26 +416,26 @@ def test_simulated_data_need_a_licence_from_their_author(tmp_path: Path) -> None
     assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
     assert "--license: expected the licence of these data" in result.stderr
     licensed(root, {WHOLE: None, SCANS: None})
-    with pytest.raises(ArgumentError, match="expected the licence of set of Tra and set of Val"):
+    with pytest.raises(ArgumentError) as caught:
         write_card(root, pictures=False)
+    assert "set of Tra and set of Val" in caught.value.expected
 
 
 def test_a_given_licence_does_not_replace_that_of_the_source(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     licensed(root, dict.fromkeys(carlasc.open(root).sequences(), "CC BY-NC-SA 3.0"))
-    with pytest.raises(
-        ArgumentError,
-        match=r"license: expected CC BY-NC-SA 3\.0, the licence of the source, .*, found MIT",
-    ):
+    with pytest.raises(ArgumentError) as caught:
         write_card(root, license="mit", pictures=False)
+    assert caught.value.found == "MIT" and caught.value.expected.startswith("CC BY-NC-SA 3.0")
     assert write_card(root, pictures=False).licenses == ("CC BY-NC-SA 3.0",)
 
 
 def test_an_existing_readme_is_not_replaced_unasked(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     (root / "README.md").write_text("mine")
-    with pytest.raises(ConflictError, match=r"README\.md: exists already: .*`overwrite=True`"):
+    with pytest.raises(ConflictError) as caught:
         write_card(root, **SAID, pictures=False)
+    assert Path(caught.value.where) == root / "README.md"
     assert (root / "README.md").read_text() == "mine"
     write_card(root, **SAID, pictures=False, overwrite=True)
     assert (root / "README.md").read_text().startswith("---\n")
@@ -446,8 +445,9 @@ def test_an_existing_picture_is_found_before_anything_is_counted(tmp_path: Path)
     root = write_dataset(tmp_path / "data")
     (root / "images").mkdir()
     (root / "images" / "grid.png").write_bytes(b"mine")
-    with pytest.raises(ConflictError, match=r"grid\.png: exists already"):
+    with pytest.raises(ConflictError) as caught:
         write_card(root, **SAID, run=Run(1, progress=lambda done, total: pytest.fail("counted")))
+    assert Path(caught.value.where).name == "grid.png"
     assert not (root / "README.md").exists()
 
 
@@ -460,8 +460,9 @@ def test_a_run_that_was_killed_is_finished_by_the_next(tmp_path: Path) -> None:
     assert (root / "README.md").read_bytes() == whole
     (root / "README.md").unlink()
     (root / "croissant.json").write_text('{"name": "mine"}')
-    with pytest.raises(ConflictError, match=r"croissant\.json: exists already"):
+    with pytest.raises(ConflictError) as caught:
         write_card(root, **SAID, pictures=False)
+    assert Path(caught.value.where).name == "croissant.json"
 
 
 def test_data_behind_a_url_have_their_card_in_a_folder_here(
@@ -470,10 +471,9 @@ def test_data_behind_a_url_have_their_card_in_a_folder_here(
     fsspec = pytest.importorskip("fsspec")
     source = write_zip(files_of(write_dataset(tmp_path / "data")), tmp_path / "x.zip")
     fsspec.filesystem("memory").pipe("/cards/x.zip", source.read_bytes())
-    with pytest.raises(
-        ArgumentError, match=r"out: expected a folder for the card, because memory://cards/x\.zip"
-    ):
+    with pytest.raises(ArgumentError) as caught:
         write_card("memory://cards/x.zip", **SAID, pictures=False)
+    assert caught.value.where == "out" and "memory://cards/x.zip" in caught.value.expected
     write_card("memory://cards/x.zip", tmp_path / "card", **SAID, pictures=False)
     (file,) = [
         file
@@ -496,22 +496,25 @@ def test_a_source_without_sequences_is_one_line(town: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    "given",
     [
-        ({"version": "new"}, "version: expected a version such as 1.0.0"),
-        ({"published": "yesterday"}, "published: expected a date YYYY-MM-DD"),
-        ({"url": "huggingface.co/x"}, "url: expected an address that begins with https://"),
-        ({"every": 0}, "every: expected 1 or more"),
-        ({"out": "README.md"}, "out: expected a folder, found the file"),
+        {"version": "new"},
+        {"published": "yesterday"},
+        {"url": "huggingface.co/x"},
+        {"every": 0},
+        {"out": "README.md"},
     ],
 )
-def test_wrong_arguments_are_one_line(tmp_path: Path, given: dict[str, Any], expected: str) -> None:
+def test_wrong_arguments_are_named(tmp_path: Path, given: dict[str, Any]) -> None:
     root = write_dataset(tmp_path / "data")
     (root / "README.md").write_text("mine")
-    if "out" in given:
+    (name,) = given
+    if name == "out":
         given = {"out": root / given["out"]}
-    with pytest.raises(ArgumentError, match=re.escape(expected)):
+    with pytest.raises(ArgumentError) as caught:
         write_card(root, **{**SAID, "overwrite": True, "pictures": False, **given})
+    assert caught.value.where == name
+    assert name == "out" or caught.value.found == repr(given[name]).strip()
 
 
 def test_names_in_the_data_make_no_markup(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -569,9 +572,9 @@ def test_frames_that_cannot_be_read_are_listed_and_end_with_1(tmp_path: Path) ->
 def test_a_grid_that_cannot_be_described_is_not_left_out(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "data")
     (root / WHOLE / "evaluation" / "params.json").write_text("{}")
-    with pytest.raises(FormatError, match=r"params\.json") as caught:
+    with pytest.raises(FormatError) as caught:
         write_card(root, **SAID, pictures=False)
-    assert "\n" not in str(caught.value)
+    assert "params.json" in str(caught.value) and "\n" not in str(caught.value)
     assert not (root / "README.md").exists()
 
 
