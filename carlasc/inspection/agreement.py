@@ -56,7 +56,7 @@ class GroundBelow:
 
     @property
     def share(self) -> float:
-        """Mean share of a frame's ground points that are below the grid; NaN without ground points."""
+        """Mean share of a frame's ground points that are below the grid; NaN without any."""
         shares = [float((z < self.spec.lower[2]).mean()) for z in self._heights if len(z)]
         return float(np.mean(shares)) if shares else math.nan
 

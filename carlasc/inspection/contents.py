@@ -73,8 +73,8 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
                     "copy the file: the grid is ignored without it",
                 )
     for name, spec in grids.items():
-        file, channels = f"{where}/{layout.params_file(name)}", sequence.params(name)
-        channels = channels.get("num_channels")
+        file = f"{where}/{layout.params_file(name)}"
+        channels = sequence.params(name).get("num_channels")
         classes: ClassTable | None = None
         try:
             classes = sequence.classes_of(name)
@@ -101,7 +101,7 @@ def check_documents(sequence: Sequence) -> Iterator[Finding]:
 
 
 def check_frames(sequence: Sequence) -> Iterator[Finding]:
-    """Check that frame numbers have no gaps, and that each field has the frames that it must have."""
+    """Check that frame numbers have no gaps, and that no field lacks frames or has more."""
     fields, frames = sequence.fields(), sequence.scan_frames()
     gaps = np.flatnonzero(np.diff(frames) > 1)
     if len(gaps):

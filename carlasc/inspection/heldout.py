@@ -207,7 +207,7 @@ class _HeldOutDrive:
         return self.feed.reads + len(self.frames)
 
     def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_HeldOutFrame]:
-        """Find the actors in the scans that are left, and return a task for each frame to measure."""
+        """Find the actors in the scans that are left; return a task for each frame to measure."""
         feed, inputs = self.feed, self.inputs
         actors = MovingActors()
         if feed.needs_actors:

@@ -236,9 +236,12 @@ class HeldOutScores:
         total = int(counts[_RETURNS])
         occupied = total - counts[_FREE] - counts[_UNKNOWN]
         others = (counts[i] for i in (_PASSED, _PASSED_OBJECT, _MISSED))
-        parts = (counts[_FREE], counts[_UNKNOWN], occupied, *others)
-        shares = [float(part) / total if total else None for part in parts]
-        return RayShares(total, *shares, _quantile(errors, 0.5), _quantile(errors, 0.9))
+        free, unknown, hit, passed, passed_object, missed = (
+            float(part) / total if total else None
+            for part in (counts[_FREE], counts[_UNKNOWN], occupied, *others)
+        )
+        median, most = _quantile(errors, 0.5), _quantile(errors, 0.9)
+        return RayShares(total, free, unknown, hit, passed, passed_object, missed, median, most)
 
 
 def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> NDArray[np.bool_]:

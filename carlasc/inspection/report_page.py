@@ -179,7 +179,7 @@ def _table(
 
 
 def _bars(rows: Sequence[tuple[str, float]]) -> str:
-    """Return horizontal bars of shares, on a square-root scale, so that small shares can be seen."""
+    """Return horizontal bars of shares; a square-root scale shows small shares, too."""
     lines = []
     for row, (label, share) in enumerate(rows):
         y, width = row * _ROW, 520 * share**0.5

@@ -249,7 +249,7 @@ class _ReportMaker:
 
 
 def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
-    """Return the scans that a grid was made from, if they are in the same sequence; None otherwise."""
+    """Return the scans that a grid was made from; None if they are not in the same sequence."""
     record = sequence.params(grid).get(RECORD)
     if not isinstance(record, dict) or "points" not in sequence.fields():
         return None
@@ -272,7 +272,7 @@ def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
 
 
 def _options_of(record: Mapping[str, Any]) -> FromScans:
-    """Return the options in the record of a run; options that it does not name have their defaults."""
+    """Return the options in the record of a run; others have their defaults."""
     given = {
         option.name: record[option.name] for option in fields(FromScans) if option.name in record
     }

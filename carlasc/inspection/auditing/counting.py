@@ -233,7 +233,7 @@ class FrameCounter:
         return placed[self.matched.spec.flat_index(placed) >= 0]
 
     def _add_held_out(self, sums: Sums, seen: _Frame) -> None:
-        """Count the returns of static classes in the nearest scans that took no part in the grid."""
+        """Count static returns of the nearest scans that took no part in the grid."""
         if self.window is None or seen.known is None:
             return
         for other in (seen.number + self.window[0] - 1, seen.number + self.window[1] + 1):
@@ -308,7 +308,7 @@ class FrameCounter:
         points: NDArray[np.floating],
         wrong: NDArray[np.bool_],
     ) -> None:
-        """Add (K, B, H, 2) counts by class, distance and height: all of them, and the wrong ones."""
+        """Add (K, B, H, 2) counts by class, distance and height: all, and the wrong ones."""
         low, high = self.matched.spec.lower[2], self.matched.spec.upper[2]
         heights = np.clip((points[:, 2] - low) / (high - low) * HEIGHTS, 0, HEIGHTS - 1).astype(
             np.int64
@@ -378,7 +378,7 @@ class FrameCounter:
         return trails.reshape(seen.occupied.shape)
 
     def _members(self, seen: _Frame) -> list[tuple[str, NDArray[np.integer]]]:
-        """Return the points of each actor in a scan: by instances, or by tracks of moving actors."""
+        """Return the points of each actor in a scan, by instances or by tracks."""
         ids, labels = seen.scan.instances, seen.scan.labels
         if ids is None or not ids.any():
             tracks = self.actors.tracks.items()

@@ -93,7 +93,7 @@ class MatchedGrids:
 
     @property
     def axes(self) -> str:
-        """Handedness of the grids: "left" or "right"; formats of other benchmarks are right-handed."""
+        """Handedness of the grids: "left" or "right", as formats of other benchmarks are."""
         return (
             self.grids.sequence.metadata.axes if isinstance(self.grids, SequenceGrid) else "right"
         )
@@ -185,7 +185,7 @@ class MatchedGrids:
     def trajectory(
         self,
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
-        """(F,) frames with scans, their seconds, and their (F, 4, 4) poses, None without poses.txt."""
+        """(F,) frames with scans, their seconds, and (F, 4, 4) poses; None without poses.txt."""
         frames, documents = self.scans.frames("points"), self.scans.documents()
         poses = (
             np.stack([self.scans.read_pose(f) for f in frames.tolist()])

@@ -69,7 +69,7 @@ def croissant(
 
 
 def _id(name: str) -> str:
-    """Return a name as a part of an IRI: names of grids, class tables and sequences come from data."""
+    """Return a name, which comes from the data, as a part of an IRI."""
     return quote(name, safe="/._-")
 
 

@@ -189,9 +189,10 @@ class Facts:
             if report.inferred_share:
                 yield say("inferred", share=f"{report.inferred_share:.1%}", grid=name)
         for near, far in sorted({(m.min_range_m, m.max_range_m) for m in self.metadata}, key=str):
-            limits = (near and f"nearer than {near:g} m", far and f"farther than {far:g} m")
-            if any(limits):
-                yield say("ranges", limits=" or ".join(filter(None, limits)))
+            limits = [f"nearer than {near:g} m"] if near else []
+            limits += [f"farther than {far:g} m"] if far else []
+            if limits:
+                yield say("ranges", limits=" or ".join(limits))
         if self.lossy_mm:
             yield say("rounded", step=f"{self.lossy_mm:g}")
         if self.every > 1:

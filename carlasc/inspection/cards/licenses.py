@@ -1,4 +1,4 @@
-"""Licences of data: their names, what they permit, and the licences of the sequences of a data set."""
+"""Licences of data: their names, what they permit, and those of the sequences of a data set."""
 
 from __future__ import annotations
 

@@ -127,8 +127,10 @@ class Place:
 
     def measure(self, path: str) -> tuple[str, int]:
         """Return the SHA-256 of a file, 64 hexadecimal digits, and its bytes."""
-        remote = self.local is None
-        opened = RemoteTree(self.location).open(path) if remote else (self.local / path).open("rb")
+        if self.local is None:
+            opened = RemoteTree(self.location).open(path)
+        else:
+            opened = (self.local / path).open("rb")
         with opened as file:
             return hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
 

@@ -20,7 +20,7 @@ class Table(NamedTuple):
     name: str
     section: str
     title: str
-    columns: tuple[str, ...]
+    columns: list[str]
     rows: list[tuple[str | int | float | None, ...]]
 
 
@@ -39,7 +39,7 @@ def tables_of_card(facts: Facts) -> Iterator[Table]:
             if points[index] or voxels[index]
         ]
         title = say("classes", name=one.classes.name)
-        columns = ("id", "name", "points", "voxels")
+        columns = "id name points voxels".split()
         yield Table(f"classes-{one.classes.name}", "classes", title, columns, [*shares])
     overviews = {one.path: one for one in facts.overview.sequences}
     sequences = sorted(
@@ -54,7 +54,7 @@ def tables_of_card(facts: Facts) -> Iterator[Table]:
         for part in facts.parts
         for path in part.paths
     )
-    columns = ("path", "split", "frames", "source", "license", "classes")
+    columns = "path split frames source license classes".split()
     yield Table("sequences", "sequences", say("sequences"), columns, [*sequences])
     if facts.grids:
         grids = [
@@ -69,7 +69,7 @@ def tables_of_card(facts: Facts) -> Iterator[Table]:
             )
             for grid, number, frames in facts.grids
         ]
-        columns = ("grid", "coordinates", "size", "voxel_size", "sequences", "frames", "settings")
+        columns = "grid coordinates size voxel_size sequences frames settings".split()
         yield Table("grids", "grids", say("grids"), columns, [*grids])
     if facts.reports:
         reports = [
@@ -82,7 +82,7 @@ def tables_of_card(facts: Facts) -> Iterator[Table]:
             )
             for name, one in facts.reports.items()
         ]
-        columns = ("grid", "known", "occupied", "changed", "made_with")
+        columns = "grid known occupied changed made_with".split()
         yield Table("reports", "grids", say("reports"), columns, [*reports])
     licenses = [
         (
@@ -95,7 +95,7 @@ def tables_of_card(facts: Facts) -> Iterator[Table]:
         )
         for part in facts.parts
     ]
-    columns = ("source", "license", "url", "conditions", "sequences", "named_by")
+    columns = "source license url conditions sequences named_by".split()
     yield Table("licenses", "licenses", say("licenses"), columns, [*licenses])
 
 
