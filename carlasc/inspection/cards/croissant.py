@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from carlasc.inspection.cards.card_tables import Table, settings_of, tables_of_card
 from carlasc.inspection.cards.facts import CardDetails, Facts
 from carlasc.inspection.cards.places import Place, PublishedTable
-from carlasc.inspection.cards.tables import Table, settings_of, tables_of_card
 from carlasc.inspection.texts import read
 from carlasc.storage import layout
 

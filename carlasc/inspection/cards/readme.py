@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from carlasc.errors import count, printable
+from carlasc.inspection.cards.card_tables import Table, tables_of_card
 from carlasc.inspection.cards.facts import STATEMENTS, CardDetails, Facts
 from carlasc.inspection.cards.places import Place, PublishedTable
-from carlasc.inspection.cards.tables import Table, tables_of_card
 from carlasc.inspection.texts import fill, say
 
 _SIZES = (
