@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Annotated
 
@@ -16,19 +17,26 @@ from carlasc.cli.common import (
 )
 from carlasc.cli.flags import OneWorkerFlags
 from carlasc.cli.library import Given, Library
-from carlasc.errors import MissingDataError, count
+from carlasc.errors import FormatError, MissingDataError, count
 
 
 def _details(given: Given) -> carlasc.CardDetails:
-    """Return the details of the card, with the text of the BibTeX file."""
-    file: Path | None = given.values.get("citation")
-    if file is None:
-        return given.make()
-    if not file.is_file():
-        raise MissingDataError(
-            file, expected="a BibTeX file", found="nothing", advice="check the path"
-        )
-    return given.make(citation=file.read_text(errors="replace"))
+    """Return the details of the card, with the contents of the files that are given."""
+    texts = {}
+    for name, kind in (("citation", "a BibTeX file"), ("statements", "a TOML file")):
+        file: Path | None = given.values.get(name)
+        if file is None:
+            continue
+        if not file.is_file():
+            raise MissingDataError(file, expected=kind, found="nothing", advice="check the path")
+        texts[name] = file.read_text(errors="replace")
+    contents: dict[str, object] = {**texts}
+    try:
+        if "statements" in texts:
+            contents["statements"] = tomllib.loads(texts["statements"])
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(given.values["statements"], problem=f"no TOML: {error}") from error
+    return given.make(**contents)
 
 
 def card(

@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from carlasc.cli.common import FAILED, Json, echo, file_argument, print_json
+from carlasc.cli.common import FAILED, Json, echo, print_json
 
 if TYPE_CHECKING:
     from carlasc.inspection.installation import Extra, Installation
 
 
-def doctor(
-    folder: Annotated[
-        Path | None,
-        file_argument(
-            "Folder whose disk speed is measured. Default: the folder for temporary files.",
-            "FOLDER",
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
+def doctor(as_json: Json = False) -> None:
     """Print the installed packages and the properties of the machine, as text to paste into an
     issue. User names are left out.
     """
     from carlasc.inspection.installation import doctor as look
 
-    found = look(folder)
+    found = look()
     if as_json:
         print_json(found)
     else:
@@ -70,10 +60,8 @@ def _lines(found: Installation) -> Iterator[str]:
         yield "\ncompiled code"
         yield f"  {code.folder} ({state}): {code.files} files, {code.bytes / 1e6:.1f} MB"
         yield f"  a loop of one line compiles in {code.compile_s:.2f} s"
-    disk = found.disk
-    yield "\ndisk"
-    yield f"  {disk.folder}: {disk.free_bytes / 1e9:.1f} GB free; files are {'synced' if found.durable else 'not synced'} before they are renamed to their final names"
-    yield f"  32 MB: written and synced at {disk.write_mb_s:.0f} MB/s, read at {disk.read_mb_s:.0f} MB/s; 4 kB: synced in {disk.sync_ms:.1f} ms"
+    synced = "synced" if found.durable else "not synced"
+    yield f"\nfiles are {synced} before they are renamed to their final names"
     yield "\nmissing"
     missing = [extra for extra in found.extras if extra.problems]
     for extra in missing:

@@ -46,7 +46,7 @@ TABLE = {
     "carlasc.CameraOptions": Shown("Camera"),
     "carlasc.CardDetails": Shown(
         "Details of the publication",
-        files="citation",
+        files="citation statements",
         renamed={"authors": "--author", "version": "--data-version"},
     ),
     "carlasc.FromScans": Shown("Scans merged over time"),
@@ -152,7 +152,7 @@ class Library:
             text = FRAMES_HELP if kind.metavar and kind.reader is read_frames else ""
             yield make_option(
                 self._parameter(name),
-                ValueKind(Path, read_file, "FILE") if name in shown.files.split() else kind,
+                kind,
                 typed[name],
                 text or _help(declaration.text, typed),
                 default=declaration.default,
@@ -168,12 +168,16 @@ class Library:
         return f"{self.name.rpartition('.')[2]}{SEPARATOR}{name}"
 
     def _options(self) -> Iterator[tuple[str, tuple[Declaration, ValueKind]]]:
-        hidden = TABLE.get(self.name, Shown()).hidden.split()
+        shown = TABLE.get(self.name, Shown())
         for name, declaration in declarations(self.name).items():
-            known = next(
-                (kind for one, kind in _KINDS.items() if one in declaration.annotations), None
+            known = (
+                ValueKind(Path, read_file, "FILE")
+                if name in shown.files.split()
+                else next(
+                    (kind for one, kind in _KINDS.items() if one in declaration.annotations), None
+                )
             )
-            if known and name not in hidden and name in (self.only.split() or [name]):
+            if known and name not in shown.hidden.split() and name in (self.only.split() or [name]):
                 yield name, (declaration, known)
 
 

@@ -8,6 +8,7 @@ direction. Only points in known voxels count, so that unknown voxels do not lowe
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from collections.abc import Sequence as Series
@@ -16,110 +17,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.cells import Triple
-from carlasc.core.compiling import cached
+from carlasc.core.axes import choices_of_axes
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.groundtruth.reporting.facts import ActorTrack
-from carlasc.inspection.findings import Finding, Severity
+from carlasc.inspection.findings import Finding
+from carlasc.inspection.points_in_voxels import labels_at
 from carlasc.motion.tracks import is_doubtful
 from carlasc.storage.protocol import Sequence
 
 _DOUBTFUL_ACTORS = 0.25  # a greater share of doubtful actors is a warning
-KNOWN, RIGHT, OCCUPIED = 0, 1, 2
-"""Columns of what `Voxels.count` returns."""
-
-
-class Voxels:
-    """The voxels of a grid, in the types that the compiled loop takes."""
-
-    def __init__(self, grid: Grid) -> None:
-        self._spec = grid.spec
-        self._labels = np.ascontiguousarray(grid.labels, np.uint32).reshape(-1)
-        self._known = np.ascontiguousarray(grid.known).reshape(-1)
-
-    def count(
-        self, points: NDArray[np.floating], labels: NDArray[np.integer], shifts: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
-        """Count points by the labels of their voxels, in grids whose labels are `shifts` cells too
-        far along the axes.
-
-        The azimuth of a full turn is periodic. A point outside of a shifted grid counts as in the
-        grid without a shift. A point outside of the grid without a shift does not count.
-
-        Args:
-            points: (N, 3) metres.
-            labels: (N,) class ids.
-            shifts: (S, 3) cells.
-
-        Returns:
-            (S, 3) numbers of points in known voxels, in known voxels of their class, and in known
-            voxels of any class but free.
-        """
-        spec = self._spec
-        lower, upper = spec.lower, spec.upper
-        x, y, z = spec.voxel_size.tolist()
-        full_turn = spec.coordinates == "cylindrical" and upper[1] - lower[1] > 2 * math.pi - 1e-3
-        counted = np.zeros((len(shifts), 3), np.int64)
-        axes = np.ascontiguousarray(spec.to_axes(points), np.float64)
-        classes = labels.astype(np.int64)
-        _count(
-            axes,
-            classes,
-            shifts,
-            spec.size,
-            lower,
-            upper,
-            (x, y, z),
-            full_turn,
-            self._labels,
-            self._known,
-            counted,
-        )
-        return counted
-
-
-@cached
-def _count(
-    axes: NDArray[np.float64],
-    labels: NDArray[np.int64],
-    shifts: NDArray[np.int64],
-    size: tuple[int, int, int],
-    lower: Triple,
-    upper: Triple,
-    voxel_size: Triple,
-    full_turn: bool,
-    voxels: NDArray[np.uint32],
-    known: NDArray[np.bool_],
-    counted: NDArray[np.int64],
-) -> None:
-    """Add points to `counted`.
-
-    They have the axes of the grid, and their cells are computed as in `GridSpec.index`.
-    """
-    depth, width, height = size
-    for point in range(len(axes)):
-        first, second, third = axes[point, 0], axes[point, 1], axes[point, 2]
-        if not (
-            lower[0] <= first < upper[0]
-            and lower[1] <= second < upper[1]
-            and lower[2] <= third < upper[2]
-        ):
-            continue
-        i = min(int((first - lower[0]) / voxel_size[0]), depth - 1)
-        j = min(int((second - lower[1]) / voxel_size[1]), width - 1)
-        k = min(int((third - lower[2]) / voxel_size[2]), height - 1)
-        for s in range(len(shifts)):
-            x, y, z = i + shifts[s, 0], j + shifts[s, 1], k + shifts[s, 2]
-            if full_turn:
-                y %= width
-            if not (0 <= x < depth and 0 <= y < width and 0 <= z < height):
-                x, y, z = i, j, k
-            voxel = (x * width + y) * height + z
-            if known[voxel]:
-                counted[s, 0] += 1
-                counted[s, 1] += voxels[voxel] == labels[point]
-                counted[s, 2] += voxels[voxel] != 0
-
 
 # Share of the ground points within the other bounds of a grid. With the published bounds, it is 0.0
 # % on the simulated drives with flat ground, 2.6 % on average (6.6 % in one frame) on a real drive
@@ -144,18 +50,13 @@ class GroundBelow:
 
         Those outside of the grid's other bounds do not count.
         """
-        axes, lower, upper = (
-            self.spec.to_axes(ground),
-            np.array(self.spec.lower),
-            np.array(self.spec.upper),
-        )
-        first, second = ((axes[:, a] >= lower[a]) & (axes[:, a] < upper[a]) for a in (0, 1))
-        inside = first & second
+        axes, lower, upper = self.spec.to_axes(ground), self.spec.lower, self.spec.upper
+        inside = ((axes[:, :2] >= lower[:2]) & (axes[:, :2] < upper[:2])).all(axis=1)
         self._heights.append(ground[inside, 2])
 
     @property
     def share(self) -> float:
-        """Mean share of a frame's ground points that are below the grid; NaN without ground points."""
+        """Mean share of a frame's ground points that are below the grid; NaN without any."""
         shares = [float((z < self.spec.lower[2]).mean()) for z in self._heights if len(z)]
         return float(np.mean(shares)) if shares else math.nan
 
@@ -166,23 +67,20 @@ class GroundBelow:
         """
         if not self.share > _SHARE:
             return
-        z0, z1 = self.spec.lower[2], self.spec.upper[2]
-        lowest = (
-            math.floor(10 * float(np.quantile(np.concatenate(self._heights), _LOWEST))) / 10 - 0.1
-        )
-        bounds = [
-            value
-            for pair in zip(self.spec.lower[:2], self.spec.upper[:2], strict=True)
-            for value in pair
-        ]
+        (x0, y0, z0), (x1, y1, z1) = self.spec.lower, self.spec.upper
         if self.spec.coordinates == "cylindrical":
-            bounds[2:] = np.degrees(bounds[2:]).tolist()
-        text = ",".join(f"{value:.6g}" for value in (*bounds, lowest, lowest + z1 - z0))
-        found = f"{self.share:.0%} of the points on the ground below it, in no voxel"
-        advice = f"make the grid again with lower bounds: `carlasc regrid --bounds={text}`"
-        expected = f"ground points above the lower bound of the grid, z = {z0:g} m"
-        where = f"{sequence.location}/{grid}"
-        yield Finding("warning", "ground-below-grid", sequence.path, where, expected, found, advice)
+            y0, y1 = np.degrees((y0, y1)).tolist()
+        lowest = float(np.quantile(np.concatenate(self._heights), _LOWEST))
+        lowest = math.floor(10 * lowest) / 10 - 0.1
+        bounds = ",".join(f"{v:.6g}" for v in (x0, x1, y0, y1, lowest, lowest + z1 - z0))
+        yield Finding(
+            "warning",
+            "ground-below-grid",
+            f"{sequence.location}/{grid}",
+            f"ground points above the lower bound of the grid, z = {z0:g} m",
+            f"{self.share:.0%} of the points on the ground below it, in no voxel",
+            f"make the grid again with lower bounds: `carlasc regrid --bounds={bounds}`",
+        )
 
 
 _MIN_POINTS = 100
@@ -196,42 +94,27 @@ _LARGE_GAIN = 0.05
 _WINS = 0.75
 _TIE = 0.005  # if the shares of two mistakes differ by less, the first one is reported
 
-# description of the mistake, and the matrix that corrects it
-_AXES: tuple[tuple[str, NDArray[np.float64]], ...] = (
-    ("points with y mirrored against the grid", np.diag([1.0, -1, 1])),
-    ("points with x mirrored against the grid", np.diag([-1.0, 1, 1])),
-    ("points turned by half a turn against the grid", np.diag([-1.0, -1, 1])),
-    (
-        "points with x and y exchanged against the grid",
-        np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]),
-    ),
-    (
-        "points turned by a quarter turn against the grid",
-        np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
-    ),
-    (
-        "points turned by a quarter turn against the grid",
-        np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]),
-    ),
-    ("points upside down (z mirrored) against the grid", np.diag([1.0, 1, -1])),
-    ("points upside down (y and z mirrored) against the grid", np.diag([1.0, -1, -1])),
-    (
-        "points in camera axes (x right, y down, z forward)",
-        np.array([[0.0, 0, 1], [1, 0, 0], [0, -1, 0]]),
-    ),
-    (
-        "points in camera axes (x right, y down, z forward)",
-        np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
-    ),
+# description of the mistake, and the axes that correct it (see `choices_of_axes`)
+_CAMERA = "points in camera axes (x right, y down, z forward)"
+_AXES = (
+    ("points with y mirrored against the grid", "x, -y, z"),
+    ("points with x mirrored against the grid", "-x, y, z"),
+    ("points turned by half a turn against the grid", "-x, -y, z"),
+    ("points with x and y exchanged against the grid", "y, x, z"),
+    ("points turned by a quarter turn against the grid", "y, -x, z"),
+    ("points turned by a quarter turn against the grid", "-y, x, z"),
+    ("points upside down (z mirrored) against the grid", "x, y, -z"),
+    ("points upside down (y and z mirrored) against the grid", "x, -y, -z"),
+    (_CAMERA, "z, x, -y"),
+    (_CAMERA, "z, -x, -y"),
 )
-_STEPS = (-1, 0, 1)
-_SHIFTS = tuple(  # nearest first
-    sorted(
-        ((x, y, z) for x in _STEPS for y in _STEPS for z in _STEPS if x or y or z),
-        key=lambda s: sum(map(abs, s)),
-    )
+_MATRICES = dict(choices_of_axes())
+_TURNED = np.array([np.pad(_MATRICES[axes], ((0, 0), (0, 2))) for _, axes in _AXES])
+_SHIFTS = sorted(  # nearest first
+    (shift for shift in itertools.product((-1, 0, 1), repeat=3) if any(shift)),
+    key=lambda shift: sum(map(abs, shift)),
 )
-_AS_IS_AND_SHIFTED = np.array([(0, 0, 0), *_SHIFTS], np.int64)
+_SHIFTED = np.array([(0, 0, 0), *_SHIFTS], np.int64)  # first as it is
 
 
 @dataclass(frozen=True)
@@ -279,27 +162,19 @@ class GridEvidence:
                 any class but free.
             grid: the grid of this frame, with geometry `spec`.
         """
-        if labels is None:  # any class but free is right
-            labels, chosen, right = (
-                np.zeros(len(points), np.uint8),
-                np.arange(len(points)),
-                OCCUPIED,
-            )
-        else:
-            chosen, right = np.flatnonzero(labels), RIGHT
+        chosen = np.arange(len(points)) if labels is None else np.flatnonzero(labels)
         chosen = chosen[:: max(1, len(chosen) // _MAX_POINTS)]
-        points, labels, voxels = points[chosen], labels[chosen], Voxels(grid)
-        as_is = voxels.count(points, labels, _AS_IS_AND_SHIFTED)
-        exact = points.astype(np.float64)
-        turned = [
-            voxels.count(exact @ matrix.T, labels, _AS_IS_AND_SHIFTED[:1]) for _, matrix in _AXES
-        ]
-        counted = np.concatenate([as_is[:1], *turned, as_is[1:]])
-        if counted[: 1 + len(_AXES), KNOWN].max() < _MIN_POINTS:
+        shifted = labels_at(points[chosen], grid.spec, grid.labels, grid.known, shifts=_SHIFTED)[0]
+        turned = labels_at(points[chosen], grid.spec, grid.labels, grid.known, warps=_TURNED)[:, 0]
+        at_points = np.concatenate([shifted[:1], turned, shifted[1:]])
+        known, occupied = at_points >= 0, at_points > 0
+        counted = known.sum(axis=1)
+        if counted[: 1 + len(_AXES)].max() < _MIN_POINTS:
             return
-        self._right.append(counted[:, right])
-        self._known.append(counted[:, KNOWN])
-        self._occupied.append(float(as_is[0, OCCUPIED] / max(as_is[0, KNOWN], 1)))
+        right = occupied if labels is None else known & (at_points == labels[chosen])
+        self._right.append(right.sum(axis=1))
+        self._known.append(counted)
+        self._occupied.append(float(occupied[0].sum() / max(counted[0], 1)))
 
     def diagnose(self) -> GridDiagnosis:
         """Return the share of right points over the frames added so far, and the mistake, if any,
@@ -350,17 +225,14 @@ def check_actors(sequence: Sequence, grid: str, actors: Series[ActorTrack]) -> I
     """Yield how many actors of a grid's report were found by free space alone: a warning if many of
     them are doubtful.
     """
-    found = [actor for actor in actors if actor.confidence < 1]
-    if found:
-        doubtful = sum(is_doubtful(actor.confidence) for actor in found)
-        severity: Severity = (
-            "warning" if doubtful > max(_DOUBTFUL_ACTORS * len(found), 2) else "note"
-        )
-        what = f"{len(found)} actors found by free space, {doubtful} of them doubtful"
-        expected, advice = (
-            "actors that move with certainty",
-            "check the actors in the report, or give labels, boxes or flow",
-        )
+    doubtful = [is_doubtful(actor.confidence) for actor in actors if actor.confidence < 1]
+    if doubtful:
+        is_much = sum(doubtful) > max(_DOUBTFUL_ACTORS * len(doubtful), 2)
         yield Finding(
-            severity, "actors", sequence.path, f"{sequence.location}/{grid}", expected, what, advice
+            "warning" if is_much else "note",
+            "actors",
+            f"{sequence.location}/{grid}",
+            "actors that move with certainty",
+            f"{len(doubtful)} actors found by free space, {sum(doubtful)} of them doubtful",
+            "check the actors in the report, or give labels, boxes or flow",
         )

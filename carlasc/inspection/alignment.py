@@ -11,9 +11,9 @@ axis, for instance, changes nothing on a straight road.
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -122,11 +122,12 @@ def diagnose_poses(
     """
     corrections = known_corrections()
     corrected = [poses, *(correction.undo(poses) for correction in corrections)]
-    pairs, scans, shares, judged = [], [], [], []
+    overlaps, shares, judged = [], [], []
     chosen = choose_pairs(poses, max_pairs)
-    structure = _Once(structure, Counter(itertools.chain.from_iterable(chosen)))
+    # Pairs are in the order of time, so that a scan is read once although it is in several pairs.
+    recent = lru_cache(2 * _REACH)(structure)
     for earlier, later in chosen:
-        target, source = structure(earlier), structure(later)
+        target, source = recent(earlier), recent(later)
         moved = _thin(source, _MAX_POINTS)
         if min(len(target), len(moved)) < _MIN_POINTS:
             continue
@@ -135,8 +136,7 @@ def diagnose_poses(
         motions = invert(ends[:, 0]) @ ends[:, 1]
         distances = [_extent(between) for between in invert(motions) @ motions[0]]
         own = overlap(occupied, motions[0], moved)
-        pairs.append((earlier, later))
-        scans.append((target, moved, _thin(source, _OFFSET_POINTS)))
+        overlaps.append((target, _thin(source, _OFFSET_POINTS), motions[0]))
         judged.append([distance > _JUDGED_M for distance in distances])
         shares.append(
             [
@@ -144,21 +144,20 @@ def diagnose_poses(
                 for motion, distance in zip(motions, distances, strict=True)
             ]
         )
-    if not pairs:
+    if not overlaps:
         return PoseDiagnosis(float("nan"), 0)
     own = float(np.mean([row[0] for row in shares]))
     best = _best_correction(np.array(shares), np.array(judged), corrections)
     if best is not None:
         index, share_there, corrected_share = best
-        return PoseDiagnosis(own, len(pairs), corrections[index - 1], corrected_share, share_there)
-    ways = [relative(poses, earlier, later) for earlier, later in pairs]
-    quality = measure_poses(structure.again if points is None else points, poses, seconds)
+        return PoseDiagnosis(
+            own, len(overlaps), corrections[index - 1], corrected_share, share_there
+        )
+    quality = measure_poses(points or structure, poses, seconds)
     explained = quality.mounting is not None and bool(quality.mounting.wrong.any())
     search = not explained and own < _GOOD
-    overlaps = [(target, few, way) for (target, _, few), way in zip(scans, ways, strict=True)]
-    return PoseDiagnosis(
-        own, len(pairs), quality=quality, offset_m=_common_offset(overlaps) if search else None
-    )
+    offset = _common_offset(overlaps) if search else None
+    return PoseDiagnosis(own, len(overlaps), quality=quality, offset_m=offset)
 
 
 def choose_pairs(poses: Poses, max_pairs: int) -> list[tuple[int, int]]:
@@ -186,25 +185,23 @@ def known_corrections() -> tuple[Correction, ...]:
         Correction(name, advice, _in_axes(matrix), rank >= _COMMON_AXES)
         for rank, (name, advice, matrix) in mistakes
     ]
-    others = [
-        Correction(
-            "transposed rotations",
-            "write R instead of its transpose (the matrices were probably read column by column)",
-            _transpose,
-        ),
-        Correction(
-            "inverted transforms (first frame to sensor)",
-            "invert the transforms: they must lead from the sensor to the first frame",
-            invert,
-        ),
-        Correction(
-            "scans that are all in one frame, with the poses of a moving sensor",
-            "move each scan to the frame of its own sensor, or take the poses of this sequence",
-            lambda p: np.tile(np.eye(4), (len(p), 1, 1)),
-            factor=_STANDING,
-        ),
-    ]
-    return (*axes[:1], *others[:2], *axes[1:], *others[2:])
+    transposed = Correction(
+        "transposed rotations",
+        "write R instead of its transpose (the matrices were probably read column by column)",
+        _transpose,
+    )
+    inverted = Correction(
+        "inverted transforms (first frame to sensor)",
+        "invert the transforms: they must lead from the sensor to the first frame",
+        invert,
+    )
+    standing = Correction(
+        "scans that are all in one frame, with the poses of a moving sensor",
+        "move each scan to the frame of its own sensor, or take the poses of this sequence",
+        lambda p: np.tile(np.eye(4), (len(p), 1, 1)),
+        factor=_STANDING,
+    )
+    return (axes[0], transposed, inverted, *axes[1:], standing)
 
 
 def relative(poses: Poses, earlier: int, later: int) -> Transform:
@@ -279,7 +276,7 @@ def _partner(poses: Poses, first: int) -> int:
     if the poses do not move.
     """
     last = min(first + _REACH, len(poses) - 1)
-    if _distance(poses[first], poses[last]) < _DIFFERENT_M:
+    if _extent(relative(poses, first, last)) < _DIFFERENT_M:
         # the sensor may have moved nevertheless: one frame apart shows a fast motion, four frames
         # apart a slow one
         return min(first + (1, 4)[first % 2], last)
@@ -290,41 +287,12 @@ def _partner(poses: Poses, first: int) -> int:
     return last
 
 
-class _Once:
-    """The structure of scans, each of which is read once and kept until its last use.
-
-    Args:
-        structure: returns the structure of the i-th scan.
-        uses: how often each scan will be asked for.
-    """
-
-    def __init__(self, structure: Callable[[int], NDArray[np.float64]], uses: Counter[int]) -> None:
-        self._structure, self._uses = structure, uses
-        self._kept: dict[int, NDArray[np.float64]] = {}
-
-    def again(self, index: int) -> NDArray[np.float64]:
-        """Return (M, 3) points, which are read again."""
-        return self._structure(index)
-
-    def __call__(self, index: int) -> NDArray[np.float64]:
-        """Return (M, 3) points."""
-        if index not in self._kept:
-            self._kept[index] = self._structure(index)
-        self._uses[index] -= 1
-        return self._kept[index] if self._uses[index] else self._kept.pop(index)
-
-
 def _thin(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     return points[:: max(1, len(points) // count)]
 
 
 def _angle(motion: Transform) -> float:
     return float(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1.0, 1.0)))
-
-
-def _distance(a: Transform, b: Transform) -> float:
-    """Return about how far apart, in metres, two motions put a point that is 15 m away."""
-    return _extent(invert(a) @ b)
 
 
 def _extent(motion: Transform) -> float:
@@ -355,6 +323,7 @@ def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
     # x right, y down, z forward, from x forward, y left, z up
     camera_of_kitti = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     camera_advice = "convert them to the frame of the LiDAR: inv(Tr) @ P @ Tr, Tr from calib.txt"
+    camera = "camera-frame poses (x right, y down, z forward)"
     mistakes = [
         (
             "poses with y mirrored against the scans",
@@ -362,12 +331,8 @@ def _axes_mistakes() -> list[tuple[str, str, NDArray[np.float64]]]:
             "diag(1, -1, 1, 1)) or in neither",
             mirrored,
         ),
-        ("camera-frame poses (x right, y down, z forward)", camera_advice, camera_of_kitti),
-        (
-            "camera-frame poses (x right, y down, z forward)",
-            camera_advice,
-            camera_of_kitti @ mirrored,
-        ),
+        (camera, camera_advice, camera_of_kitti),
+        (camera, camera_advice, camera_of_kitti @ mirrored),
         ("camera-frame poses with y mirrored", camera_advice, mirrored @ camera_of_kitti),
         (
             "camera-frame poses with y mirrored",

@@ -21,49 +21,40 @@ class Finding:
             "note": no fault, for information.
         check: short name of the check that found it, such as "file-size"; findings are grouped by
             it.
-        sequence: path of the sequence in its Source.
         location: the file or the folder.
         expected: the content that the file should have.
         found: the content that it has.
         advice: what to do; may be empty.
+        sequence: path of the sequence in its Source; `validate` fills it in.
     """
 
     severity: Severity
     check: str
-    sequence: str
     location: str
     expected: str
     found: str
     advice: str = ""
+    sequence: str = ""
 
     @classmethod
     def from_error(
-        cls, check: str, sequence: str, location: str, error: CarlascError, advice: str = ""
+        cls, check: str, location: str, error: CarlascError, advice: str = ""
     ) -> Finding:
         """Turn an error of the library into a finding of severity "error".
 
         Args:
             check: short name of the check.
-            sequence: path of the sequence in its Source.
             location: the file or the folder, for an error without a location.
             error: its parts become the parts of the finding.
             advice: for an error without advice.
         """
-        advice = error.advice or advice
-        if error.expected:
-            found = f"{error.problem}: {error.found}" if error.problem else error.found
-            return cls("error", check, sequence, error.where, error.expected, found, advice)
+        expected, found, where = error.expected, error.found, error.where
         if error.problem:
-            return cls(
-                "error",
-                check,
-                sequence,
-                error.where,
-                "data that can be read",
-                error.problem,
-                advice,
-            )
-        return cls("error", check, sequence, location, "data that can be read", error.where, advice)
+            found = f"{error.problem}: {found}" if expected else error.problem
+        elif not expected:  # all that the error says is in its first part
+            found, where = where, location
+        expected = expected or "data that can be read"
+        return cls("error", check, where, expected, found, error.advice or advice)
 
     def __str__(self) -> str:
         text = f"{self.location}: expected {self.expected}, found {self.found}"

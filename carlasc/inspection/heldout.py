@@ -33,9 +33,8 @@ from carlasc.storage.protocol import Sequence, Source
 
 EVERY = 10
 """Default of `every`: every tenth scan is left out."""
-_NEARLY_WHOLE = (
-    0.8  # a frame is measured if its window has this share of the scans of a whole window
-)
+# a frame is measured if its window has this share of the scans of a whole window
+_NEARLY_WHOLE = 0.8
 
 
 @dataclass(frozen=True)
@@ -160,10 +159,10 @@ def holdout(
     failures = []
     with closing(run_all(_run_task, tasks, run, lost=_fail)) as results:
         for task, outcome in zip(tasks, results, strict=True):
-            found = scores if task.is_used else before
+            totals = scores if task.is_used else before
             if not isinstance(outcome, str):
-                found[task.path] = (
-                    found[task.path].merge(outcome) if task.path in found else outcome
+                totals[task.path] = (
+                    totals[task.path].merge(outcome) if task.path in totals else outcome
                 )
             elif task.is_used:
                 failures.append(FrameFailure(task.whole.location, task.frame, outcome))
@@ -193,12 +192,11 @@ class _HeldOutDrive:
         enough = _NEARLY_WHOLE * max(len(whole.window_of(int(frame))) for frame in whole.frames)
         chosen = [frame for frame in hidden if frame in inputs.plan.frames]
         if not chosen:
-            expected, advice = (
-                f"frames to leave out in {inputs.plan.frames}",
-                "choose a smaller `every`",
-            )
             raise MissingDataError(
-                inputs.location, expected=expected, found=f"only {hidden}", advice=advice
+                inputs.location,
+                expected=f"frames to leave out in {inputs.plan.frames}",
+                found=f"only {hidden}",
+                advice="choose a smaller `every`",
             )
         measured = [frame for frame in chosen if len(whole.window_of(frame)) >= enough] or chosen
         return cls(inputs, whole.without(hidden), tuple(measured))
@@ -209,7 +207,7 @@ class _HeldOutDrive:
         return self.feed.reads + len(self.frames)
 
     def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_HeldOutFrame]:
-        """Find the actors in the scans that are left, and return a task for each frame to measure."""
+        """Find the actors in the scans that are left; return a task for each frame to measure."""
         feed, inputs = self.feed, self.inputs
         actors = MovingActors()
         if feed.needs_actors:

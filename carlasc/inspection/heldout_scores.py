@@ -4,7 +4,7 @@ distance, and shares of these.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -16,6 +16,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.core.scans import runs_of_origins, sorted_by_origin
+from carlasc.inspection.points_in_voxels import OUTSIDE, UNKNOWN, labels_at
 from carlasc.metrics.casting import follow_rays
 
 BANDS_M = (0.0, 10.0, 20.0, 30.0, np.inf)
@@ -28,10 +29,7 @@ sensor (x forward), metres.
 _RETURNS, _FREE, _UNKNOWN, _PASSED, _PASSED_OBJECT, _MISSED = range(6)
 _SOLID, _OBJECT = 1, 2  # bits of a voxel: it is occupied; its class is not ground
 # histogram of the errors of the first hit; the last bin holds all larger ones
-_STEP_M, _STEPS = (
-    0.02,
-    500,
-)
+_STEP_M, _STEPS = 0.02, 500
 
 
 @dataclass(frozen=True)
@@ -136,9 +134,9 @@ class HeldOutScores:
             else np.isin(grid.labels, sorted(classes.ground))
         )
         solid = np.where(occupied, np.where(ground, _SOLID, _SOLID | _OBJECT), 0).astype(np.uint8)
-        voxels = spec.flat_index(points)
-        inside = (voxels >= 0) & np.any(points != 0, axis=1)
-        points, voxels = np.asarray(points[inside], np.float64), voxels[inside]
+        at_points = labels_at(points, spec, grid.labels, grid.known)[0, 0]
+        inside = (at_points != OUTSIDE) & np.any(points != 0, axis=1)
+        points, at_points = np.asarray(points[inside], np.float64), at_points[inside]
         begun: NDArray[np.float64] = (
             np.zeros_like(points) if origins is None else np.asarray(origins[inside], np.float64)
         )
@@ -149,19 +147,19 @@ class HeldOutScores:
         )
         first, passed = _follow(solid, spec, begun, points)
         ranges = np.linalg.norm(points - begun, axis=1)
-        known, hit = grid.known.reshape(-1)[voxels], occupied.reshape(-1)[voxels]
-        properties = np.zeros((len(points), 6), np.bool_)
-        properties[:, _RETURNS], properties[:, _FREE], properties[:, _UNKNOWN] = (
-            True,
-            known & ~hit,
-            ~known,
+        missed = np.isinf(first)
+        every = np.ones(len(points), np.bool_)
+        columns = (
+            every,
+            at_points == 0,
+            at_points == UNKNOWN,
+            passed != 0,
+            passed & _OBJECT != 0,
+            missed,
         )
-        properties[:, _PASSED], properties[:, _PASSED_OBJECT] = passed != 0, passed & _OBJECT != 0
-        properties[:, _MISSED] = missed = np.isinf(first)
         scores = cls.empty(classes, labelled=labels is not None)
         band = np.searchsorted(BANDS_M, ranges, side="right") - 1
-        for column in range(6):
-            chosen = properties[:, column]
+        for column, chosen in enumerate(columns):
             np.add.at(scores.counts[:, :, column], (kind[chosen], band[chosen]), 1)
         step = np.minimum(np.abs(first - ranges)[~missed] / _STEP_M, _STEPS).astype(np.int64)
         np.add.at(scores.errors, (kind[~missed], band[~missed], step), 1)
@@ -177,16 +175,12 @@ class HeldOutScores:
 
     def merge(self, other: HeldOutScores) -> HeldOutScores:
         """Return the scores of the frames of both, which have the same class table."""
-        return HeldOutScores(
-            self.classes,
-            self.labelled and other.labelled,
-            self.frames + other.frames,
-            self.counts + other.counts,
-            self.errors + other.errors,
-            self.swept_voxels + other.swept_voxels,
-            self.swept_known + other.swept_known,
-            self.swept_occupied + other.swept_occupied,
-        )
+        sums = {
+            name: getattr(self, name) + getattr(other, name)
+            for name in vars(self)
+            if name not in ("classes", "labelled")
+        }
+        return HeldOutScores(self.classes, self.labelled and other.labelled, **sums)
 
     @property
     def swept_share(self) -> float | None:
@@ -206,21 +200,22 @@ class HeldOutScores:
         """
         if not self.labelled:
             return {}
-        rows = {
-            self.classes.names.get(i, str(i)): i
-            for i in np.flatnonzero(self.counts[:, :, 0].any(axis=1)).tolist()
-        }
         return {
-            name: self._shares(self.counts[i].sum(axis=0), self.errors[i].sum(axis=0))
-            for name, i in rows.items()
+            self.classes.names.get(i, str(i)): self._shares(
+                self.counts[i].sum(axis=0), self.errors[i].sum(axis=0)
+            )
+            for i in np.flatnonzero(self.counts[:, :, 0].any(axis=1)).tolist()
         }
 
     def by_distance(self) -> dict[str, RayShares]:
         """Return the rays of each band of distances, by its name, such as "10-20 m"."""
-        return {
-            name: self._shares(self.counts[:, i].sum(axis=0), self.errors[:, i].sum(axis=0))
-            for i, name in enumerate(_band_names())
-        }
+        shares = {}
+        for i, (low, high) in enumerate(pairwise(BANDS_M)):
+            name = f"{low:.0f}-{high:.0f} m" if np.isfinite(high) else f"{low:.0f} m and more"
+            shares[name] = self._shares(
+                self.counts[:, i].sum(axis=0), self.errors[:, i].sum(axis=0)
+            )
+        return shares
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures as plain values for JSON."""
@@ -239,22 +234,14 @@ class HeldOutScores:
 
     def _shares(self, counts: NDArray[np.int64], errors: NDArray[np.int64]) -> RayShares:
         total = int(counts[_RETURNS])
-
-        def share(column: int) -> float | None:
-            return float(counts[column]) / total if total else None
-
-        occupied = float(total - counts[_FREE] - counts[_UNKNOWN]) / total if total else None
-        return RayShares(
-            total,
-            share(_FREE),
-            share(_UNKNOWN),
-            occupied,
-            share(_PASSED),
-            share(_PASSED_OBJECT),
-            share(_MISSED),
-            _quantile(errors, 0.5),
-            _quantile(errors, 0.9),
+        occupied = total - counts[_FREE] - counts[_UNKNOWN]
+        others = (counts[i] for i in (_PASSED, _PASSED_OBJECT, _MISSED))
+        free, unknown, hit, passed, passed_object, missed = (
+            float(part) / total if total else None
+            for part in (counts[_FREE], counts[_UNKNOWN], occupied, *others)
         )
+        median, most = _quantile(errors, 0.5), _quantile(errors, 0.9)
+        return RayShares(total, free, unknown, hit, passed, passed_object, missed, median, most)
 
 
 def swept_voxels(spec: GridSpec, grid_T_vehicles: Iterable[Transform]) -> NDArray[np.bool_]:
@@ -299,11 +286,6 @@ def _quantile(errors: NDArray[np.int64], share: float) -> float | None:
         return None
     middle = int(np.searchsorted(errors.cumsum(), share * total)) + 0.5
     return round(min(middle, _STEPS) * _STEP_M, 3)
-
-
-def _band_names() -> Iterator[str]:
-    for low, high in pairwise(BANDS_M):
-        yield f"{low:.0f}-{high:.0f} m" if np.isfinite(high) else f"{low:.0f} m and more"
 
 
 def _follow(

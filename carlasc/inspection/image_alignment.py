@@ -72,23 +72,22 @@ def compare_images(sequence: Sequence) -> list[ImageAgreement]:
         cameras = cameras_of(sequence)
     except CarlascError:
         return []  # which is reported elsewhere
-    return [
-        found for camera in cameras.values() if (found := _compare(sequence, camera)) is not None
-    ]
+    compared = (_compare(sequence, camera) for camera in cameras.values())
+    return [agreement for agreement in compared if agreement is not None]
 
 
 def judge_images(sequence: Sequence, images: list[ImageAgreement]) -> Iterator[Finding]:
     """Yield a finding for each camera whose calibration or times are probably wrong."""
-    where, expected = (
-        f"{sequence.location}/{layout.CAMERAS}",
-        "images with edges where the scans have them",
-    )
-    advice = "check the calibration and the times of the camera, and draw a grid over it with `carlasc render --camera`"
     for agreement in images:
         if agreement.is_wrong:
-            found = f"{agreement.camera}: {agreement}"
             yield Finding(
-                "warning", "images-on-scans", sequence.path, where, expected, found, advice
+                "warning",
+                "images-on-scans",
+                f"{sequence.location}/{layout.CAMERAS}",
+                "images with edges where the scans have them",
+                f"{agreement.camera}: {agreement}",
+                "check the calibration and the times of the camera, and draw a grid over it with "
+                "`carlasc render --camera`",
             )
 
 
@@ -107,8 +106,8 @@ def _compare(sequence: Sequence, camera: CameraModel) -> ImageAgreement | None:
         views += [] if view is None else [view]
     # The contrast by view, time and shift. A maximum counts only if all thirds of the views have
     # it.
-    found = [view.contrast(camera) for view in views]
-    thirds = [np.sum(part, axis=0) for part in (found[0::3], found[1::3], found[2::3]) if part]
+    contrasts = [view.contrast(camera) for view in views]
+    thirds = [np.sum(contrasts[i::3], axis=0) for i in range(3) if contrasts[i::3]]
     if len(thirds) < 3 or min(third.max() for third in thirds) < _LEAST:
         return ImageAgreement(camera.name, None, None)
     late, shift = np.unravel_index(int(np.sum(thirds, axis=0).argmax()), thirds[0].shape)
@@ -171,7 +170,7 @@ class _View:
         """Return (T, S) the summed contrast of the image at the edges of depth, for each time and
         each shift.
         """
-        found = np.zeros((len(_TIMES_S), len(_SHIFTS_PX)))
+        contrast = np.zeros((len(_TIMES_S), len(_SHIFTS_PX)))
         for row, place in enumerate(self.places):
             pixels = camera.project(transform_points(invert(place), self.edges))
             kept = camera.contains(pixels)
@@ -179,8 +178,9 @@ class _View:
                 pixels[kept, 0] < camera.width - 1 - _SHIFTS_PX[-1]
             )
             column, line = np.rint(pixels[kept]).astype(np.int64).T
-            found[row] = self.contrast_of[line[:, None], column[:, None] + _SHIFTS_PX].sum(axis=0)
-        return found
+            seen = self.contrast_of[line[:, None], column[:, None] + _SHIFTS_PX]
+            contrast[row] = seen.sum(axis=0)
+        return contrast
 
 
 def _depth_edges(camera: CameraModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -211,10 +211,8 @@ def _clearest(
     total = np.sum(thirds, axis=0)
     best = int(total.argmax())
     elsewhere = np.abs(np.arange(len(values)) - best) > len(values) // 6
-    above, others = (
-        total[best] - total[elsewhere].mean(),
-        total[elsewhere] - total[elsewhere].mean(),
-    )
+    usual = total[elsewhere].mean()
+    above, others = total[best] - usual, total[elsewhere] - usual
     agree = all(abs(values[int(third.argmax())] - values[best]) <= apart for third in thirds)
     is_clear = above > _CLEAR * float(others.std()) and above > _ALONE * float(others.max())
     return float(values[best]) if agree and is_clear and 0 < best < len(values) - 1 else None

@@ -11,7 +11,6 @@ import platform
 import re
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -20,15 +19,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from carlasc.errors import (
-    ArgumentError,
-    DependencyError,
-    StorageError,
-    carlasc_version,
-    describe,
-    import_extra,
-    install_command,
-)
+from carlasc.errors import DependencyError, carlasc_version, describe, import_extra, install_command
 from carlasc.running import count_cores
 from carlasc.running.pools import ONE_THREAD
 from carlasc.storage.files import is_durable
@@ -41,10 +32,10 @@ package.
 _PACKAGE = Path(__file__).parents[1]  # the folder of carlasc
 _FEATURES = "sse4.2 avx avx2 fma bmi2 avx512f avx512bw avx512vl neon asimd sve sve2".split()
 _REQUIREMENT = re.compile(
-    r"([\w.-]+)(?:\[[\w,-]*\])?(?:>=([\w.]+))?(?:\s*;\s*extra == ['\"]([\w-]+)['\"])?"
+    r"(?P<name>[\w.-]+)(?:\[[\w,-]*\])?(?:>=(?P<lowest>[\w.]+))?"
+    r"(?:\s*;\s*extra == ['\"](?P<extra>[\w-]+)['\"])?"
 )
 _VARIABLES = re.compile("|".join([*ONE_THREAD, "NUMBA_.*", "CARLASC_.*"]))
-_MEGABYTE, _MEGABYTES, _SMALL_FILES = 1 << 20, 32, 8
 
 
 @dataclass(frozen=True)
@@ -134,26 +125,6 @@ class CompiledCode:
 
 
 @dataclass(frozen=True)
-class Disk:
-    """How fast a folder is.
-
-    Attributes:
-        folder: the folder.
-        free_bytes: free space, bytes.
-        write_mb_s: speed of writing a file of 32 MB and syncing it, MB/s.
-        read_mb_s: speed of reading it again, MB/s; where the system allows it, from the disk and
-            not from memory.
-        sync_ms: time for writing a file of 4 kB and syncing it, milliseconds.
-    """
-
-    folder: str
-    free_bytes: int
-    write_mb_s: float
-    read_mb_s: float
-    sync_ms: float
-
-
-@dataclass(frozen=True)
 class Installation:
     """What `doctor` found.
 
@@ -171,7 +142,6 @@ class Installation:
         threads: the number of threads of Numba, and the variables of the environment that set
             threads, Numba and carlasc.
         durable: whether files are synced before they are renamed to their final names.
-        disk: how fast the measured folder is.
         problems: what is broken and needed; empty if carlasc works.
     """
 
@@ -185,7 +155,6 @@ class Installation:
     compiled: CompiledCode | None
     threads: dict[str, str]
     durable: bool
-    disk: Disk
     problems: tuple[str, ...]
 
     @property
@@ -194,21 +163,13 @@ class Installation:
         return not self.problems
 
 
-def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
+def doctor() -> Installation:
     """Check the installed packages and the machine.
 
     This takes a few seconds; nothing is sent anywhere.
 
-    Args:
-        folder: folder whose disk speed is measured, in a temporary folder that is removed again;
-            None: the folder for temporary files.
-
     Returns:
         What was found.
-
-    Raises:
-        ArgumentError: `folder` is not a folder.
-        StorageError: it cannot be written to.
     """
     needed, extras = _read_requirements()
     problems = [package.problem for package in needed if package.problem]
@@ -220,10 +181,8 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
     for package in needed:
         if package.version is not None:
             problems += _problems_of_import(package.name)
-    numba_loads, compiled = (
-        not any("numba" in problem or "numpy" in problem for problem in problems),
-        None,
-    )
+    numba_loads = not any("numba" in problem or "numpy" in problem for problem in problems)
+    compiled = None
     if numba_loads:
         try:
             compiled = _look_at_compiled_code()
@@ -243,7 +202,6 @@ def doctor(folder: str | os.PathLike[str] | None = None) -> Installation:
         compiled=compiled,
         threads=_read_threads(numba_loads),
         durable=is_durable(),
-        disk=measure_disk(folder),
         problems=tuple(map(without_names, problems)),
     )
 
@@ -262,68 +220,6 @@ def without_names(text: str) -> str:
     return text
 
 
-def measure_disk(folder: str | os.PathLike[str] | None) -> Disk:
-    """Measure how fast files are written, synced and read in a temporary folder, which is removed
-    again.
-
-    Args:
-        folder: where to make it; None: the folder for temporary files.
-
-    Raises:
-        ArgumentError: `folder` is not a folder.
-        StorageError: it cannot be written to.
-    """
-    place = Path(tempfile.gettempdir() if folder is None else folder)
-    if not place.is_dir():
-        raise ArgumentError("folder", expected="a folder", found=str(place))
-    try:
-        with tempfile.TemporaryDirectory(dir=place, prefix="carlasc-doctor-") as scratch:
-            # random: some file systems compress
-            large, noise = (
-                Path(scratch, "large"),
-                os.urandom(_MEGABYTE),
-            )
-            write_s = _time_writing(large, noise, _MEGABYTES)
-            read_s = _time_reading(large)
-            syncs_s = sorted(
-                _time_writing(Path(scratch, str(n)), noise[:4096], 1) for n in range(_SMALL_FILES)
-            )
-            status = os.statvfs(scratch)
-    except OSError as error:
-        raise StorageError(
-            place, problem=f"files cannot be written: {error.strerror or error}"
-        ) from error
-    megabytes = _MEGABYTES * _MEGABYTE / 1e6
-    return Disk(
-        without_names(str(place.resolve())),
-        status.f_bavail * status.f_frsize,
-        megabytes / write_s,
-        megabytes / read_s,
-        1e3 * syncs_s[len(syncs_s) // 2],
-    )
-
-
-def _time_writing(path: Path, block: bytes, count: int) -> float:
-    start = time.perf_counter()
-    with path.open("wb") as file:
-        for _ in range(count):
-            file.write(block)
-        file.flush()
-        os.fsync(file.fileno())
-    return time.perf_counter() - start
-
-
-def _time_reading(path: Path) -> float:
-    with path.open("rb") as file:
-        if sys.platform == "linux":
-            # drop the cached copy in memory
-            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-        start = time.perf_counter()
-        while file.read(_MEGABYTE):
-            pass
-    return time.perf_counter() - start
-
-
 def _read_requirements() -> tuple[tuple[Package, ...], tuple[Extra, ...]]:
     """Return the packages that are always needed, and the extras, as the metadata of the installed
     package list them.
@@ -335,28 +231,22 @@ def _read_requirements() -> tuple[tuple[Package, ...], tuple[Extra, ...]]:
     needed: list[Package] = []
     extras: dict[str, list[Package]] = {}
     for line in lines:
-        if (found := _REQUIREMENT.fullmatch(line)) and found[3] not in FOR_DEVELOPERS:
-            (needed if found[3] is None else extras.setdefault(found[3], [])).append(
-                Package(found[1], _version(found[1]), found[2] or "0")
-            )
+        match = _REQUIREMENT.fullmatch(line)
+        if match is None or match["extra"] in FOR_DEVELOPERS:
+            continue
+        try:
+            version = metadata.version(match["name"])
+        except metadata.PackageNotFoundError:
+            version = None
+        package = Package(match["name"], version, match["lowest"] or "0")
+        (extras.setdefault(match["extra"], []) if match["extra"] else needed).append(package)
     return tuple(needed), tuple(Extra(name, tuple(packages)) for name, packages in extras.items())
 
 
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the numbers of a version up to the first part that is no number, without trailing
-    zeros: 2.0 is 2.
-    """
-    numbers = [int(part) for part in re.match(r"[\d.]*", version)[0].split(".") if part]  # type: ignore[index]
-    while numbers and not numbers[-1]:
-        numbers.pop()
-    return tuple(numbers)
+    """Return the numbers at the start of a version, without trailing zeros: 2.0+cpu is 2."""
+    start = re.sub(r"[^\d.].*", "", version)
+    return tuple(int(part) for part in re.sub(r"(\.0+)*\.?$", "", start).split(".") if part)
 
 
 def _problems_of_import(name: str) -> Iterator[str]:
@@ -375,12 +265,12 @@ def _look_at_processor(numba_loads: bool) -> Processor:
     if numba_loads:
         binding: Any = importlib.import_module("llvmlite.binding")
         config: Any = importlib.import_module("numba").config
-        found = binding.get_host_cpu_features()
+        offered = binding.get_host_cpu_features()
         target = config.CPU_NAME or binding.get_host_cpu_name()
         features = tuple(
             name
             for name in _FEATURES
-            if found.get(name) and f"-{name}" not in (config.CPU_FEATURES or "")
+            if offered.get(name) and f"-{name}" not in (config.CPU_FEATURES or "")
         )
     return Processor(_model(), os.cpu_count() or 1, count_cores(), target, features)
 
@@ -388,10 +278,10 @@ def _look_at_processor(numba_loads: bool) -> Processor:
 def _model() -> str:
     """Return the name of the processor."""
     with suppress(OSError):
-        if found := re.search(
+        if line := re.search(
             r"^(?:model name|Model)\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE
         ):
-            return found[1]
+            return line[1]
     if sys.platform == "darwin":
         with suppress(OSError, subprocess.SubprocessError):
             asked = ["sysctl", "-n", "machdep.cpu.brand_string"]
@@ -432,10 +322,10 @@ def _next(number: int) -> int:
 
 
 def _read_threads(numba_loads: bool) -> dict[str, str]:
-    found = {}
+    threads = {}
     if numba_loads:
-        found["numba"] = str(importlib.import_module("numba").config.NUMBA_NUM_THREADS)
-    return found | {
+        threads["numba"] = str(importlib.import_module("numba").config.NUMBA_NUM_THREADS)
+    return threads | {
         name: without_names(value)
         for name, value in sorted(os.environ.items())
         if _VARIABLES.fullmatch(name)

@@ -5,7 +5,9 @@ files only.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -136,10 +138,7 @@ class Overview:
     @property
     def splits(self) -> dict[str, int]:
         """Number of sequences by split; "none" counts sequences without a split in their path."""
-        found: dict[str, int] = {}
-        for sequence in self.sequences:
-            found[sequence.split or "none"] = found.get(sequence.split or "none", 0) + 1
-        return found
+        return dict(Counter(sequence.split or "none" for sequence in self.sequences))
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a row per sequence, with the attributes of `SequenceOverview`; fields, documents
@@ -148,14 +147,11 @@ class Overview:
         Raises:
             DependencyError: pandas is not installed.
         """
-        return data_frame(
-            (
-                vars(sequence)
-                | {"fields": [*sequence.fields], "grids": [grid.name for grid in sequence.grids]}
-                for sequence in self.sequences
-            ),
-            "path",
+        rows = (
+            vars(one) | {"fields": [*one.fields], "grids": [grid.name for grid in one.grids]}
+            for one in self.sequences
         )
+        return data_frame(rows, "path")
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
@@ -171,7 +167,12 @@ def info(source: str | os.PathLike[str] | Source) -> Overview:
     Raises:
         MissingDataError: the source holds neither a sequence nor a capture.
     """
-    captures = _captures_in(source)
+    captures: dict[str, Capture] = {}
+    if not isinstance(source, Source):
+        with suppress(MissingDataError):
+            captures = find_captures(source)
+    recorded = tuple(_describe_capture(path, capture) for path, capture in captures.items())
+    sequences: dict[str, Sequence] = {}
     try:
         opened = as_source(source)
         # raw/ has a bev/ folder, like a sequence, but is a capture
@@ -181,28 +182,17 @@ def info(source: str | os.PathLike[str] | Source) -> Overview:
     except MissingDataError:
         if not captures:
             raise
-        sequences = {}
     if not sequences:
-        found = tuple(_describe_capture(path, capture) for path, capture in captures.items())
-        return Overview(without_credentials(str(source)), "capture", "folder", (), found, None)
+        return Overview(without_credentials(str(source)), "capture", "folder", (), recorded, None)
     location = Path(opened.location)
     return Overview(
         opened.location,
         _level(opened.location, list(sequences)),
         type(opened).__name__.removesuffix("Source").lower(),
         tuple(_describe(sequence) for sequence in sequences.values()),
-        tuple(_describe_capture(path, capture) for path, capture in captures.items()),
+        recorded,
         location.stat().st_size if location.is_file() else None,
     )
-
-
-def _captures_in(source: str | os.PathLike[str] | Source) -> dict[str, Capture]:
-    if isinstance(source, Source):
-        return {}
-    try:
-        return find_captures(source)
-    except MissingDataError:
-        return {}
 
 
 def _level(location: str, paths: list[str]) -> str:

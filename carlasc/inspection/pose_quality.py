@@ -30,10 +30,7 @@ quality of grids.
 
 _RUN = 30  # scans of a run
 # frames by which poses are moved for another start, which must be better by this factor
-_SHIFTS, _BETTER = (
-    (-2, 2),
-    0.9,
-)
+_SHIFTS, _BETTER = ((-2, 2), 0.9)
 _AGREE_M = 0.03  # scans that agree within this distance are aligned
 _LEVER_M = 15.0  # a turn counts by what it moves at this distance
 
@@ -88,19 +85,19 @@ def measure_poses(
         ]
         used, measured = [scan.used for scan in scans], [scan.measured for scan in scans]
         was = finite_mean(disagreement(measured, poses[rows]))
-        found = align(used, poses[rows], poses[rows])
-        now = finite_mean(disagreement(measured, found))
+        aligned = align(used, poses[rows], poses[rows])
+        now = finite_mean(disagreement(measured, aligned))
         for shift in _SHIFTS:  # of poses that are late, an alignment may not find to the right ones
             start = slerp(poses, numbers, numbers[rows] + shift)
             start = multiply(poses[first], invert(start[0]), start)
             other = align(used, start, start)
             other_now = finite_mean(disagreement(measured, other))
             if other_now < _BETTER * now:
-                found, now = other, other_now
+                aligned, now = other, other_now
         before.append(was)
         after.append(now)
         if now <= _AGREE_M:
-            runs.append((first, found))
+            runs.append((first, aligned))
     if not np.isfinite(before).any():
         return PoseQuality(None, None, None)
     return PoseQuality(
@@ -115,34 +112,35 @@ def describe_mounting(mounting: Mounting, period_s: float) -> tuple[str, str] | 
     need no correction.
     """
     wrong, values, errors = mounting.wrong, mounting.values, mounting.errors
-    found, advice = [], "write corrected poses with `carlasc refine`"
+    described, advice = [], "write corrected poses with `carlasc refine`"
     if wrong[:6].any():
         place = ", ".join(
-            f"{axis} = {value:.2f} ± {error:.2f} m" if known else f"{axis} undetermined"
-            for axis, value, error, known in zip(
-                "xyz", values, errors, mounting.determined, strict=False
-            )
+            f"{axis} = {values[i]:.2f} ± {errors[i]:.2f} m"
+            if mounting.determined[i]
+            else f"{axis} undetermined"
+            for i, axis in enumerate("xyz")
         )
-        turned = [
-            f"{name} {np.rad2deg(value):.1f} degrees"
-            for name, value, is_wrong in zip(
-                ("roll", "pitch", "yaw"), values[3:6], wrong[3:6], strict=True
-            )
-            if is_wrong
-        ]
-        found.append(
+        turned = " and ".join(
+            f"{name} {np.rad2deg(values[i]):.1f} degrees"
+            for i, name in enumerate(("roll", "pitch", "yaw"), 3)
+            if wrong[i]
+        )
+        described.append(
             f"poses of another point of the vehicle: in their frame, the sensor is at about {place}"
-            + (f", turned by {' and '.join(turned)}" if turned else "")
+            + (f", turned by {turned}" if turned else "")
         )
-        advice = f"write the poses of the sensor: inv(T) @ P @ T, with T the sensor's pose in the frame of the poses (from the calibration), or {advice}"
+        advice = (
+            "write the poses of the sensor: inv(T) @ P @ T, with T the sensor's pose in the frame "
+            f"of the poses (from the calibration), or {advice}"
+        )
     if wrong[6]:
-        when = "late" if values[6] > 0 else "early"
-        frames = abs(values[6]) / period_s
-        found.append(
-            f"poses that are {abs(values[6]):.2f} ± {errors[6]:.2f} s {when} ({frames:.1f} frames)"
+        when, late_s = "late" if values[6] > 0 else "early", abs(values[6])
+        described.append(
+            f"poses that are {late_s:.2f} ± {errors[6]:.2f} s {when} "
+            f"({late_s / period_s:.1f} frames)"
         )
         advice += ", and compare the time stamps of both"
-    return (" and ".join(found), advice) if found else None
+    return (" and ".join(described), advice) if described else None
 
 
 def _choose_runs(poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> list[int]:
@@ -170,9 +168,8 @@ def _choose_runs(poses: NDArray[np.float64], seconds: NDArray[np.float64]) -> li
 
 
 _SPEED_M_S = 70.0  # 250 km/h
-_SPEED_CHANGE_M_S = (
-    15.0  # between neighbouring steps; a collision in CARLA changes the speed as much
-)
+# between neighbouring steps; a collision in CARLA changes the speed as much
+_SPEED_CHANGE_M_S = 15.0
 _TURN_RAD_S = np.deg2rad(250.0)
 _TOLERANCE = 1e-3
 
@@ -184,22 +181,32 @@ def check_poses(sequence: Sequence) -> Iterator[Finding]:
     where, frames = f"{sequence.location}/{layout.POSES}", sequence.scan_frames()
     if layout.POSES not in sequence.documents():
         if "points" in sequence.fields():
-            advice = "copy the file, or estimate poses with KISS-ICP: scans cannot be merged without poses"
             yield Finding(
-                "error", "poses", sequence.path, where, "a pose for each scan", "no file", advice
+                "error",
+                "poses",
+                where,
+                "a pose for each scan",
+                "no file",
+                "copy the file, or estimate poses with KISS-ICP: scans cannot be merged without "
+                "poses",
             )
         return
     try:
         poses = sequence.poses
     except CarlascError as error:
-        yield Finding.from_error("poses", sequence.path, where, error)
+        yield Finding.from_error("poses", where, error)
         return
-    yield from _check_lines(sequence, layout.POSES, len(poses))
-    errors = [_rigid_error(pose, f"{where}: line {line}") for line, pose in enumerate(poses, 1)]
-    if wrong := [error for error in errors if error is not None]:
+    yield from _check_lines(sequence, "poses", where, len(poses))
+    wrong: list[FormatError] = []
+    for line, pose in enumerate(poses, 1):
+        try:
+            check_rigid(pose, f"{where}: line {line}", _TOLERANCE)
+        except FormatError as error:
+            wrong.append(error)
+    if wrong:
         if len(wrong) > 1:
             wrong[0].found += f" (and {len(wrong) - 1} more such lines)"
-        yield Finding.from_error("poses", sequence.path, where, wrong[0])
+        yield Finding.from_error("poses", where, wrong[0])
     elif len(frames) and _has_lines(sequence, len(poses)):
         yield from _check_steps(sequence, frames, where)
 
@@ -210,50 +217,39 @@ def check_times(sequence: Sequence) -> Iterator[Finding]:
     if layout.TIMES not in sequence.documents():
         if "points" in sequence.fields():
             advice = "copy the file; without it, 10 Hz is assumed"
-            yield Finding(
-                "warning", "times", sequence.path, where, "a time for each scan", "no file", advice
-            )
+            yield Finding("warning", "times", where, "a time for each scan", "no file", advice)
         return
     try:
         times = sequence.times
     except CarlascError as error:
-        yield Finding.from_error("times", sequence.path, where, error)
+        yield Finding.from_error("times", where, error)
         return
-    yield from _check_lines(sequence, layout.TIMES, len(times))
+    yield from _check_lines(sequence, "times", where, len(times))
     wrong = np.flatnonzero(~(np.diff(times) > 0))
     if len(wrong):
         line = int(wrong[0]) + 1
-        found = f"{times[line]:g} s in line {line + 1} after {times[line - 1]:g} s ({len(wrong)} such lines)"
-        yield Finding(
-            "error", "times", sequence.path, where, "seconds that increase from line to line", found
-        )
+        lines = f"{times[line]:g} s in line {line + 1} after {times[line - 1]:g} s"
+        found = f"{lines} ({len(wrong)} such lines)"
+        yield Finding("error", "times", where, "seconds that increase from line to line", found)
 
 
-def _check_lines(sequence: Sequence, document: str, lines: int) -> Iterator[Finding]:
+def _check_lines(sequence: Sequence, kind: str, where: str, lines: int) -> Iterator[Finding]:
     """Check that each frame has a line, and that the file ends with the line of the last frame."""
-    frames, where = sequence.scan_frames(), f"{sequence.location}/{document}"
+    frames = sequence.scan_frames()
     if not len(frames):
         return
-    last, kind = int(frames[-1]), "poses" if document == layout.POSES else "times"
+    last = int(frames[-1])
+    expected, found = f"{last + 1} lines, up to frame {last}", f"{lines} lines"
     if not _has_lines(sequence, lines):
-        expected = f"{last + 1} lines, up to frame {last}"
         if last + 1 != len(frames):
             expected += f" (or {len(frames)}, one per frame that exists)"
         advice = "lines are missing: copy the file again"
-        yield Finding("error", kind, sequence.path, where, expected, f"{lines} lines", advice)
+        yield Finding("error", kind, where, expected, found, advice)
     elif lines > last + 1:
         advice = (
             "check whether scans are missing at the end, or the file belongs to another sequence"
         )
-        yield Finding(
-            "warning",
-            kind,
-            sequence.path,
-            where,
-            f"{last + 1} lines, up to frame {last}",
-            f"{lines} lines",
-            advice,
-        )
+        yield Finding("warning", kind, where, expected, found, advice)
 
 
 def _has_lines(sequence: Sequence, lines: int) -> bool:
@@ -266,65 +262,45 @@ def _has_lines(sequence: Sequence, lines: int) -> bool:
     return True
 
 
-def _rigid_error(pose: NDArray[np.float64], where: str) -> FormatError | None:
-    """Return the error that says why a pose is not rigid; None if it is."""
-    try:
-        check_rigid(pose, where, _TOLERANCE)
-    except FormatError as error:
-        return error
-    return None
-
-
-def _periods(sequence: Sequence, frames: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the seconds between frames, by their times if these increase."""
-    try:
-        times = np.array([sequence.read_time(frame) for frame in frames.tolist()])
-    except CarlascError:
-        times = np.zeros(1)
-    periods = np.diff(times)
-    return (
-        periods
-        if len(periods) == len(frames) - 1 and (periods > 0).all()
-        else np.diff(frames) * layout.FRAME_PERIOD_S
-    )
-
-
 def _check_steps(sequence: Sequence, frames: NDArray[np.int64], where: str) -> Iterator[Finding]:
     """Check the first pose, and that the sensor moves and turns between frames as a vehicle can."""
     poses = np.stack([sequence.read_pose(frame) for frame in frames.tolist()])
-    if frames[0] == 0 and np.abs(poses[0] - np.eye(4)).max() > 1e-3:
-        advice = "nothing to do: the poses are relative to another frame, and only relative poses are used"
+    if frames[0] == 0 and np.abs(poses[0] - np.eye(4)).max() > _TOLERANCE:
         yield Finding(
             "note",
             "poses",
-            sequence.path,
             where,
             "the identity as the first pose",
             "another pose",
-            advice,
+            "nothing to do: the poses are relative to another frame, and only relative poses are "
+            "used",
         )
     # frames of a cloud without a sensor have no order in time
     if len(frames) < 2 or not sequence.metadata.has_rays:
         return
     steps = invert(poses[:-1]) @ poses[1:]
-    period_s = _periods(sequence, frames)
-    speed = np.linalg.norm(steps[:, :3, 3], axis=1) / period_s
+    try:
+        period_s = np.diff([sequence.read_time(frame) for frame in frames.tolist()])
+    except CarlascError:
+        period_s = np.zeros(1)
+    if not (period_s > 0).all():  # which is reported elsewhere
+        period_s = np.diff(frames) * layout.FRAME_PERIOD_S
+    moved_m = np.linalg.norm(steps[:, :3, 3], axis=1)
     cosine = (np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-    turn = np.arccos(np.clip(cosine, -1, 1)) / period_s
+    speed, turned = moved_m / period_s, np.arccos(np.clip(cosine, -1, 1))
+    turn = turned / period_s
     usual = np.array([np.median(speed[max(0, i - 3) : i + 4]) for i in range(len(speed))])
+    strange = np.abs(speed - usual)
     jumps = np.flatnonzero(
-        (speed > _SPEED_M_S) | (np.abs(speed - usual) > _SPEED_CHANGE_M_S) | (turn > _TURN_RAD_S)
+        (speed > _SPEED_M_S) | (strange > _SPEED_CHANGE_M_S) | (turn > _TURN_RAD_S)
     )
     if len(jumps):
-        step = int(jumps[np.argmax(np.abs(speed - usual)[jumps] + turn[jumps])])
-        moved, turned = (
-            float(np.linalg.norm(steps[step, :3, 3])),
-            float(np.rad2deg(turn[step] * period_s[step])),
+        step = int(jumps[np.argmax(strange[jumps] + turn[jumps])])
+        found = (
+            f"{moved_m[step]:.2f} m and {np.rad2deg(turned[step]):.1f} degrees from frame "
+            f"{frames[step]} to {frames[step + 1]}, {usual[step] * period_s[step]:.2f} m between "
+            "other frames"
         )
-        usually = float(usual[step] * period_s[step])
-        found = f"{moved:.2f} m and {turned:.1f} degrees from frame {frames[step]} to {frames[step + 1]}, {usually:.2f} m between other frames"
         found += f" ({len(jumps)} such steps)" if len(jumps) > 1 else ""
         advice = "check whether frames are missing there, or sequences were joined"
-        yield Finding(
-            "error", "pose-jump", sequence.path, where, "poses without jumps", found, advice
-        )
+        yield Finding("error", "pose-jump", where, "poses without jumps", found, advice)

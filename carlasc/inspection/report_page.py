@@ -57,7 +57,10 @@ def describe(report: Report) -> list[tuple[str, str]]:
     if coverage.mean_votes is not None:
         rows.append(("votes", f"{coverage.mean_votes:.1f} per known voxel, on average"))
     if convergence is not None:
-        changed = f"{convergence.changed_share:.2%} of the known voxels change their label if {LEFT_OUT:.0%} of the scans are left out"
+        changed = (
+            f"{convergence.changed_share:.2%} of the known voxels change their label if "
+            f"{LEFT_OUT:.0%} of the scans are left out"
+        )
         rows.append(("convergence", f"{changed} ({count(convergence.frames, 'frame')})"))
     if actors is not None:
         rows.append(("actors", _count(actors)))
@@ -84,7 +87,8 @@ def _count(actors: Sequence[ActorTrack]) -> str:
     residuals = sorted(actor.residual_m for actor in actors if actor.residual_m is not None)
     middle = f"; the median residual is {residuals[len(residuals) // 2]:.2f} m" if residuals else ""
     doubtful = sum(is_doubtful(actor.confidence) for actor in actors)
-    return f"{len(actors)} moving ({kinds}){f', {doubtful} of them doubtful' if doubtful else ''}{middle}"
+    unsure = f", {doubtful} of them doubtful" if doubtful else ""
+    return f"{len(actors)} moving ({kinds}){unsure}{middle}"
 
 
 def _poses(facts: PoseFacts) -> str:
@@ -92,18 +96,14 @@ def _poses(facts: PoseFacts) -> str:
         return "as given: too few points to measure whether scans agree"
     if not any(facts.changed_m):
         return f"as given: neighbouring scans agree within {100 * facts.before_m:.1f} cm"
-    text = f"refined: neighbouring scans disagreed by {100 * facts.before_m:.1f} cm, now by {100 * facts.after_m:.1f} cm"
-    moved, turned = (
-        ", ".join(f"{scale * value:.{digits}f}" for value in values)
-        for scale, digits, values in (
-            (100.0, 1, facts.changed_m),
-            (180 / math.pi, 2, facts.changed_rad),
-        )
+    moved = ", ".join(f"{100 * value:.1f}" for value in facts.changed_m)
+    turned = ", ".join(f"{math.degrees(value):.2f}" for value in facts.changed_rad)
+    text = (
+        f"refined: neighbouring scans disagreed by {100 * facts.before_m:.1f} cm, now by "
+        f"{100 * facts.after_m:.1f} cm; corrected by {moved} cm along x, y, z and {turned} degrees "
+        "of roll, pitch, yaw per scan; the given height drifts by "
+        f"{100 * facts.height_drift_m:.0f} cm within 100 scans"
     )
-    text += (
-        f"; corrected by {moved} cm along x, y, z and {turned} degrees of roll, pitch, yaw per scan"
-    )
-    text += f"; the given height drifts by {100 * facts.height_drift_m:.0f} cm within 100 scans"
     left = ", ".join(f"{first} to {last}" for first, last in facts.left)
     return f"{text}; as given in frames {left}" if left else text
 
@@ -112,20 +112,16 @@ def _held_out(values: Mapping[str, Any]) -> str:
     rays, swept = values["rays"], values["swept"]["occupied_share"]
     if not rays["returns"]:
         return "none"
-    text = f"{rays['returns']} returns: {rays['free']:.2%} in free voxels, {rays['unknown']:.2%} in unknown ones"
-    text += f"; {rays['passed_object']:.2%} pass through an object before their return"
-    text += (
-        ""
-        if swept is None
-        else f"; {swept:.2%} of the voxels that the ego vehicle drove through are occupied"
+    text = (
+        f"{rays['returns']} returns: {rays['free']:.2%} in free voxels, {rays['unknown']:.2%} in "
+        f"unknown ones; {rays['passed_object']:.2%} pass through an object before their return"
     )
-    given = values.get("given_poses")
-    return (
-        text
-        if not given
-        else f"{text}; under the given poses {given['free']:.2%} are in free voxels, "
-        f"{given['unknown']:.2%} in unknown ones"
-    )
+    if swept is not None:
+        text += f"; {swept:.2%} of the voxels that the ego vehicle drove through are occupied"
+    if given := values.get("given_poses"):
+        text += f"; under the given poses {given['free']:.2%} are in free voxels, "
+        text += f"{given['unknown']:.2%} in unknown ones"
+    return text
 
 
 def _section(name: str, report: Report) -> str:
@@ -154,8 +150,7 @@ def _section(name: str, report: Report) -> str:
         if held_out and held_out["by_distance"]
         else "",
         actors=_part(
-            "Moving actors by frame",
-            f"{_timeline(actors, report.frames)}\n{_actor_table(actors)}",
+            "Moving actors by frame", f"{_timeline(actors, report.frames)}\n{_actor_table(actors)}"
         )
         if actors
         else "",
@@ -179,11 +174,12 @@ def _table(
             parts.append(f"<{tag}{kind}>{'' if cell is None else escape(str(cell))}</{tag}>")
         return f"<tr>{''.join(parts)}</tr>"
 
-    return f"<table>{line(header, 'th') if header else ''}{''.join(line(row, 'td') for row in rows)}</table>"
+    head = line(header, "th") if header else ""
+    return f"<table>{head}{''.join(line(row, 'td') for row in rows)}</table>"
 
 
 def _bars(rows: Sequence[tuple[str, float]]) -> str:
-    """Return horizontal bars of shares, on a square-root scale, so that small shares can be seen."""
+    """Return horizontal bars of shares; a square-root scale shows small shares, too."""
     lines = []
     for row, (label, share) in enumerate(rows):
         y, width = row * _ROW, 520 * share**0.5
@@ -202,23 +198,23 @@ def _timeline(actors: Sequence[ActorTrack], frames: Sequence[int]) -> str:
     scale = 560 / max(last - first, 1)
     lines = []
     for row, actor in enumerate(actors):
-        y, x, width = (
-            row * _ROW,
-            130 + (actor.first - first) * scale,
-            max((actor.last - actor.first) * scale, 2),
-        )
+        y, x = row * _ROW, 130 + (actor.first - first) * scale
+        width = max((actor.last - actor.first) * scale, 2)
         name = f"{actor.label} {actor.instance or ''}".strip()
         lines.append(f'<text x="0" y="{y + 13}">{escape(name)}</text>')
         share = actor.observations / (actor.last - actor.first + 1)
-        bar = f'<rect x="{x:.1f}" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}" fill-opacity="{share:.2f}"/>'
-        lines.append(bar)
+        lines.append(
+            f'<rect x="{x:.1f}" y="{y + 3}" width="{width:.1f}" height="12" fill="{_BAR}" '
+            f'fill-opacity="{share:.2f}"/>'
+        )
     axis = len(actors) * _ROW + 14
     lines += [f'<text x="130" y="{axis}">{first}</text>', f'<text x="680" y="{axis}">{last}</text>']
     return _svg(720, axis + 6, lines)
 
 
 def _svg(width: int, height: int, lines: Sequence[str]) -> str:
-    return f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" font-size="12">{"".join(lines)}</svg>'
+    size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
+    return f'<svg {size} font-size="12">{"".join(lines)}</svg>'
 
 
 def _actor_table(actors: Sequence[ActorTrack]) -> str:
@@ -251,7 +247,8 @@ def _actor_table(actors: Sequence[ActorTrack]) -> str:
         ]
         for actor in actors
     ]
-    return f"<details><summary>Table of the actors</summary>{_table(header, rows, figures=True)}</details>"
+    table = _table(header, rows, figures=True)
+    return f"<details><summary>Table of the actors</summary>{table}</details>"
 
 
 def _held_out_table(values: Mapping[str, Any]) -> str:
@@ -301,7 +298,8 @@ def write_audit_page(result: AuditResult, out: str | Path) -> None:
     parts = []
     for path, verdicts in result.verdicts.items():
         rows = "".join(map(_row, sorted(verdicts, key=lambda v: STATES.index(v.state))))
-        about = f"{count(result.frames[path], 'frame')}; coordinate frame of the grids: {escape(result.placed[path])}."
+        placed, frames = escape(result.placed[path]), count(result.frames[path], "frame")
+        about = f"{frames}; coordinate frame of the grids: {placed}."
         head = "<tr><th>check</th><th>verdict</th><th>what was found</th><th>what to do</th></tr>"
         parts.append(f"<h2>{escape(path)}</h2><p>{about}</p><table>{head}{rows}</table>")
     failed = [f"{f.where}: frame {f.frame}: {f.message}" for f in result.failures]
@@ -326,7 +324,8 @@ def _row(verdict: Verdict) -> str:
     more = (
         f"<details><summary>by class, distance and height</summary>{more}</details>" if more else ""
     )
-    return f'<tr><td>{check}</td><td class="{state}">{state}</td><td>{text}{more}</td><td>{advice}</td></tr>'
+    cells = f"<td>{text}{more}</td><td>{advice}</td>"
+    return f'<tr><td>{check}</td><td class="{state}">{state}</td>{cells}</tr>'
 
 
 def _pictures(result: AuditResult) -> str:

@@ -93,32 +93,47 @@ def report(
         if grid in (None, name) and sequence.predicted_by(name) is None
     ]
     if not grids:
-        expected, advice = (
-            "a grid" if grid is None else f"the grid {grid}",
-            "make grids with `carlasc regrid`",
+        raise MissingDataError(
+            opened.location,
+            expected="a grid" if grid is None else f"the grid {grid}",
+            found="none",
+            advice="make grids with `carlasc regrid`",
         )
-        raise MissingDataError(opened.location, expected=expected, found="none", advice=advice)
     if save:
         for _, sequence, name in grids:
             _check_writable(sequence, name)
     makers = [_ReportMaker(sequence, name) for _, sequence, name in grids]
-    existing = {} if remake else {row: maker.existing() for row, maker in enumerate(makers)}
-    reports = {row: one for row, one in existing.items() if one is not None}
+    reports: dict[int, Report] = {}
+    for row, (_, sequence, name) in enumerate([] if remake else grids):
+        if (existing := report_beside(sequence, name)) is not None:
+            reports[row] = existing
     missing = [row for row in range(len(makers)) if row not in reports]
     measured = _measure_all([makers[row] for row in missing], run)
     failures: list[FrameFailure] = []
     for row, results in zip(missing, measured, strict=True):
         failures += [result for result in results if isinstance(result, FrameFailure)]
         reports[row] = makers[row].make(results)
-    found: dict[str, Report] = {}
+    by_grid: dict[str, Report] = {}
     for row, (path, sequence, name) in enumerate(grids):
         one = reports[row]
         if holdout and one.holdout is None:
             one = replace(one, holdout=makers[row].held_out(run))
         if save and isinstance(sequence, FolderSequence):
             write_output(sequence.folder / layout.report_file(name), one.to_json())
-        found[f"{path}/{name}" if path else name] = one
-    return ReportResult(opened.location, found, tuple(failures))
+        by_grid[f"{path}/{name}" if path else name] = one
+    return ReportResult(opened.location, by_grid, tuple(failures))
+
+
+def report_beside(sequence: Sequence, grid: str) -> Report | None:
+    """Return the report beside a grid; None if there is none.
+
+    Raises:
+        FormatError: it is damaged.
+    """
+    name = layout.report_file(grid)
+    if name not in sequence.documents():
+        return None
+    return Report.from_json(sequence.read_document(name), f"{sequence.location}/{name}")
 
 
 _Measured = FrameFacts | FrameFailure
@@ -160,15 +175,6 @@ class _ReportMaker:
         self.sequence, self.grid = sequence, grid
         self.frames: list[int] = sequence.frames(f"{grid}/labels").tolist()
         self.inputs = _inputs_of(sequence, grid)
-
-    def existing(self) -> Report | None:
-        """Return the report beside the grid; None if there is none."""
-        name = layout.report_file(self.grid)
-        if name not in self.sequence.documents():
-            return None
-        return Report.from_json(
-            self.sequence.read_document(name), f"{self.sequence.location}/{name}"
-        )
 
     @property
     def steps_before(self) -> int:
@@ -243,7 +249,7 @@ class _ReportMaker:
 
 
 def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
-    """Return the scans that a grid was made from, if they are in the same sequence; None otherwise."""
+    """Return the scans that a grid was made from; None if they are not in the same sequence."""
     record = sequence.params(grid).get(RECORD)
     if not isinstance(record, dict) or "points" not in sequence.fields():
         return None
@@ -266,7 +272,7 @@ def _inputs_of(sequence: Sequence, grid: str) -> ScanSequence | None:
 
 
 def _options_of(record: Mapping[str, Any]) -> FromScans:
-    """Return the options in the record of a run; options that it does not name have their defaults."""
+    """Return the options in the record of a run; others have their defaults."""
     given = {
         option.name: record[option.name] for option in fields(FromScans) if option.name in record
     }

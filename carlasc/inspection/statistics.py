@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -61,15 +61,8 @@ class Histogram:
         return cls(zeros, zeros)
 
     def __add__(self, other: Histogram) -> Histogram:
-        return Histogram(
-            self.points + other.points,
-            self.voxels + other.voxels,
-            self.unknown + other.unknown,
-            self.scans + other.scans,
-            self.grids + other.grids,
-            self.actor_voxels + other.actor_voxels,
-            self.moving_voxels + other.moving_voxels,
-        )
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Histogram(*(own + others for own, others in pairs))
 
     def of(self, kind: Kind) -> NDArray[np.int64]:
         """Return the (K,) counts of points or of voxels."""
@@ -114,11 +107,11 @@ class Statistics:
 
     def by_split(self) -> dict[str, Histogram]:
         """Return the sums of the histograms of each split."""
-        found: dict[str, Histogram] = {}
+        sums: dict[str, Histogram] = {}
         for path, histogram in self.sequences.items():
             split = self.splits[path]
-            found[split] = found.get(split, Histogram.empty(self.classes)) + histogram
-        return found
+            sums[split] = sums.get(split, Histogram.empty(self.classes)) + histogram
+        return sums
 
     def summed(self, counts: NDArray[np.int64]) -> dict[str, int]:
         """Return (C,) counts of the classes by the names of the remapped classes."""
@@ -148,45 +141,35 @@ class Statistics:
         Raises:
             DependencyError: pandas is not installed.
         """
-        return data_frame(
-            (
-                {
-                    "sequence": path,
-                    "split": self.splits[path],
-                    "class": name,
-                    "points": points,
-                    "voxels": voxels,
-                }
-                for path, histogram in self.sequences.items()
-                for (name, points), voxels in zip(
-                    self.summed(histogram.points).items(),
-                    self.summed(histogram.voxels).values(),
-                    strict=True,
-                )
-            ),
-            "sequence",
+        rows = (
+            {
+                "sequence": path,
+                "split": self.splits[path],
+                "class": name,
+                "points": points,
+                "voxels": self.summed(histogram.voxels)[name],
+            }
+            for path, histogram in self.sequences.items()
+            for name, points in self.summed(histogram.points).items()
         )
+        return data_frame(rows, "sequence")
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
 
         def plain(histogram: Histogram) -> dict[str, Any]:
-            counts = {kind: self.named(histogram.of(kind)) for kind in KINDS}
-            remapped = (
-                {f"{kind}_remapped": self.summed(histogram.of(kind)) for kind in KINDS}
-                if self.remap
-                else {}
-            )
-            figures = {
+            share = histogram.known_share
+            figures: dict[str, Any] = {kind: self.named(histogram.of(kind)) for kind in KINDS}
+            if self.remap:
+                figures |= {f"{kind}_remapped": self.summed(histogram.of(kind)) for kind in KINDS}
+            return figures | {
                 "unknown_voxels": histogram.unknown,
                 "scans": histogram.scans,
                 "grids": histogram.grids,
+                "actor_voxels": histogram.actor_voxels,
+                "moving_voxels": histogram.moving_voxels,
+                "known_share": None if np.isnan(share) else share,
             }
-            figures |= {
-                name: getattr(histogram, name) for name in ("actor_voxels", "moving_voxels")
-            }
-            share = histogram.known_share
-            return counts | remapped | figures | {"known_share": None if np.isnan(share) else share}
 
         return {
             "location": self.location,
@@ -293,24 +276,21 @@ def _count_frame(sequence: Sequence, field: str, frame: int, classes: ClassTable
     labels = sequence.read(field, frame)
     stored.check(labels, where)
     labels = to_table(labels, stored, classes, where)
-    nothing = np.zeros(classes.num_channels, np.int64)
-    if field == "labels":
-        return Histogram(np.bincount(labels, minlength=classes.num_channels), nothing, scans=1)
-    labels = labels.reshape(-1)
-    counts = field.removesuffix("labels") + "counts"
-    if counts in sequence.fields():
-        known = sequence.read(counts, frame).reshape(-1) > 0
+    histogram, grid = Histogram.empty(classes), field.removesuffix("labels")
+    labels, unknown = labels.reshape(-1), 0
+    if not grid:
+        points = np.bincount(labels, minlength=classes.num_channels)
+        return replace(histogram, points=points, scans=1)
+    if f"{grid}counts" in sequence.fields():
+        known = sequence.read(f"{grid}counts", frame).reshape(-1) > 0
         labels, unknown = labels[known], int(np.count_nonzero(~known))
-    else:
-        unknown = 0
-    grid, who = field.removesuffix("labels"), list[int]()
+    who = list[int]()
     for part in layout.ACTOR_FIELDS:
         has = f"{grid}{part}" in sequence.fields() and frame in sequence.frames(f"{grid}{part}")
         array = sequence.read(f"{grid}{part}", frame) if has else np.empty(0, np.uint8)
         who.append(len(array) if part == "velocity" else int(np.count_nonzero(array)))
-    return Histogram(
-        nothing, np.bincount(labels, minlength=classes.num_channels), unknown, 0, 1, *who
-    )
+    voxels = np.bincount(labels, minlength=classes.num_channels)
+    return Histogram(histogram.points, voxels, unknown, 0, 1, *who)
 
 
 def _table_of(sequence: Sequence, field: str) -> ClassTable:
@@ -328,23 +308,18 @@ def _common_table(tasks: Iterable[_Task], where: str) -> ClassTable:
     fields = {(sequence.path, field): _table_of(sequence, field) for sequence, field, _ in tasks}
     grids = [table for (_, field), table in fields.items() if field != "labels"]
     tables = {table.name: table for table in grids or fields.values()}
+    place = f"{where}: classes"
     if len(tables) > 1:
-        raise FormatError(
-            f"{where}: classes",
-            expected="one table",
-            found=", ".join(sorted(tables)),
-            advice=_COUNT_APART,
-        )
+        found = ", ".join(sorted(tables))
+        raise FormatError(place, expected="one table", found=found, advice=_COUNT_APART)
     (classes,) = tables.values()
     for table in fields.values():
         try:
             remaps_between(table, classes)
         except ArgumentError as error:
+            expected = f"classes that remap to {classes.name}"
             raise FormatError(
-                f"{where}: classes",
-                expected=f"classes that remap to {classes.name}",
-                found=table.name,
-                advice=_COUNT_APART,
+                place, expected=expected, found=table.name, advice=_COUNT_APART
             ) from error
     return classes
 

@@ -86,11 +86,11 @@ def within(points: NDArray[np.floating], nearest: float, farthest: float) -> NDA
 
     Points that are not finite are not.
     """
-    found = np.empty(len(points), np.bool_)
+    is_within = np.empty(len(points), np.bool_)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        found[i] = nearest < np.sqrt(x * x + y * y + z * z) < farthest
-    return found
+        is_within[i] = nearest < np.sqrt(x * x + y * y + z * z) < farthest
+    return is_within
 
 
 def _per_point(sequence: Sequence, field: str, frame: int, count: int) -> NDArray[Any] | None:

@@ -4,9 +4,9 @@ grid are unchanged since its report.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +31,7 @@ from carlasc.inspection.findings import (
     ValidationResult,
 )
 from carlasc.inspection.image_alignment import compare_images, judge_images
-from carlasc.inspection.pose_quality import PoseQuality, check_poses, check_times, describe_mounting
+from carlasc.inspection.pose_quality import check_poses, check_times, describe_mounting
 from carlasc.inspection.structure import static_structure
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -39,7 +39,10 @@ from carlasc.storage import as_source, layout
 from carlasc.storage.folder import FolderSequence
 from carlasc.storage.protocol import Sequence, Source
 
-_ADVICE = "make the report again with `carlasc report --remake --save`, or the grid with `carlasc regrid --overwrite`"
+_ADVICE = (
+    "make the report again with `carlasc report --remake --save`, or the grid with "
+    "`carlasc regrid --overwrite`"
+)
 
 
 class Freshness:
@@ -66,7 +69,7 @@ class Freshness:
         try:
             report = Report.from_json(self.sequence.read_document(name), where)
         except CarlascError as error:
-            finding = Finding.from_error("report", self.sequence.path, where, error, _ADVICE)
+            finding = Finding.from_error("report", where, error, _ADVICE)
             self._damaged.append(replace(finding, severity="warning"))
             return
         self.reports[grid] = report
@@ -104,34 +107,34 @@ class Freshness:
         """Yield a finding for each difference from the reports."""
         yield from self._damaged
         for grid, report in self.reports.items():
-            yield from self._settings(grid, report)
+            for expected, found in self._differences(grid, report):
+                yield self._finding("warning", grid, expected, found)
+            missing = set(self.sequence.frames(f"{grid}/labels").tolist()) - set(report.frames)
+            if missing:
+                found = f"{len(missing)} frames that it does not cover"
+                yield self._finding("note", grid, "a report of all frames", found)
             yield from check_actors(self.sequence, grid, report.actors or ())
-            frames = self._compared.get(grid, 0)
-            for (own, field), changed in self._changed.items():
-                if own == grid:
-                    what = f"{len(changed)} of {frames} compared frames changed since, the first is {changed[0]}"
-                    yield self._finding(grid, f"the {field} that its report was made from", what)
 
-    def _settings(self, grid: str, report: Report) -> Iterator[Finding]:
+    def _differences(self, grid: str, report: Report) -> Iterator[tuple[str, str]]:
+        """Yield what was expected and what was found, for each difference from a report."""
         if report.settings != self.sequence.params(grid):
-            yield self._finding(grid, "the settings in its report", "another params.json")
+            yield "the settings in its report", "another params.json"
         for name, digest in report.documents.items():
             if name == layout.params_file(grid):
                 continue
             exists = name in self.sequence.documents()
             if not exists or not digest.matches(self.sequence.read_document(name)):
                 found = f"a {name} that changed since" if exists else f"no {name}"
-                yield self._finding(grid, f"the {name} that its report was made from", found)
-        missing = set(self.sequence.frames(f"{grid}/labels").tolist()) - set(report.frames)
-        if missing:
-            finding = self._finding(
-                grid, "a report of all frames", f"{len(missing)} frames that it does not cover"
-            )
-            yield replace(finding, severity="note")
+                yield f"the {name} that its report was made from", found
+        for (own, field), changed in self._changed.items():
+            if own == grid:
+                frames = f"{len(changed)} of {self._compared[grid]} compared frames"
+                found = f"{frames} changed since, the first is {changed[0]}"
+                yield f"the {field} that its report was made from", found
 
-    def _finding(self, grid: str, expected: str, found: str) -> Finding:
+    def _finding(self, severity: Severity, grid: str, expected: str, found: str) -> Finding:
         where = f"{self.sequence.location}/{grid}"
-        return Finding("warning", "report", self.sequence.path, where, expected, found, _ADVICE)
+        return Finding(severity, "report", where, expected, found, _ADVICE)
 
 
 _SAMPLES = 40  # frames per sequence whose contents are read by default
@@ -181,8 +184,9 @@ def validate(
         examined: Iterator[_Examined] = (_examine(plan, step) for plan in plans)
     else:
         examined = run_all(_examine, plans, run, lost=_fail)
-    for plan, (found, report) in zip(plans, examined, strict=True):
-        findings += sorted(found, key=lambda finding: SEVERITIES.index(finding.severity))
+    for plan, (in_sequence, report) in zip(plans, examined, strict=True):
+        named = [replace(finding, sequence=plan.sequence.path) for finding in in_sequence]
+        findings += sorted(named, key=lambda finding: SEVERITIES.index(finding.severity))
         reports.append(report)
         if not run.is_alone:
             step(plan.steps)
@@ -204,25 +208,16 @@ class _CheckedFrames:
 
 
 def _plan(sequence: Sequence, every: int | None) -> _CheckedFrames:
-    found = np.unique(
-        np.concatenate(
-            [np.empty(0, np.int64), *(sequence.frames(name) for name in _fields(sequence))]
-        )
-    )
-    frames = tuple(found.tolist())
+    numbers: set[int] = set()
+    with suppress(CarlascError):  # which is reported when the sequence is examined
+        for name in sequence.fields():
+            numbers.update(sequence.frames(name).tolist())
+    frames = tuple(sorted(numbers))
     read = frames[:: every or max(1, len(frames) // _SAMPLES)]
     # opening a local file is cheap; a frame of a packed store must be decoded, and has the right
     # size anyway
-    return _CheckedFrames(
-        sequence, frames, frames if isinstance(sequence, FolderSequence) else read, read
-    )
-
-
-def _fields(sequence: Sequence) -> list[str]:
-    try:
-        return sorted(sequence.fields())
-    except CarlascError:
-        return []
+    opened = frames if isinstance(sequence, FolderSequence) else read
+    return _CheckedFrames(sequence, frames, opened, read)
 
 
 _Examined = tuple[list[Finding], SequenceReport]
@@ -230,78 +225,56 @@ _Examined = tuple[list[Finding], SequenceReport]
 
 def _fail(plan: _CheckedFrames, message: str) -> _Examined:
     """Return the result of a sequence that no worker could check."""
-    finding = Finding(
-        "error",
-        "check",
-        plan.sequence.path,
-        plan.sequence.location,
-        "a check that ends",
-        message,
-        "",
-    )
+    finding = Finding("error", "check", plan.sequence.location, "a check that ends", message)
     return [finding], SequenceReport(plan.sequence.path, len(plan.frames), 0, {}, None)
 
 
 def _examine(plan: _CheckedFrames, step: Callable[[], None] = lambda: None) -> _Examined:
     """Run all checks of a sequence; `step` is called after each of its steps."""
-    found: list[Finding] = []
     sequence = plan.sequence
-    found.extend(check_documents(sequence))
+    findings = [*check_documents(sequence)]
     described = _is_described(sequence)
-    found.extend(check_frames(sequence))
-    found.extend(check_poses(sequence))
-    found.extend(check_times(sequence))
+    for check in (check_frames, check_poses, check_times):
+        findings.extend(check(sequence))
     for frame in plan.opened:
-        found.extend(check_shapes(sequence, frame, with_grids=described))
+        findings.extend(check_shapes(sequence, frame, with_grids=described))
         step()
     evidence: dict[str, GridEvidence] = {}
     below: dict[str, GroundBelow] = {}
     freshness = Freshness(sequence) if described else None
     for frame in plan.read:
         if freshness is not None:
-            found.extend(check_values(sequence, frame))
+            findings.extend(check_values(sequence, frame))
             _measure_grids(sequence, frame, evidence, below)
             freshness.compare(frame)
         step()
     if freshness is not None:
-        found.extend(freshness.findings())
-    diagnoses = {name: grid.diagnose() for name, grid in evidence.items()}
-    for name, diagnosis in diagnoses.items():
-        found.extend(_judge_grid(sequence, name, evidence[name].spec, diagnosis))
-        found.extend(below[name].findings(sequence, name))
+        findings.extend(freshness.findings())
+    shares = {}
+    for name, grid in evidence.items():
+        diagnosis = grid.diagnose()
+        if diagnosis.frames:
+            shares[name] = diagnosis.share
+            findings.extend(_judge_grid(sequence, name, grid.spec, diagnosis))
+        findings.extend(below[name].findings(sequence, name))
     poses = _diagnose_poses(sequence)
     if poses is not None:
-        found.extend(_judge_poses(sequence, poses))
+        findings.extend(_judge_poses(sequence, poses))
     step()
-    shares = {
-        name: diagnosis.share
-        for name, diagnosis in diagnoses.items()
-        if not math.isnan(diagnosis.share)
-    }
-    pose_share = poses.share if poses is not None and poses.pairs else None
-    quality = None if poses is None else poses.quality
     images = compare_images(sequence) if described else []
-    found.extend(judge_images(sequence, images))
-    about = {agreement.camera: str(agreement) for agreement in images}
-    return found, SequenceReport(
+    findings.extend(judge_images(sequence, images))
+    quality = None if poses is None else poses.quality
+    mounting = None if quality is None else quality.mounting
+    return findings, SequenceReport(
         sequence.path,
         len(plan.frames),
         len(plan.read),
         shares,
-        pose_share,
-        *_figures(quality),
-        about,
-    )
-
-
-def _figures(quality: PoseQuality | None) -> tuple[float | None, float | None, dict[str, str]]:
-    """Return what a report says about the poses."""
-    if quality is None:
-        return None, None, {}
-    return (
-        quality.disagreement_m,
-        quality.refined_m,
-        {} if quality.mounting is None else quality.mounting.describe(),
+        poses.share if poses is not None and poses.pairs else None,
+        None if quality is None else quality.disagreement_m,
+        None if quality is None else quality.refined_m,
+        {} if mounting is None else mounting.describe(),
+        {agreement.camera: str(agreement) for agreement in images},
     )
 
 
@@ -393,26 +366,33 @@ def _diagnose_poses(sequence: Sequence) -> PoseDiagnosis | None:
 def _judge_grid(
     sequence: Sequence, grid: str, spec: GridSpec, diagnosis: GridDiagnosis
 ) -> Iterator[Finding]:
-    where = f"{sequence.location}/{grid}"
-    expected = "points in voxels of their class"
-    share = f"{diagnosis.share:.1%} of the points in known voxels, over {diagnosis.frames} frames"
-    if not diagnosis.frames:
+    own, corrected = diagnosis.share, diagnosis.corrected_share
+    share = f"{own:.1%} of the points in known voxels, over {diagnosis.frames} frames"
+    # The labels are wrong, not the geometry, if occupied voxels agree much better than classes.
+    other_classes = diagnosis.occupied_share > max(_DOUBTFUL_SHARE, own + 0.2)
+    severity: Severity = "error"
+    advice = "draw both with `carlasc render`, or make the grid again with `carlasc regrid`"
+    if diagnosis.mistake is not None and not (other_classes and corrected < _POOR_SHARE):
+        cause = f"; the likely cause is {diagnosis.mistake}: after correction, {corrected:.1%}"
+        advice = (
+            "correct the program that writes the points or the grid, or make the grid again with "
+            "`carlasc regrid`"
+        )
+    elif own >= _DOUBTFUL_SHARE or _largest_edge(spec) > _COARSE_M:
         return
-    other_classes = diagnosis.occupied_share > max(_DOUBTFUL_SHARE, diagnosis.share + 0.2)
-    if diagnosis.mistake is not None and not (
-        other_classes and diagnosis.corrected_share < _POOR_SHARE
-    ):
-        found = f"{share}; the likely cause is {diagnosis.mistake}: after correction, {diagnosis.corrected_share:.1%}"
-        advice = "correct the program that writes the points or the grid, or make the grid again with `carlasc regrid`"
-        yield Finding("error", "scan-in-voxels", sequence.path, where, expected, found, advice)
-    elif diagnosis.share < _DOUBTFUL_SHARE and _largest_edge(spec) <= _COARSE_M:
+    else:
+        severity = "error" if own < _POOR_SHARE else "warning"
+        cause = (
+            ", and no known correction raises it; the likely cause is scans and grids of different "
+            "frames"
+        )
         if other_classes:
-            found = f"{share}, but {diagnosis.occupied_share:.1%} in occupied voxels; the likely cause is labels of another class table, or in another order"
-        else:
-            found = f"{share}, and no known correction raises it; the likely cause is scans and grids of different frames"
-        severity: Severity = "error" if diagnosis.share < _POOR_SHARE else "warning"
-        advice = "draw both with `carlasc render`, or make the grid again with `carlasc regrid`"
-        yield Finding(severity, "scan-in-voxels", sequence.path, where, expected, found, advice)
+            cause = (
+                f", but {diagnosis.occupied_share:.1%} in occupied voxels; the likely cause is "
+                "labels of another class table, or in another order"
+            )
+    where, expected = f"{sequence.location}/{grid}", "points in voxels of their class"
+    yield Finding(severity, "scan-in-voxels", where, expected, share + cause, advice)
 
 
 def _largest_edge(spec: GridSpec) -> float:
@@ -426,42 +406,45 @@ def _largest_edge(spec: GridSpec) -> float:
 
 
 def _judge_poses(sequence: Sequence, diagnosis: PoseDiagnosis) -> Iterator[Finding]:
-    where = f"{sequence.location}/{layout.POSES}"
-    expected = "scans that overlap under the poses"
-    quality = diagnosis.quality
+    quality, correction = diagnosis.quality, diagnosis.correction
     mounting = None if quality is None else quality.mounting
     described = None if mounting is None else describe_mounting(mounting, layout.FRAME_PERIOD_S)
-    if diagnosis.correction is not None:
-        found = f"{diagnosis.share_there:.1%} of a scan's structure overlaps that of an earlier scan; the likely cause is {diagnosis.correction.name}: after correction, {diagnosis.corrected_share:.1%}"
-        yield Finding(
-            "error",
-            "poses-on-scans",
-            sequence.path,
-            where,
-            expected,
-            found,
-            diagnosis.correction.advice,
+    check, expected = "poses-on-scans", "scans that overlap under the poses"
+    overlap = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan"
+    severity: Severity = "warning"
+    if correction is not None:
+        severity, advice = "error", correction.advice
+        found = (
+            f"{diagnosis.share_there:.1%} of a scan's structure overlaps that of an earlier scan; "
+            f"the likely cause is {correction.name}: after correction, "
+            f"{diagnosis.corrected_share:.1%}"
         )
     elif described is not None:
-        yield Finding("warning", "poses-on-scans", sequence.path, where, expected, *described)
+        found, advice = described
     elif quality is not None and quality.is_poor:
-        found = f"scans that are {100 * (quality.disagreement_m or 0):.1f} cm from the surfaces that their neighbours saw; under refined poses {100 * (quality.refined_m or 0):.1f} cm"
-        advice = "write refined poses with `carlasc refine` before you stack scans yourself; `carlasc regrid` refines them anyway"
-        yield Finding(
-            "warning",
-            "pose-jitter",
-            sequence.path,
-            where,
-            "scans that agree with their neighbours",
-            found,
-            advice,
+        check, expected = "pose-jitter", "scans that agree with their neighbours"
+        found = (
+            f"scans that are {100 * (quality.disagreement_m or 0):.1f} cm from the surfaces that "
+            "their neighbours saw; under refined poses "
+            f"{100 * (quality.refined_m or 0):.1f} cm"
+        )
+        advice = (
+            "write refined poses with `carlasc refine` before you stack scans yourself; `carlasc "
+            "regrid` refines them anyway"
         )
     elif diagnosis.offset_m is not None:
         x, y, z = diagnosis.offset_m
-        found = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from their poses"
+        severity = "error"
+        found = (
+            f"{overlap}; scans fit best about ({x:.1f}, {y:.1f}, {z:.1f}) m away from their poses"
+        )
         advice = "check that the poses belong to this sequence and to these frames"
-        yield Finding("error", "poses-on-scans", sequence.path, where, expected, found, advice)
     elif diagnosis.pairs and diagnosis.share < _NO_OVERLAP:
-        found = f"{diagnosis.share:.1%} of a scan's structure overlaps that of an earlier scan, and no known correction raises it"
-        advice = "check that the poses belong to this sequence, or estimate them with `carlasc convert --poses kiss-icp`"
-        yield Finding("warning", "poses-on-scans", sequence.path, where, expected, found, advice)
+        found = f"{overlap}, and no known correction raises it"
+        advice = (
+            "check that the poses belong to this sequence, or estimate them with `carlasc convert "
+            "--poses kiss-icp`"
+        )
+    else:
+        return
+    yield Finding(severity, check, f"{sequence.location}/{layout.POSES}", expected, found, advice)

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from carlasc.core.geometry import rotation_z
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.inspection.agreement import KNOWN, OCCUPIED, RIGHT, GridEvidence, GroundBelow, Voxels
+from carlasc.inspection.agreement import GridEvidence, GroundBelow
 from carlasc.inspection.alignment import choose_pairs, diagnose_poses
+from carlasc.inspection.points_in_voxels import labels_at
 from carlasc.inspection.validation import validate
 from carlasc.storage import FolderSink, FolderSource, layout
 from carlasc.testing.drives import SimulatedDrive
@@ -26,6 +27,13 @@ SPECS = {
     "one cell": GridSpec("cartesian", (1, 1, 1), (-3.0, -2.5, -1.0), (3.0, 2.5, 0.7)),
 }
 SHIFTS = np.array([(x, y, z) for x in (0, -1, 1) for y in (0, -1, 1) for z in (0, -1, 1)])
+
+
+def count(grid, points, classes, shifts):
+    """Return (S, 3) points in known voxels, of these in voxels of their class, and of any class."""
+    found = labels_at(points, grid.spec, grid.labels, grid.known, shifts=shifts)[0]
+    known = found >= 0
+    return np.stack([known, known & (found == classes), found > 0], axis=2).sum(axis=1)
 
 
 def plain_count(grid, points, labels, shifts):
@@ -69,8 +77,9 @@ def test_points_are_counted_as_in_plain_numpy(name, real, whole, narrow, with_co
     points[:4, 0] = (math.nan, math.inf, -math.inf, 1e300)
     with np.errstate(over="ignore", invalid="ignore"):
         points, classes = points.astype(real), rng.integers(0, 4, 200).astype(whole)
-        found = Voxels(grid).count(points, classes, SHIFTS)
-        np.testing.assert_array_equal(found, plain_count(grid, points, classes, SHIFTS))
+        found = count(grid, points, classes, SHIFTS)
+        exact = points.astype(np.float64)
+        np.testing.assert_array_equal(found, plain_count(grid, exact, classes, SHIFTS))
 
 
 @pytest.mark.parametrize("name", SPECS)
@@ -78,9 +87,8 @@ def test_points_in_the_middle_of_voxels_are_found_where_the_grid_has_them(name):
     spec = SPECS[name]
     labels = np.random.default_rng(0).integers(0, 5, spec.size).astype(np.uint8)
     points = spec.from_axes(spec.centers()).reshape(-1, 3)
-    counted = Voxels(Grid(spec, labels)).count(points, labels.reshape(-1), SHIFTS[:1])
-    assert counted[0, KNOWN] == counted[0, RIGHT] == spec.num_voxels
-    assert counted[0, OCCUPIED] == np.count_nonzero(labels)
+    counted = count(Grid(spec, labels), points, labels.reshape(-1), SHIFTS[:1])
+    assert counted.tolist() == [[spec.num_voxels, spec.num_voxels, np.count_nonzero(labels)]]
 
 
 def test_grids_in_any_order_in_memory_count_alike():
@@ -88,10 +96,10 @@ def test_grids_in_any_order_in_memory_count_alike():
     labels, counts = rng.integers(0, 4, spec.size).astype(np.uint32), rng.integers(0, 2, spec.size)
     points = spec.centers().reshape(-1, 3)
     args = (points, labels.reshape(-1), SHIFTS)
-    expected = Voxels(Grid(spec, labels, counts)).count(*args)
-    found = Voxels(
-        Grid(spec, np.asfortranarray(labels), counts[::-1, ::-1].copy()[::-1, ::-1])
-    ).count(*args)
+    expected = count(Grid(spec, labels, counts), *args)
+    found = count(
+        Grid(spec, np.asfortranarray(labels), counts[::-1, ::-1].copy()[::-1, ::-1]), *args
+    )
     np.testing.assert_array_equal(found, expected)
 
 

@@ -208,8 +208,9 @@ def test_a_part_counts_and_the_last_part_judges(town, tmp_path):
     assert [file.stat().st_mtime_ns for file in kept] == times
     kept[0].write_bytes(b"PK damaged")
     assert carlasc.audit(town, town, keep=tmp_path).verdicts == whole.verdicts
-    with pytest.raises(ArgumentError, match="keep"):
+    with pytest.raises(ArgumentError) as caught:
         carlasc.audit(town, town, run=Run(workers=1, part=Part(1, 2)))
+    assert caught.value.where == "part" and "keep" in caught.value.expected
 
 
 @pytest.mark.slow
@@ -228,17 +229,18 @@ def test_grids_without_scans_of_theirs_are_refused(town, tmp_path):
     far = planted.write_grids(town, tmp_path / "far")
     for file in sorted(far.rglob("0000*.*"), reverse=True):
         file.rename(file.with_name(f"{int(file.stem) + 500:06d}{file.suffix}"))
-    with pytest.raises(MissingDataError, match="frames 0 to 15.*found 500 to 515"):
+    with pytest.raises(MissingDataError) as caught:
         carlasc.audit(far, town)
-    with pytest.raises(
-        MissingDataError, match=r"far/cartesian/evaluation with \S*town/cartesian: "
-    ):
+    assert (caught.value.expected, caught.value.found) == ("grids of frames 0 to 15", "500 to 515")
+    with pytest.raises(MissingDataError) as caught:
         carlasc.audit(far, town)
+    assert "far/cartesian/evaluation with" in caught.value.where
     names = tmp_path / "named"
     shutil.copytree(town / "cartesian", names / "Val" / "one" / "cartesian")
     shutil.copytree(town / "cartesian", names / "Val" / "two" / "cartesian")
-    with pytest.raises(MissingDataError, match="tried.*cartesian with Val/one"):
+    with pytest.raises(MissingDataError) as caught:
         carlasc.audit(town, names)
+    assert "cartesian with Val/one" in caught.value.found
 
 
 @pytest.mark.slow
@@ -316,11 +318,9 @@ def test_grids_of_another_length_are_named_with_their_scans(town, tmp_path):
             tmp_path / "gts" / "scene" / token / "labels.npz",
             semantics=np.full((200, 200, 16), 17, np.uint8),
         )
-    with pytest.raises(
-        MissingDataError,
-        match=r"scene with \S*cartesian: expected a time for each of 3 tokens.*found 16 scans",
-    ):
+    with pytest.raises(MissingDataError) as caught:
         carlasc.audit(tmp_path / "gts", town)
+    assert "3 tokens" in caught.value.expected and caught.value.found.startswith("16 scans")
     grids = planted.write_grids(town, tmp_path / "longer")
     for file in grids.rglob("000015.*"):
         shutil.copy(file, file.with_name(f"000099{file.suffix}"))

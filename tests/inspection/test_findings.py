@@ -37,23 +37,21 @@ from carlasc.inspection.findings import Finding, SequenceReport, ValidationResul
     ],
 )
 def test_the_parts_of_an_error_become_those_of_a_finding(error, advice, expected):
-    finding = Finding.from_error("check", "Val/A", "folder", error, advice)
+    finding = Finding.from_error("check", "folder", error, advice)
     assert (finding.location, finding.expected, finding.found, finding.advice) == expected
-    assert (finding.severity, finding.check, finding.sequence) == ("error", "check", "Val/A")
+    assert (finding.severity, finding.check) == ("error", "check")
 
 
 def test_a_finding_reads_as_an_error_does():
     error = FormatError("a.bin", expected="b", found="c", advice="d")
     assert (
-        str(Finding.from_error("check", "", "", error))
-        == str(error)
-        == "a.bin: expected b, found c: d"
+        str(Finding.from_error("check", "", error)) == str(error) == "a.bin: expected b, found c: d"
     )
-    assert str(Finding("note", "check", "", "a.bin", "b", "c")) == "a.bin: expected b, found c"
+    assert str(Finding("note", "check", "a.bin", "b", "c")) == "a.bin: expected b, found c"
 
 
 def finding(severity, check="x"):
-    return Finding(severity, check, "", "a", "b", "c")
+    return Finding(severity, check, "a", "b", "c")
 
 
 def test_findings_are_grouped_by_check_with_errors_first():

@@ -223,8 +223,9 @@ def test_frames_whose_window_is_cut_are_not_measured(bare):
         ).total.frames
         == 1
     )
-    with pytest.raises(MissingDataError, match="leave out"):
+    with pytest.raises(MissingDataError) as caught:
         holdout(bare, every=2, frames=(2, 3))
+    assert "leave out" in caught.value.expected
 
 
 def test_executors_give_the_same_scores_and_progress_counts_frames(bare):

@@ -123,10 +123,12 @@ def test_a_broken_grid_is_a_problem_of_its_sequence_not_of_the_whole(data: Path)
 
 
 def test_nothing_and_a_level_too_low_are_told(data: Path, tmp_path: Path) -> None:
-    with pytest.raises(MissingDataError, match="found nothing"):
+    with pytest.raises(MissingDataError) as caught:
         info(tmp_path / "nowhere")
-    with pytest.raises(MissingDataError, match="give the folder above"):
+    assert caught.value.found == "nothing"
+    with pytest.raises(MissingDataError) as caught:
         info(data / "Train/Town01_Light/cartesian/labels")
+    assert "give the folder above" in caught.value.advice
 
 
 def test_the_overview_turns_into_json(data: Path) -> None:

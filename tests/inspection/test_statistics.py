@@ -150,24 +150,29 @@ def test_two_class_tables_are_not_summed_up(
     (root / "Val/Town07_Light/cartesian" / layout.METADATA).write_bytes(
         Metadata(classes=SEMANTICKITTI).to_json()
     )
-    with pytest.raises(FormatError, match="expected one table, found carla, semantickitti"):
+    with pytest.raises(FormatError) as caught:
         stats(root)
+    assert caught.value.found == "carla, semantickitti"
 
 
 def test_senseless_arguments_and_data_without_classes_are_told(
     data: tuple[Path, dict[str, dict[str, np.ndarray]]], tmp_path: Path
 ) -> None:
-    with pytest.raises(ArgumentError, match="every"):
+    with pytest.raises(ArgumentError) as caught:
         stats(data[0], every=0)
-    with pytest.raises(ArgumentError, match="remap"):
+    assert caught.value.where == "every"
+    with pytest.raises(ArgumentError) as caught:
         stats(data[0], remap="carlasc12")
-    with pytest.raises(FormatError, match="expected labels of semantickitti, found carla"):
+    assert caught.value.where == "remap"
+    with pytest.raises(FormatError) as caught:
         stats(data[0], remap="semantickitti19")
+    assert (caught.value.expected, caught.value.found) == ("labels of semantickitti", "carla")
     for path in data[0].glob("*/*/cartesian"):
         shutil.rmtree(path / "labels")
         shutil.rmtree(path / "evaluation")
-    with pytest.raises(MissingDataError, match="found neither"):
+    with pytest.raises(MissingDataError) as caught:
         stats(data[0])
+    assert caught.value.found == "neither"
 
 
 def test_progress_ends_at_its_total(data: tuple[Path, dict[str, dict[str, np.ndarray]]]) -> None:
@@ -197,8 +202,9 @@ def test_a_chart_is_drawn(
 
 
 def test_a_chart_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="plot: expected a file that ends in .png"):
+    with pytest.raises(ArgumentError) as caught:
         draw_histograms(Statistics("", CARLA, None, {}, {}), tmp_path / "classes.doc")
+    assert (caught.value.where, caught.value.found) == ("plot", ".doc")
 
 
 def test_points_beside_a_prediction_are_counted_in_its_classes(tmp_path: Path) -> None:

@@ -52,11 +52,7 @@ _SHOWN = 4  # number of frames in pictures
 _REACH = 30  # frames before and after a stretch in which actors matter
 _BLOCK = 400  # frames for which actors are found together
 # name of the files of sums, and of other entries in them
-_SUMS, _WORST, _KEY = (
-    "audit",
-    "worst",
-    "key",
-)
+_SUMS, _WORST, _KEY = ("audit", "worst", "key")
 
 # a wrong frame: path, frame of the grid, frame of the scan, wrong voxels
 _Row = tuple[str, int, int, int]
@@ -289,14 +285,12 @@ def _actors_of(
         return MovingActors()
     frames = one.scans.frames("points")
     far = frames[(frames < first - 2 * _REACH) | (frames > last + 2 * _REACH)].tolist()
-    scans, named = (
-        WithoutScans(one.scans, far),
-        [n for n in ScanFeed(one.scans, FromScans()).motion if n != "evidence"],
-    )
-    # if a field names actors, evidence would only add doubtful ones
-    observe = FromScans(motion=MotionOptions(named[0] if named else "evidence"))  # type: ignore[arg-type]
+    # If a field names actors, evidence would only add doubtful ones.
+    named = [n for n in ScanFeed(one.scans, FromScans()).motion if n != "evidence"]
+    motion = MotionOptions(named[0] if named else "evidence")  # type: ignore[arg-type]
     try:
-        return find_actors(ScanFeed(scans, observe), run)
+        feed = ScanFeed(WithoutScans(one.scans, far), FromScans(motion=motion))
+        return find_actors(feed, run)
     except CarlascError as error:
         notes.append(f"{one.path}: moving actors are not checked: {error}")
         return MovingActors()
@@ -317,11 +311,11 @@ def _count_all(
     tasks = _with_actors((stretches[index] for index in own), run, notes)
     with closing(run_all(_Stretch.count, tasks, run, lost=_fail)) as results:
         for index, stretch in enumerate(stretches):
-            found, failed = next(results) if index in own else (stretch.read(), [])
-            path, is_whole = stretch.counter.matched.path, is_whole and found is not None
+            counted, failed = next(results) if index in own else (stretch.read(), [])
+            path, is_whole = stretch.counter.matched.path, is_whole and counted is not None
             steps(len(stretch.frames))
             failures += failed
-            for name, counts in (found or {}).items():
+            for name, counts in (counted or {}).items():
                 if name == _WORST:
                     worst += [
                         (path, number, frame, wrong) for number, frame, wrong in counts.tolist()

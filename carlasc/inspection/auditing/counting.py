@@ -16,37 +16,27 @@ from carlasc.core.geometry import invert, thin, transform_points
 from carlasc.core.scans import Scan
 from carlasc.errors import CarlascError
 from carlasc.inspection.auditing.geometry import Family, families
-from carlasc.inspection.auditing.loops import count_occupied_under, crossings, grown, voxels_at
+from carlasc.inspection.auditing.loops import crossings, grown, voxels_at
 from carlasc.inspection.auditing.matching import MatchedGrids
 from carlasc.inspection.auditing.verdicts import Sums, add
 from carlasc.inspection.heldout_scores import BANDS_M, lowest_of_columns
+from carlasc.inspection.points_in_voxels import labels_at
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 
 HEIGHTS = 4  # shares are also computed for this number of layers of equal height
 MAX_ID = 511  # larger ids of classes count as this one
 # points of a frame that are thinned evenly in space, and rays that are followed
-_SPREAD, _RAYS = (
-    20_000,
-    8000,
-)
+_SPREAD, _RAYS = (20_000, 8000)
 # points that are kept of these in a frame, and in all frames
-_LEAST, _MOST, _IN_ALL = (
-    500,
-    2500,
-    250_000,
-)
+_LEAST, _MOST, _IN_ALL = (500, 2500, 250_000)
 # frames before and after, in which the paths of actors are checked
-_TIMES = (
-    *range(-20, -1, 2),
-    *range(2, 21, 2),
-)
+_TIMES = (*range(-20, -1, 2), *range(2, 21, 2))
 _APART = 20  # frames between the scans that show a drift
 _CLEAR_RAYS = 3  # an occupied voxel that this number of rays cross is a phantom
 # an actor may be larger than its body by this, because bodies are measured on a few sides only
 _AROUND_M = 0.6
-_INSET_M = (
-    0.2  # the path of an actor is narrower than its body by this, and as far above the ground
-)
+# the path of an actor is narrower than its body by this, and as far above the ground
+_INSET_M = 0.2
 _MEMBERS = 5  # an actor counts if it is seen in this number of voxels
 _KEPT = 14  # number of scans kept in memory for later frames
 FREE, OCCUPIED, PHANTOM, TRAIL, FALSE_FREE = range(5)
@@ -174,9 +164,11 @@ class FrameCounter:
         points: NDArray[np.float64],
         later_s: float = 0.0,
     ) -> NDArray[np.int64]:
-        timed = np.column_stack([points, np.full(len(points), later_s)])
-        found = count_occupied_under(timed, warps, self.matched.spec, seen.occupied)
-        return np.column_stack([np.full(len(found), len(points)), found])
+        at_points = labels_at(
+            points, self.matched.spec, seen.occupied, warps=warps, later_s=later_s
+        )
+        occupied = (at_points[:, 0] > 0).sum(axis=1)
+        return np.column_stack([np.full(len(warps), len(points)), occupied])
 
     @property
     def _most(self) -> int:
@@ -241,27 +233,15 @@ class FrameCounter:
         return placed[self.matched.spec.flat_index(placed) >= 0]
 
     def _add_held_out(self, sums: Sums, seen: _Frame) -> None:
-        """Count the returns of static classes in the nearest scans that took no part in the grid."""
+        """Count static returns of the nearest scans that took no part in the grid."""
         if self.window is None or seen.known is None:
             return
         for other in (seen.number + self.window[0] - 1, seen.number + self.window[1] + 1):
             if (placed := self._standing(seen.number, other)) is not None:
-                own = self.matched.spec.flat_index(placed)
-                known, occupied = (mask.reshape(-1)[own] for mask in (seen.known, seen.occupied))
-                add(sums, "held out", [known.sum(), (known & ~occupied).sum()])
+                at_points = labels_at(placed, self.matched.spec, seen.occupied, seen.known)
+                add(sums, "held out", [(at_points >= 0).sum(), (at_points == 0).sum()])
 
     # Contents
-
-    @cached_property
-    def ground(self) -> list[int]:
-        """The classes of the grids that are ground, by the class table of the scans."""
-        lookup = self.matched.lookup
-        found = (
-            set()
-            if lookup is None
-            else {int(lookup[i]) for i in self.matched.scans.metadata.classes.ground}
-        )
-        return sorted(found - {-1, 0})
 
     def _add_classes(self, sums: Sums, seen: _Frame) -> None:
         """Count the classes of the grid, points by their class and the class of their voxel, and
@@ -273,8 +253,8 @@ class FrameCounter:
             "classes of grids",
             np.bincount(seen.labels[seen.occupied].astype(np.int64), minlength=MAX_ID + 1),
         )
-        if len(self.ground):
-            ground = seen.occupied & np.isin(seen.labels, self.ground)
+        if self.matched.ground:
+            ground = seen.occupied & np.isin(seen.labels, self.matched.ground)
             layers = (ground & ~np.pad(ground, ((0, 0), (0, 0), (1, 0)))[:, :, :-1]).sum(axis=2)
             add(sums, "ground columns", [(layers > 0).sum(), (layers > 1).sum()])
         if labels is not None and lookup is not None and self.matched.classes is not None:
@@ -291,9 +271,9 @@ class FrameCounter:
         """Count returns in free voxels by class, distance and height, and return these voxels."""
         wrong = np.zeros(seen.occupied.shape, np.bool_)
         if seen.known is not None:
-            own = np.flatnonzero(seen.voxels >= 0)
-            own = own[seen.known.reshape(-1)[seen.voxels[own]]]
-            free = ~seen.occupied.reshape(-1)[seen.voxels[own]]
+            at_points = labels_at(seen.points, self.matched.spec, seen.occupied, seen.known)[0, 0]
+            own = np.flatnonzero((at_points >= 0) & (seen.voxels >= 0))
+            free = at_points[own] == 0
             wrong.reshape(-1)[seen.voxels[own[free]]] = True
             kinds = (
                 np.zeros(len(own), np.int64) if seen.scan.labels is None else seen.scan.labels[own]
@@ -309,8 +289,8 @@ class FrameCounter:
         wrong = seen.occupied & clear & ~seen.around
         # rays near the ground cross its voxels for metres
         wrong &= ~(
-            np.isin(seen.labels, self.ground)
-            if len(self.ground)
+            np.isin(seen.labels, self.matched.ground)
+            if self.matched.ground
             else lowest_of_columns(seen.occupied)
         )
         looked = np.nonzero(seen.occupied & (clear | seen.hit))
@@ -328,7 +308,7 @@ class FrameCounter:
         points: NDArray[np.floating],
         wrong: NDArray[np.bool_],
     ) -> None:
-        """Add (K, B, H, 2) counts by class, distance and height: all of them, and the wrong ones."""
+        """Add (K, B, H, 2) counts by class, distance and height: all, and the wrong ones."""
         low, high = self.matched.spec.lower[2], self.matched.spec.upper[2]
         heights = np.clip((points[:, 2] - low) / (high - low) * HEIGHTS, 0, HEIGHTS - 1).astype(
             np.int64
@@ -398,7 +378,7 @@ class FrameCounter:
         return trails.reshape(seen.occupied.shape)
 
     def _members(self, seen: _Frame) -> list[tuple[str, NDArray[np.integer]]]:
-        """Return the points of each actor in a scan: by instances, or by tracks of moving actors."""
+        """Return the points of each actor in a scan, by instances or by tracks."""
         ids, labels = seen.scan.instances, seen.scan.labels
         if ids is None or not ids.any():
             tracks = self.actors.tracks.items()
@@ -406,9 +386,9 @@ class FrameCounter:
                 (_name(n, t), t.members[seen.number]) for n, t in tracks if seen.number in t.members
             ]
         order = np.argsort(ids, kind="stable")
-        found, starts = np.unique(ids[order], return_index=True)
+        actors, starts = np.unique(ids[order], return_index=True)
         movable = sorted(self.matched.scans.metadata.classes.movable)
-        parts = zip(found.tolist(), np.split(order, starts[1:]), strict=True)
+        parts = zip(actors.tolist(), np.split(order, starts[1:]), strict=True)
         return [
             (str(i), own)
             for i, own in parts
@@ -426,10 +406,8 @@ class FrameCounter:
 
         A negative margin also leaves out the lowest voxel.
         """
-        spec, poses = (
-            self.matched.spec,
-            [pose for frame in frames if (pose := track.pose(frame)) is not None],
-        )
+        spec = self.matched.spec
+        poses = [pose for frame in frames if (pose := track.pose(frame)) is not None]
         lower, upper = track.lower - margin_m, track.upper + margin_m
         if margin_m < 0:
             lower[2] = track.lower[2] + float(spec.voxel_size[2])

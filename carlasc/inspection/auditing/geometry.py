@@ -75,10 +75,8 @@ class _Fit:
         """The lowest and the highest value that fit as well as the best one, or are the best in
         nearly all draws.
         """
-        values, worse = (
-            self.family.values,
-            np.flatnonzero(self.shares[0] < self.shares[0, self.best] - _FLAT),
-        )
+        values = self.family.values
+        worse = np.flatnonzero(self.shares[0] < self.shares[0, self.best] - _FLAT)
         low = int(worse[worse < self.best].max(initial=-1)) + 1
         high = int(worse[worse > self.best].min(initial=len(values))) - 1
         drawn = np.quantile(values[self.shares[1:].argmax(axis=1)], (0.025, 0.975))
@@ -103,60 +101,53 @@ def judge_geometry(stretches: Stretches, one: MatchedGrids) -> Iterator[Verdict]
     ]
     top, own = max(float(fit.shares[0].max()) for fit in fits), shares[:, 0]
     low, high = np.quantile(own[1:], (0.025, 0.975)).tolist()
-    text = f"{own[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} with the best correction"
-    state: State = "sound" if top >= _BELONGS else "fault"
-    advice = f"check that scans and grids are of the same sequence and in a known coordinate frame; tried: {one.pair}"
-    yield Verdict(
-        "fit",
-        state,
-        float(own[0]),
-        low,
-        high,
-        "share",
-        text,
-        one.path,
-        "" if state == "sound" else advice,
+    text = (
+        f"{own[0]:.1%} of the points of scans are in occupied voxels, {top:.1%} with the best "
+        "correction"
     )
-    if state == "fault":
+    belongs, advice = top >= _BELONGS, ""
+    if not belongs:
+        advice = (
+            "check that scans and grids are of the same sequence and in a known coordinate frame; "
+            f"tried: {one.pair}"
+        )
+    state: State = "sound" if belongs else "fault"
+    yield Verdict("fit", state, float(own[0]), low, high, "share", text, one.path, advice)
+    if not belongs:
         return
-    found = [fit for fit in fits if fit.is_measured and fit.is_fault]
-    if not found:
+    faults = [fit for fit in fits if fit.is_measured and fit.is_fault]
+    if not faults:
         yield from (_sound_or_not(fit, one.path) for fit in fits)
         return
-    best = max(found, key=lambda fit: fit.gain)
-    # a shift that fits nearly as well as another size is preferred: it needs fewer assumptions
-    near = [
-        fit
-        for fit in found
-        if fit.family.kind == "shift" and fit.gain >= (1 - _SAME / 5) * best.gain
-    ]
-    winner = (
-        max(near, key=lambda fit: fit.gain) if near and best.family.kind == "voxel size" else best
-    )
-    for fit in found:
-        together = (
-            fit.family.kind == winner.family.kind == "shift" and fit.gain >= _SAME * winner.gain
-        )
-        if fit is winner or together:
-            yield _fault(fit, found, one)
+    winner = max(faults, key=lambda fit: fit.gain)
+    if winner.family.kind == "voxel size":
+        # a shift that fits nearly as well as another size is preferred: it needs fewer assumptions
+        near = (1 - _SAME / 5) * winner.gain
+        shifts = [fit for fit in faults if fit.family.kind == "shift" and fit.gain >= near]
+        winner = max(shifts, key=lambda fit: fit.gain, default=winner)
+    for fit in faults:
+        both_shift = fit.family.kind == winner.family.kind == "shift"
+        if fit is winner or (both_shift and fit.gain >= _SAME * winner.gain):
+            yield _fault(fit, faults, one)
     text = f"not judged before the fault of {winner.family.name} is corrected"
     yield Verdict("other geometry", "undetermined", None, None, None, "", text, one.path)
 
 
-def _fault(fit: _Fit, found: list[_Fit], one: MatchedGrids) -> Verdict:
+def _fault(fit: _Fit, faults: list[_Fit], one: MatchedGrids) -> Verdict:
     family, (low, high) = fit.family, fit.interval
-    others = [
-        o
-        for o in found
-        if o is not fit and o.family.kind != "voxel size" and o.gain >= (1 - _SAME / 3) * fit.gain
-    ]
-    also = (
-        f"; {' or '.join(o.family.name for o in others)} explains it nearly as well"
-        if others
-        else ""
+    others = " or ".join(
+        other.family.name
+        for other in faults
+        if other is not fit
+        and other.family.kind != "voxel size"
+        and other.gain >= (1 - _SAME / 3) * fit.gain
     )
+    also = f"; {others} explains it nearly as well" if others else ""
     own, best = (float(fit.shares[0, row]) for row in (family.neutral, fit.best))
-    text = f"{_describe(fit, one)}: corrected, {best:.1%} instead of {own:.1%} of points are in occupied voxels{also}"
+    text = (
+        f"{_describe(fit, one)}: corrected, {best:.1%} instead of {own:.1%} of points are in "
+        f"occupied voxels{also}"
+    )
     if family.kind == "axes":
         low = high = fit.value
     return Verdict(
@@ -256,65 +247,47 @@ class Family:
 
 def families(spec: GridSpec) -> list[Family]:
     """Return the families of corrections of a grid."""
-    found = [
-        _family(
-            "axes",
-            "axes",
-            range(len(AXES)),
-            [m for _, m in AXES],
-            "give grids and scans the same axes",
-        )
-    ]
-    advice = "move the bounds, or correct the position of the sensor in the poses that the grids were made with"
+    advice, still = "give grids and scans the same axes", [np.eye(3)]
+    made = [_family("axes", "axes", range(len(AXES)), [m for _, m in AXES], advice)]
+    advice = (
+        "move the bounds, or correct the position of the sensor in the poses that the grids were "
+        "made with"
+    )
     for axis, name in enumerate("xyz"):
-        step = shift_step(spec, name)
+        step, coarse = shift_step(spec, name), _COARSE_M[name]
         fine = np.arange(-round(_VOXELS / _FINE), round(_VOXELS / _FINE) + 1) * _FINE * step
-        values = np.sort([*fine, *_COARSE_M[name][np.abs(_COARSE_M[name]) > _VOXELS * step + 0.01]])
-        shifts = _family(
-            f"shift {name}", "shift", values, [np.eye(3)], advice, "m", 0.2 * step, step
-        )
+        values = np.sort([*fine, *coarse[np.abs(coarse) > _VOXELS * step + 0.01]])
+        shifts = _family(f"shift {name}", "shift", values, still, advice, "m", 0.2 * step, step)
         shifts.warps[:, axis, 3] = values
-        found.append(shifts)
+        made.append(shifts)
     turns = [rotation_z(angle)[:3, :3] for angle in np.radians(_YAW_DEG)]
     advice = "correct the yaw of the sensor in the calibration that the grids were made with"
-    found.append(_family("yaw", "yaw", _YAW_DEG, turns, advice, "degrees", 0.4, 1.5))
+    made.append(_family("yaw", "yaw", _YAW_DEG, turns, advice, "degrees", 0.4, 1.5))
+    anchors = {"": np.zeros(3), ", lower bound kept": np.array(spec.lower)}
+    advice, kind = "correct the declared voxel size or bounds", "voxel size"
     for axes, which in (("", (1, 1, 1)), (" x, y", (1, 1, 0)), (" z", (0, 0, 1))):
         # the fault is declared = ratio * true size: p is in the true grid where p * ratio is in the
         # declared one
         scales = [np.diag(np.where(which, ratio, 1.0)) for ratio in _RATIOS]
-        for anchor, fixed in (("", np.zeros(3)), (", lower bound kept", np.array(spec.lower))):
+        for anchor, fixed in anchors.items():
             if not anchor or spec.coordinates == "cartesian":
-                advice = "correct the declared voxel size or bounds"
-                sizes = _family(
-                    f"voxel size{axes}{anchor}",
-                    "voxel size",
-                    _RATIOS,
-                    scales,
-                    advice,
-                    "times",
-                    0.02,
-                    0.15,
-                )
+                name = f"{kind}{axes}{anchor}"
+                sizes = _family(name, kind, _RATIOS, scales, advice, "times", 0.02, 0.15)
                 sizes.warps[:, :, 3] = fixed - sizes.warps[:, :, :3] @ fixed
-                found.append(sizes)
-    advice = "refine the poses (`carlasc refine`) and make the grids again"
-    drift = _family(
-        "height drift", "height drift", _DRIFT_M_S, [np.eye(3)], advice, "m/s", 0.02, 0.06
-    )
+                made.append(sizes)
+    advice, name = "refine the poses (`carlasc refine`) and make the grids again", "height drift"
+    drift = _family(name, name, _DRIFT_M_S, still, advice, "m/s", 0.02, 0.06)
     drift.warps[:, 2, 4] = _DRIFT_M_S
     advice = "give the grids the numbers or the times of these scans"
-    return [*found, drift, _family("lag", "lag", _LAGS, [np.eye(3)], advice, "frames", 1.0, 1.0)]
+    return [*made, drift, _family("lag", "lag", _LAGS, still, advice, "frames", 1.0, 1.0)]
 
 
 def shift_step(spec: GridSpec, axis: str) -> float:
     """Return the size of a voxel along x, y or z; in a cylindrical grid, x and y take the size
     along the radius.
     """
-    return float(
-        spec.voxel_size[
-            0 if spec.coordinates == "cylindrical" and axis != "z" else "xyz".index(axis)
-        ]
-    )
+    radial = spec.coordinates == "cylindrical" and axis != "z"
+    return float(spec.voxel_size[0 if radial else "xyz".index(axis)])
 
 
 def _family(

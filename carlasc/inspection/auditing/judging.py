@@ -26,10 +26,7 @@ _TRAIL, _TRAIL_VOXELS = 0.1, 30  # of the path of an actor; fact: trail
 _ERASED, _ERASED_VOXELS = 0.2, 40  # of the voxels in which an actor was seen
 _DOUBLED = 0.05  # of the columns with ground; fact: doubled
 # least share of the points of a class under another class, and largest share under its own
-_EXPLAINED, _OWN = (  # fact: explained
-    0.5,
-    0.3,
-)
+_EXPLAINED, _OWN = (0.5, 0.3)  # fact: explained
 # largest share under its own class, for thin markings, which lose their voxels in any case
 _NONE = 0.002
 _SHOWN = 4
@@ -66,62 +63,63 @@ class _Judge:
         check: str,
         state: State | bool,
         text: str,
-        found: Share | None = None,
+        value: Share | float | None = None,
         advice: str = "",
         unit: str = "share",
     ) -> Verdict:
-        """Return a verdict; True is a fault, and False is sound. Only a fault has advice."""
+        """Return a verdict; True is a fault, and False is sound. Only a fault has advice.
+
+        A number without an interval was counted, not sampled.
+        """
         named: State = state if isinstance(state, str) else "fault" if state else "sound"
-        value, low, high = found or (None, None, None)
-        return Verdict(
-            check,
-            named,
-            value,
-            low,
-            high,
-            unit,
-            text,
-            self.one.path,
-            advice if named == "fault" else "",
-        )
+        share = value if isinstance(value, tuple) else (value, value, value)
+        advice = advice if named == "fault" else ""
+        return Verdict(check, named, *share, unit, text, self.one.path, advice)
 
     def voxels(self) -> Iterator[Verdict]:
         """Yield what is wrong in voxels."""
         if self.stretches.stacked("returns") is None:
-            yield self._say(
-                "false free", "undetermined", "the files do not distinguish free from unknown space"
-            )
+            text = "the files do not distinguish free from unknown space"
+            yield self._say("false free", "undetermined", text)
         else:
-            by = (
-                "scans that may have made the grids"
-                if self.window is None
-                else "the frame's own scan"
-            )
-            what, advice = (
-                f"returns of {by} are in voxels called free",
+            which = ("scans that may have made the grids", "the frame's own scan")[
+                self.window is not None
+            ]
+            yield self._by_class(
+                "returns",
+                "false free",
+                f"returns of {which} are in voxels called free",
+                (_FREE, _FREE_OF_CLASS),
+                self.one.scans.metadata.classes,
                 "make these voxels occupied",
             )
-            classes = self.one.scans.metadata.classes
-            yield self._by_class(
-                "returns", "false free", what, (_FREE, _FREE_OF_CLASS), classes, advice
-            )
         if self.window is not None:
-            yield self._held_out()
-        what, advice = "occupied voxels are crossed by rays", "make these voxels free"
+            held_out = self.stretches.share("held out")
+            text = "no frame has a scan just outside of the window, with poses and a mask"
+            if held_out is not None:
+                text = (
+                    f"{_percent(held_out)} of the returns of static objects in scans that took no "
+                    "part in the grids are in free voxels"
+                )
+            state = _is_above(held_out, _FREE)
+            advice = "make these voxels occupied or unknown"
+            yield self._say("false free, held out", state, text, held_out, advice)
         yield self._by_class(
-            "seen voxels", "phantoms", what, (_PHANTOM, _PHANTOM_OF_CLASS), self.one.classes, advice
+            "seen voxels",
+            "phantoms",
+            "occupied voxels are crossed by rays",
+            (_PHANTOM, _PHANTOM_OF_CLASS),
+            self.one.classes,
+            "make these voxels free",
         )
         yield from self._actors()
-        found = self.stretches.share("ground columns")
-        text = "no class of the grids is ground" if found is None else f"{_percent(found)} of the columns with ground have it at two heights"  # fmt: skip
-        state: State | bool = "undetermined" if found is None else found[1] > _DOUBLED
-        yield self._say(
-            "doubled ground",
-            state,
-            text,
-            found,
-            "refine the poses that the grids were made with: they drift in height",
-        )
+        doubled = self.stretches.share("ground columns")
+        text = f"{_percent(doubled)} of the columns with ground have it at two heights"
+        if doubled is None:
+            text = "no class of the grids is ground"
+        advice = "refine the poses that the grids were made with: they drift in height"
+        state = _is_above(doubled, _DOUBLED)
+        yield self._say("doubled ground", state, text, doubled, advice)
         yield from self._labels()
 
     def _by_class(
@@ -137,93 +135,75 @@ class _Judge:
         if counts is None or not counts[..., 0].any():
             return self._say(check, "undetermined", "nothing could be counted")
         total = counts.sum(axis=0)
-        classes = np.flatnonzero(total[..., 0].sum(axis=(1, 2)) >= _LEAST).tolist()
-        of_class = self.stretches.draw(counts[:, classes].sum(axis=(2, 3)))
         drawn = self.stretches.draw(counts.sum(axis=(1, 2, 3)))
-        found = share_of(drawn[:, 1], drawn[:, 0]) or (0.0, 0.0, 0.0)
-        shares = {
-            i: share_of(of_class[:, row, 1], of_class[:, row, 0]) for row, i in enumerate(classes)
-        }
-        worst = sorted(
-            ((share, _name(table, i)) for i, share in shares.items() if share is not None),
-            reverse=True,
-        )
+        whole = share_of(drawn[:, 1], drawn[:, 0]) or (0.0, 0.0, 0.0)
+        worst = []
+        for index in np.flatnonzero(total[..., 0].sum(axis=(1, 2)) >= _LEAST).tolist():
+            of_class = self.stretches.draw(counts[:, index].sum(axis=(1, 2)))
+            if (share := share_of(of_class[:, 1], of_class[:, 0])) is not None:
+                worst.append((share, _name(table, index)))
+        worst.sort(reverse=True)
         wrong = [f"{share[0]:.0%} of {name}" for share, name in worst if share[1] > limits[1]]
-        text = f"{_percent(found)} of the {what}{': ' if wrong else ''}{', '.join(wrong[:_SHOWN])}"
+        text = f"{_percent(whole)} of the {what}{': ' if wrong else ''}{', '.join(wrong[:_SHOWN])}"
         if wrong and check == "false free":
-            advice = "use more scans or sensors: rays that pass beside thin objects outvote their returns"
-        bands = zip(BANDS_M, total.sum(axis=(0, 2)), strict=False)
-        near = [f"from {low:.0f} m {n[1] / n[0]:.1%}" for low, n in bands if n[0]]
-        levels = [
-            f"layer {k + 1} of {HEIGHTS} {n[1] / n[0]:.1%}"
-            for k, n in enumerate(total.sum(axis=(0, 1)))
-            if n[0]
-        ]
+            advice = (
+                "use more scans or sensors: rays that pass beside thin objects outvote their "
+                "returns"
+            )
         named = [
             f"{name} {share[0]:.1%} ({share[1]:.1%} to {share[2]:.1%})" for share, name in worst
         ]
-        said = self._say(check, found[1] > limits[0] or bool(wrong), text, found, advice)
-        return replace(said, details=", ".join([*named, *near, *levels]))
-
-    def _held_out(self) -> Verdict:
-        if (found := self.stretches.share("held out")) is None:
-            text = "no frame has a scan just outside of the window, with poses and a mask"
-            return self._say("false free, held out", "undetermined", text)
-        text = f"{_percent(found)} of the returns of static objects in scans that took no part in the grids are in free voxels"
-        advice = "make these voxels occupied or unknown"
-        return self._say("false free, held out", found[1] > _FREE, text, found, advice)
+        by_distance = zip(BANDS_M, total.sum(axis=(0, 2)), strict=False)
+        near = [f"from {low:.0f} m {n[1] / n[0]:.1%}" for low, n in by_distance if n[0]]
+        by_height = enumerate(total.sum(axis=(0, 1)), 1)
+        levels = [f"layer {k} of {HEIGHTS} {n[1] / n[0]:.1%}" for k, n in by_height if n[0]]
+        verdict = self._say(check, whole[1] > limits[0] or bool(wrong), text, whole, advice)
+        return replace(verdict, details=", ".join([*named, *near, *levels]))
 
     def _actors(self) -> Iterator[Verdict]:
-        volume, names = (
-            float(np.prod(self.one.spec.voxel_size)),
-            {n for p in self.stretches.parts for n in p},
-        )
-        sums = {
-            n.removeprefix("actor "): self.stretches.drawn(n)
-            for n in sorted(names)
-            if n.startswith("actor ")
-        }
-        actors = {name: drawn for name, drawn in sums.items() if drawn is not None}
-        moved = {name: n for name, n in actors.items() if n[0, 0] >= _TRAIL_VOXELS}
-        seen = {name: n for name, n in actors.items() if n[0, 2] >= _ERASED_VOXELS}
-        paths = {name: share_of(n[:, 1], n[:, 0]) for name, n in moved.items()}
-        trails = [
-            (moved[name][0, 1], name, path)
-            for name, path in paths.items()
-            if path and path[1] > _TRAIL
+        names = sorted({name for part in self.stretches.parts for name in part})
+        actors = [
+            (name, drawn)  # voxels of its path, occupied ones, those it is seen in, occupied ones
+            for name in names
+            if name.startswith("actor ") and (drawn := self.stretches.drawn(name)) is not None
         ]
-        listed = [
-            f"actor {name} {_percent(path, 0)}" for _, name, path in sorted(trails, reverse=True)
-        ]
+        moved = [(name, n) for name, n in actors if n[0, 0] >= _TRAIL_VOXELS]
+        paths = [(n[0, 1], name, share_of(n[:, 1], n[:, 0])) for name, n in moved]
+        trails = [row for row in paths if row[2] is not None and row[2][1] > _TRAIL]
+        listed = [f"{name} {_percent(path, 0)}" for _, name, path in sorted(trails, reverse=True)]
+        text, share = "no moving actor was found in the recording", None
+        if moved:
+            total = np.sum([n for _, n in moved], axis=0)
+            share = share_of(total[:, 1], total[:, 0])
+            volume = total[0, 1] * float(np.prod(self.one.spec.voxel_size)) / self._frames[0]
+            text = (
+                f"{share[0] if share else 0:.2%} of the paths of {count(len(moved), 'actor')} are "
+                f"occupied, {volume:.2f} m3 per frame"
+            )
         advice = (
             f"leave out moving actors, or move their points along: {first_names(listed, _SHOWN)}"
         )
-        if moved:
-            total = np.sum(list(moved.values()), axis=0)
-            found, frames = share_of(total[:, 1], total[:, 0]), self._frames[0]
-            text = f"{found[0] if found else 0:.2%} of the paths of {count(len(moved), 'actor')} are occupied, {total[0, 1] * volume / frames:.2f} m3 per frame"
-            yield self._say("ghost trails", bool(trails), text, found, advice)
-        else:
-            text = "no moving actor was found in the recording"
-            yield self._say("ghost trails", "undetermined", text)
-        own = {name: share_of(n[:, 3], n[:, 2]) for name, n in seen.items() if n[0, 4] >= 2}
-        erased = [
-            (seen[name][0, 2], name, share[0])
-            for name, share in own.items()
-            if share and share[2] < _ERASED
+        state: State | bool = bool(trails) if moved else "undetermined"
+        yield self._say("ghost trails", state, text, share, advice)
+        seen = [(name, n) for name, n in actors if n[0, 2] >= _ERASED_VOXELS]
+        own = [
+            (n[0, 2], name, share_of(n[:, 3], n[:, 2]), n[0, 4]) for name, n in seen if n[0, 4] > 1
         ]
-        listed = [f"actor {name} ({share:.0%} of its voxels in {seen[name][0, 4]:.0f} frames)" for _, name, share in sorted(erased, reverse=True)]  # fmt: skip
+        erased = sorted((row for row in own if row[2] and row[2][2] < _ERASED), reverse=True)
+        listed = [
+            f"{name} ({share[0] if share else 0:.0%} of its voxels in {frames:.0f} frames)"
+            for _, name, share, frames in erased
+        ]
         text = f"{len(erased)} of {count(len(seen), 'actor')} have no voxels"
         text += f": {first_names(listed, _SHOWN)}" if erased else ""
-        number = float(len(erased))
-        yield self._say(
-            "erased actors",
-            bool(erased) if seen else "undetermined",
-            text if seen else "no actor was found in the recording",
-            (number, number, number) if seen else None,
-            "keep the voxels of these actors",
-            "actors",
-        )
+        advice = "keep the voxels of these actors"
+        if seen:
+            yield self._say(
+                "erased actors", bool(erased), text, float(len(erased)), advice, "actors"
+            )
+        else:
+            text = "no actor was found in the recording"
+            yield self._say("erased actors", "undetermined", text, unit="actors")
 
     @cached_property
     def _frames(self) -> tuple[int, int]:
@@ -248,7 +228,7 @@ class _Judge:
             return
         used = np.flatnonzero(counts.any(axis=(0, 1)) | counts.any(axis=(0, 2)))
         drawn = self.stretches.draw(counts[:, used][:, :, used])
-        names, ground = [_name(table, int(i)) for i in used], np.isin(used, sorted(self._ground))
+        names, ground = [_name(table, int(i)) for i in used], np.isin(used, self.one.ground)
         rows, right = drawn.sum(axis=2), np.einsum("dkk->dk", drawn)
         kinds = [int(i) for i in np.flatnonzero(rows[0] >= _LEAST)]
         other = {
@@ -256,85 +236,65 @@ class _Judge:
             for i in kinds
             if (j := _explains(drawn, rows, right, i, bool(ground[i]))) is not None
         }
-        found = share_of(right.sum(axis=1), rows.sum(axis=1))
+        right_share = share_of(right.sum(axis=1), rows.sum(axis=1))
         least = sorted(kinds, key=lambda i: right[0, i] / rows[0, i])
         shares = ", ".join(f"{names[i]} {right[0, i] / rows[0, i]:.0%}" for i in least[:_SHOWN])
-        text = f"{_percent(found)} of the points in occupied voxels have the class of their voxel; least: {shares}"
-        yield self._say("labels", bool(other), text, found, "correct the map of classes")
+        text = (
+            f"{_percent(right_share)} of the points in occupied voxels have the class of their "
+            f"voxel; least: {shares}"
+        )
+        yield self._say("labels", bool(other), text, right_share, "correct the map of classes")
         for i, j in other.items():
             if other.get(j) != i:
-                one = share_of(drawn[:, i, j], rows[:, i])
-                text = f"{_percent(one)} of the points of {names[i]} are in voxels of {names[j]}"
-                yield self._say(
-                    "class mapped",
-                    True,
-                    text,
-                    one,
-                    f"map {names[i]} to id {used[i]}, not {used[j]}",
-                )
+                moved = share_of(drawn[:, i, j], rows[:, i])
+                text = f"{_percent(moved)} of the points of {names[i]} are in voxels of {names[j]}"
+                advice = f"map {names[i]} to id {used[i]}, not {used[j]}"
+                yield self._say("class mapped", True, text, moved, advice)
             elif i < j:
-                one = share_of(drawn[:, i, j] + drawn[:, j, i], rows[:, i] + rows[:, j])
-                text = f"{names[i]} and {names[j]} are exchanged: {_percent(one)} of their points are in voxels of the other"
-                yield self._say(
-                    "classes exchanged",
-                    True,
-                    text,
-                    one,
-                    f"exchange the ids {used[i]} and {used[j]}",
+                moved = share_of(drawn[:, i, j] + drawn[:, j, i], rows[:, i] + rows[:, j])
+                text = (
+                    f"{names[i]} and {names[j]} are exchanged: {_percent(moved)} of their points "
+                    "are in voxels of the other"
                 )
-
-    @property
-    def _ground(self) -> set[int]:
-        lookup = self.one.lookup
-        return (
-            set()
-            if lookup is None
-            else {int(lookup[i]) for i in self.one.scans.metadata.classes.ground}
-        )
+                advice = f"exchange the ids {used[i]} and {used[j]}"
+                yield self._say("classes exchanged", True, text, moved, advice)
 
     def gaps(self, wrong: str) -> Iterator[Verdict]:
         """Yield what is missing; classes only if the geometry is not `wrong`."""
         missing, (frames, without) = self.one.absent, self._frames
         made = len(self.one.frames) + len(missing)
-        share = len(missing) / made
-        text = f"{len(missing)} of {made} frames have no grid ({share:.1%})"
+        text = f"{len(missing)} of {made} frames have no grid ({len(missing) / made:.1%})"
         text += f": {first_names(map(str, missing))}" if missing else ""
         advice = "make these frames, or document why they are missing"
-        yield self._say("missing frames", bool(missing), text, (share, share, share), advice)
+        yield self._say("missing frames", bool(missing), text, len(missing) / made, advice)
         if 0 < without < frames:
-            share, text = (
-                without / frames,
-                f"{without} of {frames} frames have no mask of known voxels",
-            )
-            yield self._say(
-                "missing masks", True, text, (share, share, share), "write the masks of all frames"
-            )
-        counts, kinds, table = (
-            self._confusion,
-            self.stretches.stacked("classes of grids"),
-            self.one.classes,
-        )
-        if not wrong and counts is not None and kinds is not None and table is not None:
-            met, made_of = counts.sum(axis=(0, 2)), kinds.sum(axis=0)
+            text = f"{without} of {frames} frames have no mask of known voxels"
+            advice = "write the masks of all frames"
+            yield self._say("missing masks", True, text, without / frames, advice)
+        counts, kinds = self._confusion, self.stretches.stacked("classes of grids")
+        if not wrong and counts is not None and kinds is not None and self.one.classes is not None:
+            met, made_of = counts.sum(axis=(0, 2)) >= _LEAST, kinds.sum(axis=0)
             gone = [
-                _name(table, i) for i in np.flatnonzero(met >= _LEAST).tolist() if not made_of[i]
+                _name(self.one.classes, i) for i in np.flatnonzero(met).tolist() if not made_of[i]
             ]
-            text = f"classes in the scans but not in the grids: {', '.join(gone)}" if gone else "every class of the scans is in the grids"  # fmt: skip
+            text = "every class of the scans is in the grids"
+            if gone:
+                text = f"classes in the scans but not in the grids: {', '.join(gone)}"
+            advice = "label the voxels of these classes"
             number = float(len(gone))
-            yield self._say("missing classes", bool(gone), text, (number, number, number), "label the voxels of these classes", "classes")  # fmt: skip
+            yield self._say("missing classes", bool(gone), text, number, advice, "classes")
         if (unknown := self.stretches.drawn("unknown")) is not None:
             whole = share_of(unknown[:, 1:].sum(axis=1), unknown[:, 0])
             causes = ("hold a return", "are crossed by rays", "are outside the view", "are hidden")
-            parts = [
-                f"{part / unknown[0, 0]:.1%} {cause}"
-                for part, cause in zip(unknown[0, 1:], causes, strict=True)
-            ]
-            yield self._say(
-                "unknown space",
-                False,
-                f"{_percent(whole)} of the voxels are unknown: {', '.join(parts)}",
-                whole,
-            )
+            shares = zip(unknown[0, 1:] / unknown[0, 0], causes, strict=True)
+            parts = ", ".join(f"{share:.1%} {cause}" for share, cause in shares)
+            text = f"{_percent(whole)} of the voxels are unknown: {parts}"
+            yield self._say("unknown space", False, text, whole)
+
+
+def _is_above(share: Share | None, limit: float) -> State | bool:
+    """Return whether a whole interval is above a limit."""
+    return "undetermined" if share is None else share[1] > limit
 
 
 def _explains(

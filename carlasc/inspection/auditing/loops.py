@@ -1,6 +1,4 @@
-"""The compiled loops of the audit: points under many corrections, the voxels of bodies, and the
-rays that cross each voxel.
-"""
+"""The compiled loops of the audit: the voxels of bodies, and the rays that cross each voxel."""
 
 from __future__ import annotations
 
@@ -12,49 +10,8 @@ from carlasc.core.compiling import cached
 from carlasc.core.grids import GridSpec
 
 _SAMPLES = 4  # samples on a ray per edge of the smallest voxel
-_INSIDE = (
-    3  # least samples of a ray in a voxel that it crosses: rays that graze a corner do not count
-)
-
-
-def count_occupied_under(
-    points: NDArray[np.float64],
-    warps: NDArray[np.float64],
-    spec: GridSpec,
-    occupied: NDArray[np.bool_],
-) -> NDArray[np.int64]:
-    """Return (W,) how many points lie in occupied voxels under each correction.
-
-    Args:
-        points: (N, 4) x, y, z in metres in the frame of the grid, and dt in seconds.
-        warps: (W, 3, 5) see `Family`.
-        spec: geometry of the grid.
-        occupied: (X, Y, Z).
-    """
-    counted = np.zeros(len(warps), np.int64)
-    _count(
-        points,
-        np.ascontiguousarray(warps),
-        Cells.of(spec),
-        np.append(occupied.reshape(-1), False),
-        counted,
-    )
-    return counted
-
-
-@cached
-def _count(points, warps, cells, occupied, counted):  # type: ignore[no-untyped-def]
-    for w in range(len(warps)):
-        m = warps[w]
-        for i in range(len(points)):
-            x, y, z, t = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
-            voxel = find_voxel(
-                m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] + m[0, 4] * t,
-                m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] + m[1, 4] * t,
-                m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] + m[2, 4] * t,
-                cells,
-            )
-            counted[w] += occupied[voxel]
+# least samples of a ray in a voxel that it crosses: rays that graze a corner do not count
+_INSIDE = 3
 
 
 def crossings(

@@ -83,17 +83,17 @@ class MatchedGrids:
             FormatError: it is not known.
         """
         if self.grids.spec is None:
-            expected, advice = (
-                "grids of known geometry",
-                "add params.json: docs/format.md#the-record-in-paramsjson",
+            raise FormatError(
+                self.grids.location,
+                expected="grids of known geometry",
+                found="a folder without params.json",
+                advice="add params.json: docs/format.md#the-record-in-paramsjson",
             )
-            found = "a folder without params.json"
-            raise FormatError(self.grids.location, expected=expected, found=found, advice=advice)
         return self.grids.spec
 
     @property
     def axes(self) -> str:
-        """Handedness of the grids: "left" or "right"; formats of other benchmarks are right-handed."""
+        """Handedness of the grids: "left" or "right", as formats of other benchmarks are."""
         return (
             self.grids.sequence.metadata.axes if isinstance(self.grids, SequenceGrid) else "right"
         )
@@ -101,7 +101,8 @@ class MatchedGrids:
     @property
     def frame_name(self) -> str:
         """The frame of the grids in words."""
-        return f"{_FRAMES.get(self.grids.benchmark or '', 'the sensor, x forward')}; {self.axes}-handed"
+        place = _FRAMES.get(self.grids.benchmark or "", "the sensor, x forward")
+        return f"{place}; {self.axes}-handed"
 
     @cached_property
     def grid_T_scan(self) -> Transform:
@@ -144,6 +145,13 @@ class MatchedGrids:
         lookup[0] = -1
         return lookup
 
+    @cached_property
+    def ground(self) -> list[int]:
+        """The classes of the grids that are ground, by the class table of the scans."""
+        if self.lookup is None:
+            return []
+        return sorted({int(self.lookup[i]) for i in self.scans.metadata.classes.ground} - {-1, 0})
+
     def read(
         self, frame: int
     ) -> tuple[NDArray[np.unsignedinteger], NDArray[np.bool_], NDArray[np.bool_] | None]:
@@ -177,7 +185,7 @@ class MatchedGrids:
     def trajectory(
         self,
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
-        """(F,) frames with scans, their seconds, and their (F, 4, 4) poses, None without poses.txt."""
+        """(F,) frames with scans, their seconds, and (F, 4, 4) poses; None without poses.txt."""
         frames, documents = self.scans.frames("points"), self.scans.documents()
         poses = (
             np.stack([self.scans.read_pose(f) for f in frames.tolist()])
@@ -212,18 +220,19 @@ def match_grids(grids: Place, scans: Place, grid: str | None, frames: Frames) ->
     """
     source = as_source(scans)
     recordings = {s.path: s for s in source.sequences().values() if "points" in s.fields()}
-    found = list(open_grids(grids, grid, "truth"))
+    sequences = list(open_grids(grids, grid, "truth"))
     if not recordings:
         advice = "give the recording in the layout, such as `carlasc convert` writes it"
         expected = "sequences with scans (velodyne/)"
         raise MissingDataError(source.location, expected=expected, found="none", advice=advice)
-    pairs = [(one, _recording_of(one, recordings, alone=len(found) == 1)) for one in found]
+    pairs = [(one, _recording_of(one, recordings, alone=len(sequences) == 1)) for one in sequences]
     matched = [
         _match_frames(one, own, FrameRange.of(frames)) for one, own in pairs if own is not None
     ]
     if not matched:
         tried = first_names(
-            [f"{one.path or one.location} with {path}" for one in found for path in recordings], 6
+            [f"{one.path or one.location} with {path}" for one in sequences for path in recordings],
+            6,
         )
         raise MissingDataError(
             str(grids),
@@ -283,8 +292,8 @@ def _match_frames(grids: GridFrames, scans: Sequence, chosen: FrameRange) -> Mat
         )
     if without := sorted(set(numbers) - {number for number, _ in pairs}):
         names = first_names([grids.name_of(number) for number in without], 4)
-        notes.append(f"{len(without)} of {count(len(numbers), 'grid')} left out, without a scan of "
-                     f"the same number or time: {names}")  # fmt: skip
+        left_out = f"{len(without)} of {count(len(numbers), 'grid')} left out"
+        notes.append(f"{left_out}, without a scan of the same number or time: {names}")
     pairs = [pair for pair in pairs if pair[0] in chosen]
     if not pairs:
         where = f"frames {own[0]} to {own[-1]}" if len(own) else "frames with scans"

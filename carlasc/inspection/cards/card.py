@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import os
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from carlasc.errors import (
     DependencyError,
     FormatError,
     MissingDataError,
+    count,
 )
-from carlasc.inspection.cards.croissant import WRITER, croissant
+from carlasc.inspection.cards.croissant import croissant, vocabulary
 from carlasc.inspection.cards.facts import CardDetails, Facts, gather
 from carlasc.inspection.cards.licenses import license_given
 from carlasc.inspection.cards.places import place_of, tables_of
@@ -55,15 +56,7 @@ class CardResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
-        return {
-            "folder": str(self.folder),
-            "files": [str(path) for path in self.files],
-            "frames": self.frames,
-            "sequences": self.sequences,
-            "licenses": list(self.licenses),
-            "notes": list(self.notes),
-            "failures": [list(failure) for failure in self.failures],
-        }
+        return asdict(self) | {"folder": str(self.folder), "files": list(map(str, self.files))}
 
 
 def card(
@@ -80,7 +73,7 @@ def card(
     croissant.json, and pictures.
 
     Counts, classes, splits, sensors, licences, sources, settings and limits are read from the data.
-    All other details are given in `about`.
+    All other details are given in `about`, and what neither says is named as not stated.
 
     Args:
         source: a path or URL that `carlasc.open` knows, or a Source at such a place.
@@ -111,21 +104,29 @@ def card(
     overwrite = _check_free(folder, overwrite, pictures)
     facts = gather(opened, stated, every, run)
     tables = tables_of(opened) if isinstance(opened, ParquetSource) else []
+    made = say("simulated") if facts.simulated else ""
+    made += say("converted", sources=", ".join(facts.citations)) if facts.citations else ""
+    sequences = count(len(facts.sequences), "sequence")
+    summary = say(
+        "summary", frames=count(facts.frames, "LiDAR frame"), sequences=sequences, made=made
+    )
     details = replace(
         about,
         name=about.name or place.title,
-        description=about.description or _describe(facts),
+        description=about.description or summary,
         published=about.published or datetime.datetime.now(datetime.UTC).date().isoformat(),
     )
     write_output(folder / CROISSANT, croissant(facts, details, place, tables))
     drawn, notes = _draw(facts, folder, overwrite) if pictures else ([], [])
+    if details.not_stated:
+        notes.append(say("not_stated", names=", ".join(details.not_stated)))
     shown = [(path.relative_to(folder).as_posix(), text) for path, text in drawn]
     write_output(folder / README, readme(facts, details, place, tables, shown))
     return CardResult(
         folder,
         (folder / README, folder / CROISSANT, *(path for path, _ in drawn)),
         facts.frames,
-        len(facts.overview.sequences),
+        len(facts.sequences),
         tuple(one.name for one in facts.licenses),
         tuple(notes),
         tuple(facts.failures),
@@ -159,26 +160,7 @@ def _is_ours(path: Path) -> bool:
         writer = parse_json(path.read_bytes(), str(path)).get("sdPublisher")
     except (OSError, FormatError):
         return False
-    return isinstance(writer, dict) and writer.get("name") == WRITER
-
-
-def _describe(facts: Facts) -> str:
-    """Return a description of the data set, in two sentences."""
-    grids = ", ".join(
-        f"{grid.name} ({' x '.join(map(str, grid.size))})" for grid, _, _ in facts.grids[:3]
-    )
-    what = (
-        f"with voxel grids of complete semantic scenes: {grids}" if grids else "without voxel grids"
-    )
-    made = ["recorded in a simulator"] if facts.simulated else []
-    made += [f"converted from {', '.join(facts.sources)}"] if facts.sources else []
-    return say(
-        "summary",
-        frames=f"{facts.frames:,}",
-        sequences=facts.sequences_told,
-        grids=what,
-        made=" and ".join(made),
-    )
+    return bool(writer == vocabulary()["dataset"]["sdPublisher"])
 
 
 def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path, str]], list[str]]:
@@ -188,32 +170,20 @@ def _draw(facts: Facts, folder: Path, overwrite: bool) -> tuple[list[tuple[Path,
     from carlasc.viewing import Scene, StyleOptions, render
 
     drawn, notes = [], []
-    with_content = {
-        "grid": [path for path, one in facts.sequences.items() if one.grids],
-        "scan": [path for path, one in facts.sequences.items() if "points" in one.fields()],
-    }
-    for what, paths in with_content.items():
-        if not paths:
-            continue
-        path = paths[0]
-        sequence = facts.sequences[path]
-        target = folder / PICTURES / f"{what}.png"
-        try:
-            field = (
-                "points" if what == "scan" else next(f"{grid}/labels" for grid in sequence.grids)
-            )
+    for what in ("grid", "scan"):
+        for path, sequence in facts.sequences.items():
+            grid = next(iter(sequence.grids), None) if what == "grid" else None
+            field = "points" if what == "scan" else f"{grid}/labels"
+            if field not in sequence.fields():
+                continue
             frames = sequence.frames(field)
             frame = int(frames[len(frames) // 2])
-            scene = Scene(
-                sequence,
-                frames=(frame, frame + 1),
-                grid=None if what == "scan" else next(iter(sequence.grids)),
-            )
-            result = render(
-                scene, target, what=what, style=StyleOptions(size=_SIZE), overwrite=overwrite
-            )
-        except (DependencyError, MissingDataError) as error:
-            notes.append(f"no picture of a {what}: {error}")
-            continue
-        drawn.append((result.out, f"Frame {frame} of {path or sequence.name}: {what}"))
+            target, style = folder / PICTURES / f"{what}.png", StyleOptions(size=_SIZE)
+            try:
+                scene = Scene(sequence, frames=(frame, frame + 1), grid=grid)
+                result = render(scene, target, what=what, style=style, overwrite=overwrite)
+                drawn.append((result.out, f"Frame {frame} of {path or sequence.name}: {what}"))
+            except (DependencyError, MissingDataError) as error:
+                notes.append(f"no picture of a {what}: {error}")
+            break
     return drawn, notes

@@ -5,21 +5,27 @@ from __future__ import annotations
 import datetime
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.groundtruth.reporting.report import Report
 from carlasc.inspection.cards.licenses import License, LicensedPart, licensed_parts
 from carlasc.inspection.overview import GridOverview, Overview, info
-from carlasc.inspection.statistics import Histogram, Statistics, stats
+from carlasc.inspection.reports import report_beside
+from carlasc.inspection.statistics import Statistics, stats
+from carlasc.inspection.texts import read_table, say
 from carlasc.running.spreading import Run
-from carlasc.storage import layout
+from carlasc.storage.metadata import Metadata
 from carlasc.storage.packed.stores import PackedSource
 from carlasc.storage.protocol import Sequence as StoredSequence
 from carlasc.storage.protocol import Source
 from carlasc.storage.views import ChosenSequences
+
+STATEMENTS: dict[str, str] = read_table("card.toml")["statements"]
+"""What only the author can state: names of fields in croissant.json, and headings in README.md."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +38,16 @@ class CardDetails:
         authors: people or groups that publish it.
         license: licence of the sequences whose carlasc.json names none: a name such as cc-by-4.0,
             or the URL of its text. Converted sequences keep the licence of their source.
-        citation: how to cite the data (BibTeX); the paper that introduced CarlaSC is always named,
-            too.
+        citation: how to cite the data (BibTeX).
+        statements: what only the author knows, such as personalSensitiveInformation: texts by the
+            names of Croissant's RAI fields, of which `STATEMENTS` is the list.
         url: URL where the data are published, such as https://huggingface.co/datasets/ORG/NAME.
         contact: contact for questions, such as an e-mail address.
         version: version of the data.
         published: date of the publication, YYYY-MM-DD. None: today.
 
     Raises:
-        ArgumentError: a version, a date or an address is not valid.
+        ArgumentError: a version, a date, an address or the name of a statement is not valid.
     """
 
     name: str | None = None
@@ -48,6 +55,7 @@ class CardDetails:
     authors: Sequence[str] = ()
     license: str | None = None
     citation: str | None = None
+    statements: Mapping[str, str] = field(default_factory=dict)
     url: str | None = None
     contact: str | None = None
     version: str = "1.0.0"
@@ -68,6 +76,18 @@ class CardDetails:
             raise ArgumentError(
                 "url", expected="an address that begins with https://", found=repr(self.url)
             )
+        for name, text in self.statements.items():
+            if name not in STATEMENTS or not isinstance(text, str):
+                raise ArgumentError(
+                    "statements",
+                    expected=f"a text for some of {', '.join(STATEMENTS)}",
+                    found=f"{name} = {text!r}",
+                )
+
+    @property
+    def not_stated(self) -> list[str]:
+        """The headings of the statements that are missing."""
+        return [text.lower() for name, text in STATEMENTS.items() if name not in self.statements]
 
 
 @dataclass(frozen=True)
@@ -98,33 +118,13 @@ class Facts:
         """Number of frames of all sequences."""
         return sum(sequence.frames for sequence in self.overview.sequences)
 
-    @property
-    def sequences_told(self) -> str:
-        """The number of sequences, in words."""
-        count = len(self.overview.sequences)
-        return "1 sequence" if count == 1 else f"{count} sequences"
-
-    @cached_property
-    def splits(self) -> dict[str, tuple[int, int]]:
-        """Number of sequences and of frames of each split, in the order of the layout; "none" for
-        sequences without a split.
-        """
-        order = {name: place for place, name in enumerate((*layout.SPLITS, "none"))}
-        found: dict[str, tuple[int, int]] = {}
-        for sequence in sorted(
-            self.overview.sequences, key=lambda one: order.get(one.split or "none", 9)
-        ):
-            count, frames = found.get(sequence.split or "none", (0, 0))
-            found[sequence.split or "none"] = (count + 1, frames + sequence.frames)
-        return found
-
     @cached_property
     def fields(self) -> dict[str, int]:
         """Number of frames of each field, without the fields of grids."""
-        found: Counter[str] = Counter()
+        counts: Counter[str] = Counter()
         for sequence in self.overview.sequences:
-            found.update(sequence.fields)
-        return dict(sorted(found.items()))
+            counts.update(sequence.fields)
+        return dict(sorted(counts.items()))
 
     @cached_property
     def grids(self) -> list[tuple[GridOverview, int, int]]:
@@ -132,19 +132,10 @@ class Facts:
 
         Grids of one kind differ only in their sequence.
         """
-        kinds: dict[tuple[object, ...], list[GridOverview]] = {}
+        kinds: dict[str, list[GridOverview]] = {}
         for sequence in self.overview.sequences:
             for grid in sequence.grids:
-                key = (
-                    grid.name,
-                    grid.coordinates,
-                    grid.size,
-                    grid.lower,
-                    grid.upper,
-                    grid.parts,
-                    str(grid.made),
-                )
-                kinds.setdefault(key, []).append(grid)
+                kinds.setdefault(repr(replace(grid, frames=0)), []).append(grid)
         return [
             (grids[0], len(grids), sum(grid.frames for grid in grids)) for grids in kinds.values()
         ]
@@ -155,62 +146,56 @@ class Facts:
         return list(dict.fromkeys(part.license for part in self.parts))
 
     @cached_property
-    def sources(self) -> list[str]:
-        """What sequences were converted from."""
-        return sorted({part.source for part in self.parts if part.source is not None})
+    def citations(self) -> dict[str, str]:
+        """What to cite for each source of converted sequences; "" if carlasc.json does not say."""
+        return {
+            about.source: str(about.extra.get("citation") or "")
+            for about in self.metadata
+            if about.source is not None
+        }
+
+    @property
+    def metadata(self) -> list[Metadata]:
+        """The carlasc.json of each sequence."""
+        return [sequence.metadata for sequence in self.sequences.values()]
 
     @property
     def simulated(self) -> bool:
-        """Whether some sequences were not converted: they were recorded in a simulator."""
-        return any(part.source is None for part in self.parts)
-
-    @property
-    def synthetic(self) -> bool:
-        """Whether some sequences were recorded in a simulator, by us or by others."""
-        return self.simulated or any(
-            one.metadata.extra.get("simulated") is True for one in self.sequences.values()
-        )
-
-    @cached_property
-    def citations(self) -> dict[str, str]:
-        """What to cite for each source; "" if carlasc.json does not name it."""
-        said = {
-            one.metadata.source: one.metadata.extra.get("citation")
-            for one in self.sequences.values()
-        }
-        return {
-            source: text if isinstance(text := said.get(source), str) else ""
-            for source in self.sources
-        }
-
-    @cached_property
-    def sensors(self) -> list[str]:
-        """The sensors, as carlasc.json names them."""
-        return sorted({sequence.sensor for sequence in self.overview.sequences if sequence.sensor})
-
-    @cached_property
-    def versions(self) -> list[str]:
-        """The versions of carlasc that made the grids, as their reports say."""
-        return sorted(
-            {str(report.versions.get("carlasc", "?")) for report in self.reports.values()}
-        )
-
-    @cached_property
-    def gaps(self) -> int:
-        """Number of places where frame numbers are missing."""
-        return sum(sequence.gaps for sequence in self.overview.sequences)
+        """Whether the carlasc.json of a sequence says that it was recorded in a simulator."""
+        return bool(self.said("simulated"))
 
     @property
     def failures(self) -> list[tuple[str, str]]:
         """(file, message) of each file that could not be read."""
         return [failure for one in self.statistics for failure in one.failures]
 
-    def known_share(self) -> float | None:
-        """Share of the voxels that are known; None without grids."""
-        total = sum(one.total.unknown + int(one.total.voxels.sum()) for one in self.statistics)
-        return (
-            sum(int(one.total.voxels.sum()) for one in self.statistics) / total if total else None
+    def said(self, key: str) -> str:
+        """Return the values of a key of carlasc.json, without false ones; "" if none has it."""
+        return ", ".join(
+            sorted({str(one.extra[key]) for one in self.metadata if one.extra.get(key)})
         )
+
+    def limits(self) -> Iterator[str]:
+        """Yield the limits that the data themselves show, one sentence each."""
+        known = sum(int(one.total.voxels.sum()) for one in self.statistics)
+        if unknown := sum(one.total.unknown for one in self.statistics):
+            yield say("unknown", share=f"{unknown / (known + unknown):.1%}")
+        if gaps := sum(sequence.gaps for sequence in self.overview.sequences):
+            yield say("gaps", places=gaps)
+        if self.failures:
+            yield say("unreadable", files=len(self.failures))
+        for name, report in self.reports.items():
+            if report.inferred_share:
+                yield say("inferred", share=f"{report.inferred_share:.1%}", grid=name)
+        for near, far in sorted({(m.min_range_m, m.max_range_m) for m in self.metadata}, key=str):
+            limits = [f"nearer than {near:g} m"] if near else []
+            limits += [f"farther than {far:g} m"] if far else []
+            if limits:
+                yield say("ranges", limits=" or ".join(limits))
+        if self.lossy_mm:
+            yield say("rounded", step=f"{self.lossy_mm:g}")
+        if self.every > 1:
+            yield say("counted", every=self.every)
 
 
 def gather(source: Source, license_: License | None, every: int, run: Run) -> Facts:
@@ -221,6 +206,8 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
         FormatError: a sequence cannot be described.
         ArgumentError, FormatError, CarlascError: see `licensed_parts` and `stats`.
     """
+    if every < 1:
+        raise ArgumentError("every", expected="1 or more", found=str(every))
     sequences = {path: one for path, one in source.sequences().items() if one.fields()}
     if not sequences:
         raise MissingDataError(
@@ -230,64 +217,23 @@ def gather(source: Source, license_: License | None, every: int, run: Run) -> Fa
             advice="make them with `carlasc regrid`",
         )
     parts = licensed_parts(sequences.values(), license_, source.location)
-    reports = {}
-    for path, sequence in sequences.items():
-        for grid in sequence.grids:
-            name = layout.report_file(grid)
-            if name in sequence.documents():
-                where = f"{sequence.location}/{name}"
-                reports[f"{path}/{grid}" if path else grid] = Report.from_json(
-                    sequence.read_document(name), where
-                )
     overview = info(source)
+    tables: dict[str, dict[str, StoredSequence]] = {}
+    reports = {}
     for one in overview.sequences:
-        # otherwise, a grid that cannot be described would be missing from the card without a
-        # message
+        # A grid that cannot be described would be missing from the card without a message.
         if one.problem:
             raise FormatError(one.path or source.location, problem=one.problem)
-    return Facts(
-        overview,
-        sequences,
-        parts,
-        _count(source.location, sequences, every, run),
-        every,
-        reports,
-        source.lossy_mm if isinstance(source, PackedSource) else None,
-    )
-
-
-def _count(
-    location: str, sequences: Mapping[str, StoredSequence], every: int, run: Run
-) -> tuple[Statistics, ...]:
-    """Count the classes, separately for each class table; sequences without labels are left out."""
-    if every < 1:
-        raise ArgumentError("every", expected="1 or more", found=str(every))
-    tables: dict[str, dict[str, StoredSequence]] = {}
     for path, sequence in sequences.items():
-        if "labels" in sequence.fields() or any(
-            name.endswith("/labels") for name in sequence.fields()
-        ):
+        for grid in sequence.grids:
+            if (report := report_beside(sequence, grid)) is not None:
+                reports[f"{path}/{grid}".lstrip("/")] = report
+        if any(name.rpartition("/")[2] == "labels" for name in sequence.fields()):
             tables.setdefault(sequence.metadata.classes.name, {})[path] = sequence
     counted = []
     for chosen in tables.values():
-        try:
-            counted.append(
-                stats(ChosenSequences(location, chosen), remap=None, every=every, run=run)
-            )
-        except MissingDataError:  # several grids without the published one
-            continue
-    return tuple(counted)
-
-
-def shares(
-    statistics: Statistics, histogram: Histogram
-) -> list[tuple[int, str, float | None, float | None]]:
-    """Return id, name, share of the points and share of the known voxels of each class that occurs."""
-    points, voxels = int(histogram.points.sum()), int(histogram.voxels.sum())
-    rows = []
-    for index, name in statistics.classes.names.items():
-        if statistics.total.points[index] or statistics.total.voxels[index]:
-            of_points = float(histogram.points[index]) / points if points else None
-            of_voxels = float(histogram.voxels[index]) / voxels if voxels else None
-            rows.append((index, name, of_points, of_voxels))
-    return rows
+        with suppress(MissingDataError):  # several grids without the published one
+            one_table = ChosenSequences(source.location, chosen)
+            counted.append(stats(one_table, remap=None, every=every, run=run))
+    lossy_mm = source.lossy_mm if isinstance(source, PackedSource) else None
+    return Facts(overview, sequences, parts, tuple(counted), every, reports, lossy_mm)

@@ -1,4 +1,4 @@
-"""Licences of data: their names, what they permit, and the licences of the sequences of a data set."""
+"""Licences of data: their names, what they permit, and those of the sequences of a data set."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ class License:
 def _licenses() -> dict[str, License]:
     """Return the licences by name, with all versions of those of Creative Commons."""
     table = read_table("licenses.toml")
-    found = [License(**entry) for entry in table["license"]]
+    licenses = [License(**entry) for entry in table["license"]]
     for kind, on_hub in table["creative_commons"].items():
         for version in ("1.0", "2.0", "2.5", "3.0", "4.0"):
             url = f"https://creativecommons.org/licenses/{kind}/{version}/"
             hub = f"cc-{kind}-{version}" if version in on_hub else _OTHER
             permits = ("nd" not in kind, "nc" not in kind, "sa" in kind)
-            found.append(License(f"CC {kind.upper()} {version}", url, hub, *permits))
-    return {re.sub(r"[^a-z0-9.]+", "-", one.name.lower()): one for one in found}
+            licenses.append(License(f"CC {kind.upper()} {version}", url, hub, *permits))
+    return {re.sub(r"[^a-z0-9.]+", "-", one.name.lower()): one for one in licenses}
 
 
 def find_license(text: str) -> License | None:
@@ -108,8 +108,8 @@ def license_given(text: str) -> License:
     Raises:
         ArgumentError: no licence has this name.
     """
-    found = find_license(text)
-    if found is None:
+    license_ = find_license(text)
+    if license_ is None:
         near = difflib.get_close_matches(
             text.lower(), [one.hub for one in _licenses().values()], 3, 0.5
         )
@@ -120,7 +120,7 @@ def license_given(text: str) -> License:
             found=repr(text),
             advice="for another licence, give the address of its text (https://...)",
         )
-    return found
+    return license_
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def licensed_parts(
             sequences have a licence.
         CarlascError: a licence forbids publishing derived data.
     """
-    found: dict[tuple[str | None, License | None], list[str]] = {}
+    paths_of: dict[tuple[str | None, License | None], list[str]] = {}
     for sequence in sequences:
         license_, source = _license_of(sequence), sequence.metadata.source
         if license_ is not None and license_.derivatives is False:
@@ -171,9 +171,9 @@ def licensed_parts(
                 advice="publish instead how you made the data, so that others can convert their "
                 "own copies",
             )
-        found.setdefault((source, license_), []).append(sequence.path)
-    known = {license_ for _, license_ in found if license_ is not None}
-    without = sorted({source or "" for source, license_ in found if license_ is None})
+        paths_of.setdefault((source, license_), []).append(sequence.path)
+    known = {license_ for _, license_ in paths_of if license_ is not None}
+    without = sorted({source or "" for source, license_ in paths_of if license_ is None})
     if without and given is None:
         of = " and ".join(source for source in without if source)
         raise ArgumentError(
@@ -190,7 +190,7 @@ def licensed_parts(
             found=given.name,
         )
     parts = []
-    for (source, license_), paths in found.items():
+    for (source, license_), paths in paths_of.items():
         holds = given if license_ is None else license_
         assert holds is not None  # checked above
         parts.append(LicensedPart(source, holds, license_ is None, tuple(paths)))
@@ -203,12 +203,12 @@ def _license_of(sequence: Sequence) -> License | None:
     text = sequence.metadata.extra.get("license")
     if text is None:
         return None
-    found = find_license(text) if isinstance(text, str) else None
-    if found is None:
+    license_ = find_license(text) if isinstance(text, str) else None
+    if license_ is None:
         raise FormatError(
             f"{sequence.location}/{layout.METADATA}",
             expected="the name of a licence, or the address of its text, in license",
             found=repr(text),
             advice="look it up, and write its name (CC BY-NC-SA 4.0) or its address (https://...)",
         )
-    return found
+    return license_

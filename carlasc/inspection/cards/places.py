@@ -7,7 +7,6 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -44,6 +43,10 @@ class PublishedTable:
         """All files."""
         return [path for paths in self.files.values() for path in paths]
 
+    def in_order(self) -> list[tuple[str, list[str]]]:
+        """Return each split with its files, in the order of the layout."""
+        return [(name, self.files[name]) for name in HUB_SPLITS.values() if name in self.files]
+
 
 def split_of(sequence: Sequence) -> str:
     """Return the split of a sequence by its name at the Hub."""
@@ -59,20 +62,20 @@ def tables_of(source: ParquetSource) -> list[PublishedTable]:
     Raises:
         FormatError: a table is damaged.
     """
-    found: dict[tuple[str, tuple[tuple[str, str], ...]], PublishedTable] = {}
+    tables: dict[tuple[str, str], PublishedTable] = {}
     for path, sequence in source.sequences().items():
         names = {"frames": FRAMES} | {name: f"{name}.parquet" for name in sorted(sequence.fields())}
         for name, file in names.items():
             place = str(PurePosixPath(source.nodes[path]) / file)
             with opened(source.tree, place) as opening:
                 columns = {column.name: str(column.type) for column in opening.schema_arrow}
-            key = (name, tuple(columns.items()))
-            if key not in found:
-                others = sum(other == name for other, _ in found)
+            key = (name, str(columns))
+            if key not in tables:
+                others = sum(other == name for other, _ in tables)
                 suffix = f"_{others + 1}" if others else ""
-                found[key] = PublishedTable(name.replace("/", "_") + suffix, _title(name), columns)
-            found[key].files.setdefault(split_of(sequence), []).append(place)
-    return sorted(found.values(), key=lambda table: (table.name != "frames", table.name))
+                tables[key] = PublishedTable(name.replace("/", "_") + suffix, _title(name), columns)
+            tables[key].files.setdefault(split_of(sequence), []).append(place)
+    return sorted(tables.values(), key=lambda table: (table.name != "frames", table.name))
 
 
 def _title(name: str) -> str:
@@ -83,7 +86,6 @@ def _title(name: str) -> str:
     return f"one row per {rows}: {entry.meaning}"
 
 
-_BLOCK = 1 << 22  # bytes that are read at a time for a checksum
 _HUB = "https://huggingface.co/datasets/"
 
 
@@ -109,11 +111,7 @@ class Place:
     @property
     def title(self) -> str:
         """A name for the data set: that of its file or folder, without the ending of a store."""
-        name = (
-            PurePosixPath(self.location.partition("://")[2]).name
-            if self.local is None
-            else self.local.name
-        )
+        name = PurePosixPath(self.local or self.location.partition("://")[2]).name
         return re.sub(r"\.(parquet|zarr|h5|hdf5|zip)$", "", name) or "data"
 
     def published(self, path: str) -> str:
@@ -127,27 +125,14 @@ class Place:
         published = self.published(path)
         return f"{self.repository}/resolve/main/{published}" if self.repository else published
 
-    def measure(self, path: str) -> tuple[int, str]:
-        """Return the bytes of a file and its SHA-256, 64 hexadecimal digits.
-
-        The file is read once.
-        """
-        digest, size = hashlib.sha256(), 0
-        for block in self._blocks(path):
-            digest.update(block)
-            size += len(block)
-        return size, digest.hexdigest()
-
-    def _blocks(self, path: str) -> Iterator[bytes]:
+    def measure(self, path: str) -> tuple[str, int]:
+        """Return the SHA-256 of a file, 64 hexadecimal digits, and its bytes."""
         if self.local is None:
-            tree = RemoteTree(self.location)
-            size = tree.size(path) or 0
-            for start in range(0, size, _BLOCK):
-                yield tree.read_range(path, start, min(start + _BLOCK, size))
-            return
-        with (self.local / path if path else self.local).open("rb") as file:
-            while block := file.read(_BLOCK):
-                yield block
+            opened = RemoteTree(self.location).open(path)
+        else:
+            opened = (self.local / path).open("rb")
+        with opened as file:
+            return hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
 
 
 def place_of(
