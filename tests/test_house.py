@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "carlasc"
 FILES = sorted([*PACKAGE.rglob("*.py"), *(ROOT / "converters").rglob("*.py")])
-MOST_LINES, MOST_PARAMETERS, MOST_FIELDS, MOST_ENTRIES = 400, 12, 12, 15
+MOST_LINES, MOST_PARAMETERS, MOST_FIELDS, MOST_ENTRIES = 400, 12, 12, 16
 # names of classes that hold options
 OPTIONS = re.compile(r"\w*(Options|Settings|Scoring|Details|Address)|From\w+|Voting|Run|Lidar")
 

@@ -244,12 +244,12 @@ class SequenceInput(ABC):
         """Return the number of points of a scan; 0 if the sequence has no scans."""
 
     def prepare(  # noqa: B027 (most sequences need nothing)
-        self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]
+        self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]
     ) -> None:
         """Do the work that comes once per sequence, before its frames are made.
 
         Args:
-            writer: writes the sequence, and the results that are kept beside the grids.
+            writer: keeps the results beside the grids; None: they are not kept.
             run: how the work is spread.
             steps: called with the number of steps since the last call, `steps_before` in all.
         """

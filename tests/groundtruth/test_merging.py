@@ -392,11 +392,11 @@ class TestFeed:
 
     def test_ground_is_found_only_where_labels_do_not_name_it(self, tmp_path):
         folder = FolderSink(tmp_path).sequence("Val/Street/cartesian")
-        assert self.feed(tmp_path, frames=range(6)).finds_ground
+        assert self.feed(tmp_path, frames=range(6)).must_find_ground
         for frame, labels in ((3, [1, 1]), (4, [ROAD, 1])):
             folder.write("labels", frame, np.array(labels, np.uint32))
             (sequence,) = FolderSource(tmp_path).sequences().values()
-            assert ScanFeed(sequence, FromScans()).finds_ground == (ROAD not in labels)
+            assert ScanFeed(sequence, FromScans()).must_find_ground == (ROAD not in labels)
 
 
 def test_all_points_of_an_actor_vote_for_its_class():

@@ -118,6 +118,7 @@ class ScanFeed:
         classes: class table of the labels.
         min_range_m: nearer points are left out, in metres.
         max_range_m: farther points are left out, in metres.
+        key: the same for all copies of a feed.
     """
 
     def __init__(self, sequence: Sequence, options: FromScans) -> None:
@@ -135,10 +136,10 @@ class ScanFeed:
         self._scans: OrderedDict[int, PreparedScan] = OrderedDict()
         self._merger: Merger | None = None
         self._lock = threading.RLock()  # an executor may be of threads
-        self._key = uuid4().hex
+        self.key = uuid4().hex
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
-        return _restore, (self._key, without_caches(self.sequence), self.options)
+        return _restore, (self.key, without_caches(self.sequence), self.options)
 
     def without(self, hidden: Collection[int]) -> ScanFeed:
         """Return a feed without the scans of some frames: they neither vote nor show motion.
@@ -147,7 +148,7 @@ class ScanFeed:
         """
         return ScanFeed(WithoutScans(self.sequence, hidden), replace(self.options, own_path=False))
 
-    def under(self, sequence: Sequence) -> ScanFeed:
+    def with_poses_of(self, sequence: Sequence) -> ScanFeed:
         """Return a feed of the same scans under the poses of `sequence`."""
         other = ScanFeed(sequence, self.options)
         if "digest" in vars(self):
@@ -175,7 +176,7 @@ class ScanFeed:
         return "labels" in self.sequence.fields()
 
     @cached_property
-    def finds_ground(self) -> bool:
+    def must_find_ground(self) -> bool:
         """Whether ground points have to be found: in some scans, no label is of a ground class."""
         if not self.classes.ground:
             return False
@@ -185,7 +186,7 @@ class ScanFeed:
         )
 
     @cached_property
-    def names_ground(self) -> bool:
+    def trusts_ground_labels(self) -> bool:
         """Whether labels name the ground: in some scans, few points on the ground have other
         classes.
         """
@@ -250,7 +251,7 @@ class ScanFeed:
         return self.options.dynamic == "align" if self.motion == ("flow",) else bool(self.motion)
 
     @property
-    def reads(self) -> int:
+    def reads_for_actors(self) -> int:
         """Number of scans that are read to find the actors; fields and evidence of motion take a
         pass each.
         """
@@ -379,7 +380,7 @@ class ScanFeed:
             explained[segment.members] = True
         ground = (
             np.isin(_labels(scan), sorted(self.classes.ground))
-            if self.names_ground or self.finds_ground
+            if self.trusts_ground_labels or self.must_find_ground
             else None
         )
         labels = _labels(scan) if self.has_labels else None
@@ -429,7 +430,7 @@ class ScanFeed:
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
             scan = replace(scan, labels=np.full(len(scan), self.classes.geometry_id, np.uint32))
-        if self.finds_ground:
+        if self.must_find_ground:
             scan = replace(scan, labels=self._with_ground(scan.points, _labels(scan)))
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
@@ -470,7 +471,7 @@ def _restore(key: str, sequence: Sequence, options: FromScans) -> ScanFeed:
     feed = _FEEDS.get(key)
     if feed is None:
         feed = ScanFeed(sequence, options)
-        feed._key = key
+        feed.key = key
         _FEEDS.clear()  # a run processes its sequences one after the other
         _FEEDS[key] = feed
     return feed

@@ -124,7 +124,7 @@ def merge_frame(
     if consensus is not None:
         steps.keep_returns(made, votes, consensus)
     who = steps.actors(made.labels)
-    if feed.finds_ground:  # ground that was found had a class for the votes only
+    if feed.must_find_ground:  # ground that was found had a class for the votes only
         made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
     size = plan.spec.size
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))

@@ -85,7 +85,7 @@ class _FindEvidence:
         chosen = set(block)
         # labels that are often wrong must not split actors
         found = find_evidence(
-            scans, movable=self.feed.classes.movable if self.feed.names_ground else ()
+            scans, movable=self.feed.classes.movable if self.feed.trusts_ground_labels else ()
         )
         return [evidence.thinned() for evidence in found if evidence.frame in chosen]
 
@@ -303,19 +303,21 @@ def _box_tracks(feed: ScanFeed) -> list[Track]:
 
 
 def read_or_find_actors(
-    feed: ScanFeed, writer: SequenceWriter, run: Run, steps: Callable[[int], None]
+    feed: ScanFeed, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]
 ) -> MovingActors:
     """Return the actors that an earlier run kept for the same scans and options; without any, find
-    and keep them.
+    and keep them. Without a writer, nothing is kept.
     """
+    if writer is None:
+        return find_actors(feed, run, steps)
     about = {"motion": feed.motion, "min_speed_m_s": feed.options.motion.min_speed_m_s}
     key = _key_of(TRACKS, feed, **about)
     actors = read_derived(writer, TRACKS, key, MovingActors.from_bytes)
-    if actors is not None:
-        steps(feed.reads)
-        return actors
-    actors = find_actors(feed, run, steps)
-    writer.write_document(layout.derived(TRACKS, key), actors.to_bytes(key))
+    if actors is None:
+        actors = find_actors(feed, run, steps)
+        writer.write_document(layout.derived(TRACKS, key), actors.to_bytes(key))
+    else:
+        steps(feed.reads_for_actors)
     return actors
 
 

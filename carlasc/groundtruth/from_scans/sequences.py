@@ -192,11 +192,13 @@ class ScanSequence(StoredSequence):
         """Number of scans that the passes before the grids read: to refine poses, and to find
         actors.
         """
-        return self.feed.reads + (len(self.feed.frames) if self.refines else 0)
+        return self.feed.reads_for_actors + (len(self.feed.frames) if self.refines else 0)
 
-    def prepare(self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> None:
+    def prepare(
+        self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]
+    ) -> None:
         """Refine the poses of the sequence, and find its actors, or read the results of an earlier
-        run.
+        run with `writer`.
         """
         self.refine(writer, run, steps)
         if self.feed.needs_actors:
@@ -218,7 +220,7 @@ class ScanSequence(StoredSequence):
             return
         self.refined = refine_sequence(self.feed, writer, run, steps)
         if self.refined.refined.any():
-            self.feed = self.feed.under(
+            self.feed = self.feed.with_poses_of(
                 with_refined_poses(self.posed, self.feed.frames, self.refined)
             )
 
@@ -331,7 +333,7 @@ class ScanSequence(StoredSequence):
         heights = [np.empty(0, np.float32)]
         for frame in chosen.tolist():
             try:
-                scan = feed.sequence.scan(frame, () if feed.finds_ground else ("labels",))
+                scan = feed.sequence.scan(frame, () if feed.must_find_ground else ("labels",))
             except CarlascError:
                 continue
             points, labels, classes = scan.points, scan.labels, sorted(feed.classes.ground)

@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, ConflictError, import_extra
-from carlasc.storage.cloud_files import POINT_ENDINGS, PointPieces, write_octomap, write_points
+from carlasc.groundtruth.maps.cloud_files import (
+    POINT_ENDINGS,
+    PointPieces,
+    write_octomap,
+    write_points,
+)
 from carlasc.storage.files import write_output, writing
 
 OCTOMAP = ".bt"

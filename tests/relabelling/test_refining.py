@@ -18,9 +18,9 @@ from carlasc import GridSpec, Run
 from carlasc.captures import Lidar, SimulatedCapture
 from carlasc.core.geometry import invert, multiply, slerp, translation
 from carlasc.errors import ArgumentError, ConflictError, FormatError, MissingDataError
-from carlasc.groundtruth import refining
 from carlasc.inspection import validate
 from carlasc.motion import PoseOptions
+from carlasc.relabelling import refining
 from carlasc.storage import FolderSink, Metadata, layout
 from carlasc.storage import open as open_store
 from carlasc.testing import wrong_poses

@@ -13,9 +13,9 @@ from carlasc.core import ClassTable
 from carlasc.core.frames import FrameRange
 from carlasc.core.tables import CARLA, CARLASC11, SEMANTICKITTI, SEMANTICKITTI19, to_table
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
+from carlasc.relabelling.predictions import PredictionReader, find_predictions, read_table
 from carlasc.storage import open as open_store
 from carlasc.storage.layout import CERTAIN
-from carlasc.storage.predictions import PredictionReader, find_predictions, read_table
 from carlasc.testing import write_dataset
 from carlasc.testing.data import SCANS, WHOLE
 

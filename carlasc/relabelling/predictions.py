@@ -9,14 +9,14 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.frames import FrameRange
-from carlasc.core.tables import TABLES, table_from_json, to_table
+from carlasc.core.tables import TABLES, remaps_between, table_from_json, to_table
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
 from carlasc.storage import layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
@@ -77,15 +77,13 @@ def find_predictions(
                 by_folder[parts] = PredictedFiles(Path(folder), suffix, tuple(numbers))
     result, lacking = {}, []
     for path, sequence in sequences.items():
+        # names of splits and coordinates that do not belong to the sequence
+        others = {*layout.SPLITS, *layout.COORDINATES} - {sequence.split, sequence.coordinates}
         matching = [
-            parts
-            for parts in by_folder
-            if sequence.name in parts and not _others(sequence) & set(parts)
+            parts for parts in by_folder if sequence.name in parts and not others & set(parts)
         ]
         if not matching and len(sequences) == 1:
-            matching = [
-                parts for parts in by_folder if parts in ((), *((leaf,) for leaf in _LEAVES))
-            ]
+            matching = [parts for parts in by_folder if "/".join(parts) in ("", *_LEAVES)]
         matching = [parts for parts in matching if parts and parts[-1] in _LEAVES] or matching
         if len(matching) != 1:
             folders = (
@@ -94,7 +92,8 @@ def find_predictions(
                 )
                 or "none"
             )
-            expected = f"one folder of files such as {sequence.name}/000000{SUFFIXES[0]} ({', '.join(SUFFIXES[1:])})"
+            expected = f"one folder of files such as {sequence.name}/000000{SUFFIXES[0]} "
+            expected += f"({', '.join(SUFFIXES[1:])})"
             raise (FormatError if matching else MissingDataError)(
                 root, expected=expected, found=folders
             )
@@ -117,11 +116,6 @@ def find_predictions(
     return result
 
 
-def _others(sequence: Sequence) -> set[str]:
-    """Return the names of splits and coordinates that do not belong to the sequence."""
-    return {*layout.SPLITS, *layout.COORDINATES} - {sequence.split or "", sequence.coordinates}
-
-
 def read_table(classes: str | os.PathLike[str] | ClassTable) -> ClassTable:
     """Return a class table, given as a table, its name, or a JSON file: a class table in the form
     of carlasc.json, or a carlasc.json.
@@ -130,8 +124,10 @@ def read_table(classes: str | os.PathLike[str] | ClassTable) -> ClassTable:
         ArgumentError: `classes` is neither a known name nor a file.
         FormatError: the file holds no class table.
     """
-    if isinstance(classes, ClassTable) or str(classes) in TABLES:
-        return classes if isinstance(classes, ClassTable) else TABLES[str(classes)]
+    if isinstance(classes, ClassTable):
+        return classes
+    if str(classes) in TABLES:
+        return TABLES[str(classes)]
     if not (path := Path(classes)).is_file():
         raise ArgumentError(
             "classes",
@@ -156,6 +152,20 @@ class PredictionReader:
     target: ClassTable
     logits: bool = False
 
+    @classmethod
+    def of(cls, given: ClassTable | None, sequence: Sequence, logits: bool) -> Self:
+        """Return a reader of predictions for a sequence.
+
+        It converts labels to the table of the sequence, if a remap from the given table exists.
+        """
+        own = sequence.metadata.classes
+        classes = given or own
+        try:
+            remaps_between(classes, own)
+        except ArgumentError:
+            return cls(classes, classes, logits)
+        return cls(classes, own, logits)
+
     def read(self, path: Path, count: int) -> tuple[NDArray[np.uint32], NDArray[np.uint16] | None]:
         """Return the (N,) labels of the `count` points of a scan, and the (N, 6) field
         `probabilities`, or None if the file has none.
@@ -177,10 +187,9 @@ class PredictionReader:
         if labels is None:
             raise FormatError(path, expected="labels or probabilities", found="neither")
         self.check(np.unique(labels), str(path))
-        converted = to_table(labels.astype(np.uint32), self.classes, self.target, str(path)).astype(
-            np.uint32
-        )
-        return converted, None if scores is None else self.pairs(scores, str(path))
+        converted = to_table(labels.astype(np.uint32), self.classes, self.target, str(path))
+        pairs = None if scores is None else self.pairs(scores, str(path))
+        return converted.astype(np.uint32), pairs
 
     def check(self, ids: NDArray[np.integer], where: str) -> None:
         """Check that the class table of the files contains the ids.
@@ -210,7 +219,8 @@ class PredictionReader:
         if wrong.any():
             row = int(wrong.argmax())
             found = f"a sum of {sums[row]:g} and a minimum of {shares[row].min():g} at point {row}"
-            expected = f"class probabilities that are at least 0 and sum to 1 within {_TOLERANCE} per point"
+            expected = "class probabilities that are at least 0 and sum to 1 within "
+            expected += f"{_TOLERANCE} per point"
             advice = (
                 "" if self.logits else "give `logits=True` if these are scores before the softmax"
             )
@@ -244,14 +254,13 @@ def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
     """Return the labels, (N,) integers, and the scores, (N, C) floats, of a file; None for what it
     does not contain.
     """
-    labels: NDArray[Any] | None = None
-    scores: NDArray[Any] | None = None
     if path.suffix == ".npz":
+        forms = ArrayFormat(WHOLE_NUMBERS, (None,)), ArrayFormat(_FLOATS, (None, None))
         with open_npz(path) as archive:
-            if "labels" in archive.names:
-                labels = archive.read("labels", ArrayFormat(WHOLE_NUMBERS, (None,)))
-            if "probabilities" in archive.names:
-                scores = archive.read("probabilities", ArrayFormat(_FLOATS, (None, None)))
+            labels, scores = (
+                archive.read(name, form) if name in archive.names else None
+                for name, form in zip(("labels", "probabilities"), forms, strict=True)
+            )
         return labels, scores
     if path.suffix == ".npy":
         array = read_npy(path, ArrayFormat(NUMBERS, None))

@@ -54,79 +54,64 @@ class PixelClasses:
             raise MissingDataError(
                 sequence.location, expected=f"cameras in {layout.CAMERAS}", found="none"
             )
-        if root is None:
-            found = cls(sequence, None)
-            known = set(image_fields(sequence, _LAYOUT))
-        else:
-            found = cls(sequence, _files(sequence, root))
-            known = set(found.files or ())
-        if lost := sorted(known - set(cameras)):
-            expected = f"cameras of {layout.CAMERAS}: {', '.join(cameras)}"
+        files = None if root is None else _files(sequence, root)
+        known = image_fields(sequence, _LAYOUT).keys() if files is None else files.keys()
+        if lost := sorted(known - cameras.keys()):
             raise FormatError(
                 root or sequence.location,
-                expected=expected,
+                expected=f"cameras of {layout.CAMERAS}: {', '.join(cameras)}",
                 found=f"{lost[0]}, which has no calibration",
             )
         if not known:
-            expected = (
-                f"classes of pixels, such as {sequence.name}/{next(iter(cameras))}/000000.png"
-            )
-            advice = (
-                "give the folder of a network's predictions as `pixels`" if root is None else ""
-            )
+            example = f"{sequence.name}/{next(iter(cameras))}/000000.png"
+            advice = "give the folder of a network's predictions as `pixels`"
             raise MissingDataError(
                 root or f"{sequence.location}/{_LAYOUT}",
-                expected=expected,
+                expected=f"classes of pixels, such as {example}",
                 found="none",
-                advice=advice,
+                advice=advice if root is None else "",
             )
-        return found
+        return cls(sequence, files)
 
-    def has(self, camera: str, frame: int) -> bool:
-        """Whether the classes of pixels exist for a camera and a frame."""
-        if self.files is not None:
-            return frame in self.files.get(camera, {})
-        field = image_fields(self.sequence, _LAYOUT).get(camera)
-        return field is not None and frame in self.sequence.frames(field)
-
-    def read(self, camera: CameraModel, frame: int) -> NDArray[Any]:
-        """Return (H, W) integers, class ids, or (H, W, C) floats, the probability of each id.
+    def read(self, camera: CameraModel, frame: int) -> NDArray[Any] | None:
+        """Return (H, W) integers, class ids, or (H, W, C) floats, the probability of each id; None
+        without classes of the image.
 
         Raises:
             FormatError: the file is damaged, or has another size than the camera's images.
         """
         if self.files is None:
+            field = image_fields(self.sequence, _LAYOUT).get(camera.name)
+            if field is None or frame not in self.sequence.frames(field):
+                return None
             return read_image(self.sequence, camera, frame, _LAYOUT)
-        path = self.files[camera.name][frame]
+        path = self.files.get(camera.name, {}).get(frame)
+        if path is None:
+            return None
         if path.suffix == ".png":
             return decode_image(path.read_bytes(), str(path), camera, color=False)
         array = read_npy(path, ArrayFormat(NUMBERS, None))
         size, is_float = (camera.height, camera.width), array.dtype.kind == "f"
         if array.ndim != 2 + is_float or array.shape[:2] != size:
-            expected = f"{size} integers, or {size} floats per class, as camera {camera.name} is calibrated"
             raise FormatError(
-                path, expected=expected, found=f"{array.dtype.name} of shape {array.shape}"
+                path,
+                expected=f"{size} integers, or {size} floats per class, as camera {camera.name} is "
+                f"calibrated",
+                found=f"{array.dtype.name} of shape {array.shape}",
             )
         return array
 
-    def stamps(self) -> list[tuple[str, int, int]]:
-        """Return names, sizes and modification times of the files; empty for files of the layout,
-        which belong to the source.
-        """
-        paths = [path for files in (self.files or {}).values() for path in files.values()]
-        return [
-            (str(path), found.st_size, found.st_mtime_ns)
-            for path in sorted(paths)
-            for found in (path.stat(),)
-        ]
+    def paths(self) -> list[Path]:
+        """Return the files; none for those of the layout, which belong to the source."""
+        return sorted(path for files in (self.files or {}).values() for path in files.values())
 
 
 def _files(sequence: Sequence, root: Path) -> dict[str, dict[int, Path]]:
-    # key: whether the path contains the name of the sequence
-    named: dict[bool, dict[str, dict[int, Path]]] = {
-        True: {},
-        False: {},
-    }
+    """Return the files by camera and frame: those below a folder with the name of the sequence; if
+    there are none, those in folders of cameras in the root.
+    """
+    named: dict[str, dict[int, Path]] = {}
+    unnamed: dict[str, dict[int, Path]] = {}
     for folder, _, names in os.walk(root):
         paths = {
             frame: Path(folder, name)
@@ -135,11 +120,10 @@ def _files(sequence: Sequence, root: Path) -> dict[str, dict[int, Path]]:
             if (frame := layout.frame_of(name, suffix)) is not None
         }
         parts = Path(folder).relative_to(root).parts
-        if not paths or not parts:
-            continue
-        mine = named[sequence.name in parts[:-1]]
-        if parts[-1] in mine and (sequence.name in parts[:-1] or len(parts) == 1):
-            raise FormatError(folder, expected=f"one folder of camera {parts[-1]}", found="two")
-        if sequence.name in parts[:-1] or len(parts) == 1:
+        is_named = sequence.name in parts[:-1]
+        if paths and (is_named or len(parts) == 1):
+            mine = named if is_named else unnamed
+            if parts[-1] in mine:
+                raise FormatError(folder, expected=f"one folder of camera {parts[-1]}", found="two")
             mine[parts[-1]] = paths
-    return named[True] or named[False]
+    return named or unnamed

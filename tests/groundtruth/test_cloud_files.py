@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from carlasc.errors import ArgumentError
-from carlasc.storage.cloud_files import write_octomap
+from carlasc.groundtruth.maps.cloud_files import write_octomap
 
 RES = 0.25
 
