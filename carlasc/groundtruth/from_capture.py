@@ -159,7 +159,10 @@ class CaptureSequence(SequenceInput):
         try:
             world_T_first = self.capture.read_pose(0, first)
         except (FormatError, MissingDataError) as error:
-            error.advice = "the first frame's pose is the origin of poses.txt: fix it, or start with a later frame"
+            error.advice = (
+                "the first frame's pose is the origin of poses.txt: fix it, or start with a later "
+                "frame"
+            )
             raise
         # NaN where a pose cannot be read: reading that frame raises the same error, and that one is
         # reported
@@ -167,7 +170,7 @@ class CaptureSequence(SequenceInput):
         return relative_to(world_T_first, poses)
 
     def times(self) -> NDArray[np.float64]:
-        """Return (f - first) * 0.1 for each frame f: see the format page, `docs/format.md#votes`."""
+        """Return (f - first) * 0.1 for each frame f: see `docs/format.md#votes`."""
         numbers = np.array([frame.source_frame for frame in self.frames])
         return (numbers - numbers[0]) * layout.FRAME_PERIOD_S
 

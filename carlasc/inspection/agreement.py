@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from carlasc.core.cells import Triple
 from carlasc.core.compiling import cached
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.groundtruth.reporting.facts import ActorTrack
+from carlasc.groundtruth.reporting import ActorTrack
 from carlasc.inspection.findings import Finding, Severity
 from carlasc.motion.tracks import is_doubtful
 from carlasc.storage.protocol import Sequence

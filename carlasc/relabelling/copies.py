@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.errors import ArgumentError
-from carlasc.groundtruth.reporting.facts import digest_of_bytes
+from carlasc.groundtruth.reporting import digest_of_bytes
 from carlasc.running.processes import one_pool
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import layout

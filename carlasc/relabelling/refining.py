@@ -25,7 +25,7 @@ from carlasc.groundtruth.from_scans.sequences import (
     with_estimated_poses,
 )
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting.facts import digest_of_bytes
+from carlasc.groundtruth.reporting import digest_of_bytes
 from carlasc.motion.mounting import Mounting, find_mounting
 from carlasc.motion.options import PoseOptions
 from carlasc.motion.refinement import RefinedPoses

@@ -193,11 +193,12 @@ class ScanFeed:
         scans = (
             [self._voting_points(frame) for frame in self._sampled] if self.classes.ground else []
         )
-        found = [_labels(scan)[ground_points(scan.points)] for scan in scans]
+        on_ground = [_labels(scan)[ground_points(scan.points)] for scan in scans]
         others = sum(
-            int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground)))) for labels in found
+            int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground))))
+            for labels in on_ground
         )
-        return self.has_labels and others <= _OTHERWISE * sum(map(len, found))
+        return self.has_labels and others <= _OTHERWISE * sum(map(len, on_ground))
 
     @property
     def _sampled(self) -> list[int]:
@@ -263,6 +264,8 @@ class ScanFeed:
 
     def window_of(self, frame: int) -> list[int]:
         """Return the frames whose scans are merged into a frame, including the frame itself."""
+        # Scans are counted from the frame, not from the first one of the sequence: each frame uses
+        # its own scan.
         first, last = self.options.window
         near = self.frames[(self.frames >= frame + first) & (self.frames <= frame + last)]
         near = near[(near - frame) % self.options.stride == 0]
@@ -275,6 +278,8 @@ class ScanFeed:
 
     def reaching(self, frame: int, spec: GridSpec) -> list[int]:
         """Return the frames of the window whose scans may have points in the frame's grid."""
+        # The farthest corner of the grid and the farthest point of the scan, both as spheres: a
+        # scan that cannot reach the grid costs as much as one that does.
         here = self.pose(frame)
         corners = np.array(np.meshgrid(*zip(spec.lower, spec.upper, strict=True))).reshape(3, -1).T
         across = (
@@ -293,6 +298,7 @@ class ScanFeed:
         """Yield the frames of `others` within `window_m` that are not too close to each other, in
         order of distance from `frame`.
         """
+        # The distance is that along the path. A vehicle that waits gives one scan.
         limit = self.options.window_m or np.inf
         driven, last_taken, previous = 0.0, 0.0, self.pose(frame)[:3, 3]
         for other in others:
@@ -349,6 +355,8 @@ class ScanFeed:
                     origins=scan.others.get("origins"),
                     probabilities=scan.others.get("probabilities"),
                 )
+                # A window of scans and one more: frames are made in order, and the next one needs
+                # all of them but the first.
                 first, last = self.options.window
                 while len(self._scans) > last - first + 2:
                     self._scans.popitem(last=False)
@@ -405,9 +413,9 @@ class ScanFeed:
             static = static_actor_points(
                 frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed
             )
-        found = self._segments(frame, scan, boxes)
+        segments = self._segments(frame, scan, boxes)
         return ScanMotion(
-            frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in found), static
+            frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in segments), static
         )
 
     def _segments(self, frame: int, scan: Scan, boxes: Sequence_[Track]) -> list[Segment]:
@@ -432,6 +440,7 @@ class ScanFeed:
             scan = replace(scan, labels=np.full(len(scan), self.classes.geometry_id, np.uint32))
         if self.must_find_ground:
             scan = replace(scan, labels=self._with_ground(scan.points, _labels(scan)))
+        # Checked before points are left out: a wrong id is an error wherever it is.
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
         origins = scan.others.get("origins")
@@ -457,11 +466,11 @@ class ScanFeed:
         """Return labels in which points without a class on the ground have a ground class, so that
         they vote as ground.
         """
-        found = np.asarray(labels, np.uint32).copy()
-        found[ground_points(points) & (labels == self.classes.geometry_id)] = min(
+        voting = np.asarray(labels, np.uint32).copy()
+        voting[ground_points(points) & (labels == self.classes.geometry_id)] = min(
             self.classes.ground
         )
-        return found
+        return voting
 
 
 _FEEDS: dict[str, ScanFeed] = {}  # the feed of this process, by the key of its copies: see ScanFeed

@@ -309,8 +309,8 @@ class _AddScans:
     ) -> list[tuple[Part, NDArray[Any]]]:
         frames, actors = block
         merger = Merger(self.feed.read, actors, self.feed.classes, "align")
-        found = [rows for frame in frames for rows in self._rows(merger, frame)]
-        parts, rows = zip(*found, strict=True)
+        of_scans = [rows for frame in frames for rows in self._rows(merger, frame)]
+        parts, rows = zip(*of_scans, strict=True)
         return split(np.concatenate(parts), np.concatenate(rows))
 
     def _rows(self, merger: Merger, frame: int) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
