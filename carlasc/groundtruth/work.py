@@ -72,6 +72,17 @@ class FrameTask(ABC):
     def run(self) -> FrameResult:
         """Do the work, in a worker."""
 
+    def facts_of(self, arrays: Outputs, grid: Grid, thinned: Grid | None) -> FrameFacts:
+        """Return the facts of the frame from its arrays, its grid, and the grid without a tenth of
+        the scans, if it was made.
+        """
+        plan, frame = self.plan, self.frame
+        changes = None if thinned is None else Changes.between(grid, thinned)
+        residuals = None if frame is None else frame.residuals()
+        return FrameFacts.of(
+            self.number, arrays, plan.grid, plan.spec, self.classes, changes, residuals
+        )
+
 
 @dataclass(frozen=True)
 class MakeFrame(FrameTask):
@@ -91,10 +102,7 @@ class MakeFrame(FrameTask):
                 outputs[f"{plan.grid}/seen"] = see_voxels(
                     grid.labels > 0, plan.spec, self.frame.views(), data.boxes
                 )
-            changes = None if thinned is None else Changes.between(grid, thinned)
-            facts = FrameFacts.of(
-                number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals()
-            )
+            facts = self.facts_of(outputs, grid, thinned)
         except MemoryError as error:
             raise CarlascError(
                 str(plan.spec),
@@ -121,12 +129,12 @@ class MeasureFrame(FrameTask):
         plan = self.plan
         names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
         try:
-            stored = {
-                name: self.writer.read(name, self.number)
+            arrays = {
+                name: array
                 for name in names
                 if self.writer.has(name, self.number)
+                and (array := self.writer.read(name, self.number)) is not None
             }
-            arrays = {name: array for name, array in stored.items() if array is not None}
             if not {f"{plan.grid}/labels", f"{plan.grid}/counts"} <= arrays.keys():
                 return FrameResult(self)
             labels, counts = (
@@ -134,15 +142,7 @@ class MeasureFrame(FrameTask):
                 for part in ("labels", "counts")
             )
             thinned = self.frame.thinned(plan) if self.sampled and self.frame is not None else None
-            changes = (
-                None
-                if thinned is None
-                else Changes.between(Grid(plan.spec, labels, counts), thinned)
-            )
-            residuals = None if self.frame is None else self.frame.residuals()
-            facts = FrameFacts.of(
-                self.number, arrays, plan.grid, plan.spec, self.classes, changes, residuals
-            )
+            facts = self.facts_of(arrays, Grid(plan.spec, labels, counts), thinned)
         except (CarlascError, OSError, ValueError):
             return FrameResult(self)
         return FrameResult(self, facts=facts)
@@ -345,8 +345,9 @@ class SequenceJob:
         facts = [done.facts for done in results if done.facts is not None]
         grid, writer = self.plan.grid, self.writer
         names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(grid))
-        stored = {name: writer.read_document(name) for name in names}
-        documents = {name: data for name, data in stored.items() if data is not None}
+        documents = {
+            name: data for name in names if (data := writer.read_document(name)) is not None
+        }
         if facts:
             inputs = self.inputs
             classes, actors, poses = (

@@ -201,10 +201,12 @@ def points_of_actors(
         boxed = (row >= 0) & (numbers == 0) & ~ground
         numbers[boxed] = static.tracks[row[boxed]]
     # Merging leaves out some points and sorts the others. Points are found again by their
-    # coordinates: equal points have the same place in the list of all.
-    merged = feed.read(frame).points
-    both = np.concatenate([scan.points, merged])
-    place = np.unique(both, axis=0, return_inverse=True)[1].reshape(-1)
+    # coordinates: equal points have the same place among all points in order.
+    both = np.concatenate([scan.points, feed.read(frame).points])
+    order, is_new = np.lexsort(both.T), np.ones(len(both), np.bool_)
+    is_new[1:] = (both[order[1:]] != both[order[:-1]]).any(axis=1)
+    place = np.empty(len(both), np.int64)
+    place[order] = np.cumsum(is_new)
     of_scan, of_merged = np.split(place, [len(scan)])
     tracks = [(n, t) for n, t in actors.tracks.items() if t.pose(frame) is not None]
     for number, track in sorted(tracks, key=lambda item: -float(np.prod(item[1].size))):

@@ -122,6 +122,7 @@ class ScanFrame(FrameInput):
         ones, by number of the actor.
         """
         feed, frame, by_actor = self.inputs.feed, self.number, {}
+        # Later scans in the window only: a worker has no others of a track.
         last = frame + feed.options.window[1]
         for number, track in self.inputs.actors.tracks.items():
             later = min((other for other in track.members if frame < other <= last), default=None)
@@ -437,6 +438,7 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
 
 def _check_speed(sequence: Sequence, frames: NDArray[np.int64], where: str) -> None:
     poses = np.stack([sequence.read_pose(int(frame)) for frame in frames])
+    # Speeds, not distances: frames may be missing, and then the distance is longer.
     elapsed_s = np.diff(sequence.times_of(frames))
     speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / elapsed_s
     # The trace of R1' R0 is 1 + 2 cos(angle) of the rotation between them.

@@ -192,6 +192,7 @@ class Ballot:
         count_views: bool = False,
         keep_boxes: bool = False,
     ) -> None:
+        # Numba is loaded here, not with the module: options of commands import names of rules only.
         from carlasc.core.cells import Cells
         from carlasc.groundtruth.voting import filled, kernel
 
@@ -276,6 +277,7 @@ class Ballot:
         )
         if self._boxes is not None:
             filled.widen_boxes(cast, self._cells, hit_region, self._tally.regions, self._boxes)
+        # Each origin of rays is a voter, with a number of its own: `once` compares these numbers.
         self.num_observations += len(ends)
 
     def _apart(self, region: int) -> NDArray[np.int64]:
