@@ -7,6 +7,7 @@ from . import groundtruth as groundtruth
 from . import inspection as inspection
 from . import metrics as metrics
 from . import motion as motion
+from . import relabelling as relabelling
 from . import running as running
 from . import storage as storage
 from . import testing as testing
@@ -31,10 +32,7 @@ from .groundtruth import FromCapture as FromCapture
 from .groundtruth import FromGrid as FromGrid
 from .groundtruth import FromScans as FromScans
 from .groundtruth import Voting as Voting
-from .groundtruth import label_images as label_images
-from .groundtruth import label_motion as label_motion
 from .groundtruth import map as map
-from .groundtruth import refine as refine
 from .groundtruth import regrid as regrid
 from .inspection import CardDetails as CardDetails
 from .inspection import audit as audit
@@ -47,13 +45,16 @@ from .inspection import validate as validate
 from .metrics import Scoring as Scoring
 from .metrics import evaluate as evaluate
 from .metrics import scores as scores
+from .relabelling import label as label
+from .relabelling import label_images as label_images
+from .relabelling import label_motion as label_motion
+from .relabelling import refine as refine
 from .running import Run as Run
 from .storage import Cache as Cache
 from .storage import Sink as Sink
 from .storage import Source as Source
 from .storage import download as download
 from .storage import finish as finish
-from .storage import label as label
 from .storage import open as open
 from .storage import pack as pack
 from .storage import unpack as unpack

@@ -21,7 +21,7 @@ from carlasc.cli.flags import WorkFlags
 from carlasc.cli.library import Given, Library
 
 if TYPE_CHECKING:
-    from carlasc.groundtruth.reporting.facts import ActorTrack
+    from carlasc.groundtruth.reporting import ActorTrack
     from carlasc.inspection.reports import ReportResult
 
 _SHOWN = 12

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.grids import GridSpec
 from carlasc.dataset.stacking import stack_scans
-from carlasc.groundtruth.voting import Observation, count_votes
+from carlasc.groundtruth.voting.ballot import Observation, count_votes
 
 UNSEEN, PASSED, HIT = 0, 1, 2
 """The values of the field `visibility`."""

@@ -1,7 +1,4 @@
 from .from_grid import resample as resample
-from .labelling_images import label_images as label_images
-from .labelling_motion import MotionResult as MotionResult
-from .labelling_motion import label_motion as label_motion
 from .maps.mapping import MapResult as MapResult
 from .maps.mapping import map as map
 from .options import Complete as Complete
@@ -12,8 +9,6 @@ from .options import FromScans as FromScans
 from .options import GridOptions as GridOptions
 from .options import Observe as Observe
 from .options import Voting as Voting
-from .refining import RefineResult as RefineResult
-from .refining import refine as refine
 from .run import RegridResult as RegridResult
 from .run import regrid as regrid
 from .voting.ballot import Ballot as Ballot

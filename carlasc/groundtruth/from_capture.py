@@ -43,13 +43,10 @@ class CaptureFrame(FrameInput):
 
     def fields(self) -> tuple[str, ...]:
         """Return points, labels, flow and instances, and the pictures that the frame has."""
-        always = ("points", "labels", "flow", "instances")
-        bev = ("bev",) if self.capture.has_bev(self.source_frame) else ()
-        return (
-            *always,
-            *bev,
-            *(self.capture.image_fields(self.source_frame) if self.capture.cameras else ()),
-        )
+        capture, frame = self.capture, self.source_frame
+        bev = ("bev",) if capture.has_bev(frame) else ()
+        images = capture.image_fields(frame) if capture.cameras else ()
+        return ("points", "labels", "flow", "instances", *bev, *images)
 
     def views(self) -> Views:
         """Return the cameras of the capture: their images are taken at the instant of the frame."""
@@ -159,7 +156,10 @@ class CaptureSequence(SequenceInput):
         try:
             world_T_first = self.capture.read_pose(0, first)
         except (FormatError, MissingDataError) as error:
-            error.advice = "the first frame's pose is the origin of poses.txt: fix it, or start with a later frame"
+            error.advice = (
+                "the first frame's pose is the origin of poses.txt: fix it, or start with a later "
+                "frame"
+            )
             raise
         # NaN where a pose cannot be read: reading that frame raises the same error, and that one is
         # reported
@@ -167,7 +167,7 @@ class CaptureSequence(SequenceInput):
         return relative_to(world_T_first, poses)
 
     def times(self) -> NDArray[np.float64]:
-        """Return (f - first) * 0.1 for each frame f: see the format page, `docs/format.md#votes`."""
+        """Return (f - first) * 0.1 for each frame f: see `docs/format.md#votes`."""
         numbers = np.array([frame.source_frame for frame in self.frames])
         return (numbers - numbers[0]) * layout.FRAME_PERIOD_S
 
@@ -181,18 +181,12 @@ class CaptureSequence(SequenceInput):
         An open end of the range stays open, so that a later run continues after the capture has
         grown.
         """
-        asked, first, last = (
-            self.plan.frames,
-            self.frames[0].source_frame,
-            self.frames[-1].source_frame,
-        )
-        frames = (
-            f"{first}:"
-            if asked.stop is None
-            else f"{first}:{last + 1}"
-            if asked.only is None
-            else str(asked)
-        )
+        asked, first = self.plan.frames, self.frames[0].source_frame
+        frames = str(asked)
+        if asked.stop is None:
+            frames = f"{first}:"
+        elif asked.only is None:
+            frames = f"{first}:{self.frames[-1].source_frame + 1}"
         return {"observe": "capture", "frames": frames, "sensors": len(self.capture.sensors)}
 
 

@@ -170,7 +170,7 @@ def resampled_sequences(
         raise ArgumentError(
             "keep", expected="False for resampled grids, which have no votes", found="True"
         )
-    found: list[SequenceInput] = []
+    sequences: list[SequenceInput] = []
     for sequence in as_source(source).sequences().values():
         grids = {
             name: spec
@@ -180,8 +180,8 @@ def resampled_sequences(
         if grids:
             finest = min(grids, key=lambda name: math.prod(grids[name].voxel_size.tolist()))
             check_coarser(grids[finest], plan.spec)
-            found.append(ResampledSequence(sequence, finest, plan))
-    if not found:
+            sequences.append(ResampledSequence(sequence, finest, plan))
+    if not sequences:
         wanted = f"the grid {observe.name}" if observe.name else f"a {plan.spec.coordinates} grid"
         raise MissingDataError(
             source,
@@ -189,4 +189,4 @@ def resampled_sequences(
             found="none",
             advice="make one from scans or a capture first",
         )
-    return found
+    return sequences

@@ -43,10 +43,10 @@ def ground_of(
         labels: (N,) class ids, or None.
         ground: ids of the ground classes; without any, heights decide.
     """
-    found = (
+    on_ground = (
         ground_points(points) if labels is None or not ground else np.isin(labels, sorted(ground))
     )
-    return points[found]
+    return points[on_ground]
 
 
 def find_ground(scans: Iterable[NDArray[np.float32]], reach_m: float = _REACH_M) -> Ground | None:

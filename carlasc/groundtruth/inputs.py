@@ -22,7 +22,7 @@ from carlasc.core.frames import FrameRange
 from carlasc.core.grids import Grid, GridSpec
 from carlasc.errors import ArgumentError, CarlascError, MissingDataError
 from carlasc.groundtruth.options import FromGrid, FromScans, Observe, Voting
-from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
+from carlasc.groundtruth.reporting import PoseFacts, Residual
 from carlasc.groundtruth.voting.ballot import VoteRule, Votes
 from carlasc.groundtruth.voting.certainty import VoxelCertainty
 from carlasc.groundtruth.voxel_actors import VoxelActors
@@ -69,7 +69,8 @@ class GridPlan:
             kind = type(self.observe).__name__.removeprefix("From").lower()
             raise ArgumentError(
                 name,
-                expected='grids from scans with the rule "ray", which say how certain each voxel is',
+                expected='grids from scans with the rule "ray", which say how certain each voxel '
+                "is",
                 found=f"observe={kind}, rule={self.rule}",
                 advice=f"make the grid from scans, or leave out `{name}`",
             )
@@ -231,25 +232,25 @@ class SequenceInput(ABC):
             frames[len(frames) // 2].source_frame,
             frames[-1].source_frame,
         }
-        found = []
+        counts = []
         for frame in sorted(chosen):
             try:
-                found.append(self._count_points(frame))
+                counts.append(self._count_points(frame))
             except CarlascError:
                 continue  # making the frame raises the same error, and that one is reported
-        return max(found, default=None)
+        return max(counts, default=None)
 
     @abstractmethod
     def _count_points(self, source_frame: int) -> int:
         """Return the number of points of a scan; 0 if the sequence has no scans."""
 
     def prepare(  # noqa: B027 (most sequences need nothing)
-        self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]
+        self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]
     ) -> None:
         """Do the work that comes once per sequence, before its frames are made.
 
         Args:
-            writer: writes the sequence, and the results that are kept beside the grids.
+            writer: keeps the results beside the grids; None: they are not kept.
             run: how the work is spread.
             steps: called with the number of steps since the last call, `steps_before` in all.
         """
@@ -266,7 +267,7 @@ class SequenceInput(ABC):
         return next((frame for frame in self.frames if frame.number == number), None)
 
     def summaries(self) -> Series[Mapping[str, Any]] | None:
-        """Return the facts of each actor from `prepare`, by number; None if actors are not tracked."""
+        """Return the facts of each actor, by number; None if actors are not tracked."""
         return None
 
     def pose_facts(self) -> PoseFacts | None:
@@ -340,7 +341,7 @@ def stored_views(sequence: Sequence, frame: int) -> Views:
 
 
 def parent_path(sequence: Sequence) -> str:
-    """Return the path of the folder above `<coordinates>`, where a run writes the sequence again."""
+    """Return the path above `<coordinates>`, where a run writes the sequence again."""
     head, _, last = sequence.path.rpartition("/")
     return head if last == sequence.coordinates else sequence.path
 

@@ -159,9 +159,9 @@ def _sum(rows: NDArray[np.void]) -> NDArray[np.void]:
         [rows["voxel"].astype(np.int64), rows["label"].astype(np.int64) << 32 | rows["actor"]]
     )
     first = np.flatnonzero((np.diff(keys, axis=1, prepend=-1) != 0).any(axis=0))
-    found = rows[first]
-    found["points"] = np.add.reduceat(rows["points"], first) if len(first) else 0
-    return found
+    sums = rows[first]
+    sums["points"] = np.add.reduceat(rows["points"], first) if len(first) else 0
+    return sums
 
 
 _FEWEST_COMMON = 3  # least number of frames in which two compared tracks have poses
@@ -202,21 +202,21 @@ def number_actors(tracks: Mapping[int, Track], highest: int = 0) -> dict[int, in
                 group[joined] = kept
     following = max([highest, *numbers.values()], default=0)
     seen: dict[int, set[int]] = {}  # scans that show each number of the data
-    found: dict[int, int] = {}
+    given: dict[int, int] = {}
     for number in sorted(order, key=lambda number: (-len(tracks[number].members), number)):
         own = root(number)
-        if own in found or own not in numbers:
+        if own in given or own not in numbers:
             continue
         members = {f for n in order if root(n) == own for f in tracks[n].members}
         # at two places at once, the longer track has the number
         if not members & seen.get(numbers[own], set()):
             seen.setdefault(numbers[own], set()).update(members)
-            found[own] = numbers[own]
+            given[own] = numbers[own]
     for number in order:
-        if root(number) not in found:
+        if root(number) not in given:
             following += 1
-            found[root(number)] = following
-    return {number: found[root(number)] for number in order}
+            given[root(number)] = following
+    return {number: given[root(number)] for number in order}
 
 
 def _are_one(one: Track, other: Track) -> bool:

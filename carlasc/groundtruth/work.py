@@ -22,8 +22,7 @@ from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, is_confident
 from carlasc.errors import CarlascError, ConflictError, FormatError, MissingDataError, StorageError
 from carlasc.groundtruth.inputs import FrameData, FrameInput, GridPlan, SequenceInput
-from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
-from carlasc.groundtruth.reporting.report import Report
+from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.groundtruth.seen import see_voxels
 from carlasc.running.processes import run_all
 from carlasc.running.spreading import Run, StepCounter
@@ -73,6 +72,17 @@ class FrameTask(ABC):
     def run(self) -> FrameResult:
         """Do the work, in a worker."""
 
+    def facts_of(self, arrays: Outputs, grid: Grid, thinned: Grid | None) -> FrameFacts:
+        """Return the facts of the frame from its arrays, its grid, and the grid without a tenth of
+        the scans, if it was made.
+        """
+        plan, frame = self.plan, self.frame
+        changes = None if thinned is None else Changes.between(grid, thinned)
+        residuals = None if frame is None else frame.residuals()
+        return FrameFacts.of(
+            self.number, arrays, plan.grid, plan.spec, self.classes, changes, residuals
+        )
+
 
 @dataclass(frozen=True)
 class MakeFrame(FrameTask):
@@ -92,10 +102,7 @@ class MakeFrame(FrameTask):
                 outputs[f"{plan.grid}/seen"] = see_voxels(
                     grid.labels > 0, plan.spec, self.frame.views(), data.boxes
                 )
-            changes = None if thinned is None else Changes.between(grid, thinned)
-            facts = FrameFacts.of(
-                number, outputs, plan.grid, plan.spec, self.classes, changes, self.frame.residuals()
-            )
+            facts = self.facts_of(outputs, grid, thinned)
         except MemoryError as error:
             raise CarlascError(
                 str(plan.spec),
@@ -122,12 +129,12 @@ class MeasureFrame(FrameTask):
         plan = self.plan
         names = (*layout.SCAN_FIELDS, *(f"{plan.grid}/{part}" for part in layout.GRID_FIELDS))
         try:
-            found = {
-                name: self.writer.read(name, self.number)
+            arrays = {
+                name: array
                 for name in names
                 if self.writer.has(name, self.number)
+                and (array := self.writer.read(name, self.number)) is not None
             }
-            arrays = {name: array for name, array in found.items() if array is not None}
             if not {f"{plan.grid}/labels", f"{plan.grid}/counts"} <= arrays.keys():
                 return FrameResult(self)
             labels, counts = (
@@ -135,15 +142,7 @@ class MeasureFrame(FrameTask):
                 for part in ("labels", "counts")
             )
             thinned = self.frame.thinned(plan) if self.sampled and self.frame is not None else None
-            changes = (
-                None
-                if thinned is None
-                else Changes.between(Grid(plan.spec, labels, counts), thinned)
-            )
-            residuals = None if self.frame is None else self.frame.residuals()
-            facts = FrameFacts.of(
-                self.number, arrays, plan.grid, plan.spec, self.classes, changes, residuals
-            )
+            facts = self.facts_of(arrays, Grid(plan.spec, labels, counts), thinned)
         except (CarlascError, OSError, ValueError):
             return FrameResult(self)
         return FrameResult(self, facts=facts)
@@ -171,8 +170,8 @@ def run_batch(batch: Batch) -> list[FrameResult]:
         StorageError: nothing can be written, so all other batches would fail too.
     """
     done: list[FrameResult] = []
-    for task in batch.tasks:
-        done.append(task.run())  # noqa: PERF401 (in Python 3.11, a comprehension is a level of calls)
+    for task in batch.tasks:  # in Python 3.11, a comprehension is a level of calls
+        done.append(task.run())  # noqa: PERF401
     if not batch.writer.concurrent:
         return done
     try:
@@ -255,7 +254,7 @@ class FrameFailure:
 
 @dataclass(frozen=True)
 class SequenceJob:
-    """The job of a run for one sequence: its inputs, its writer, and the documents to write first."""
+    """The job of a run for one sequence: inputs, writer, and documents to write first."""
 
     path: str
     inputs: SequenceInput
@@ -346,8 +345,9 @@ class SequenceJob:
         facts = [done.facts for done in results if done.facts is not None]
         grid, writer = self.plan.grid, self.writer
         names = (layout.POSES, layout.TIMES, layout.METADATA, layout.params_file(grid))
-        found = {name: writer.read_document(name) for name in names}
-        documents = {name: data for name, data in found.items() if data is not None}
+        documents = {
+            name: data for name in names if (data := writer.read_document(name)) is not None
+        }
         if facts:
             inputs = self.inputs
             classes, actors, poses = (

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from carlasc.core.axes import choices_of_axes
 from carlasc.core.grids import Grid, GridSpec
-from carlasc.groundtruth.reporting.facts import ActorTrack
+from carlasc.groundtruth.reporting import ActorTrack
 from carlasc.inspection.findings import Finding
 from carlasc.inspection.points_in_voxels import labels_at
 from carlasc.motion.tracks import is_doubtful

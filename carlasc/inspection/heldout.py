@@ -204,7 +204,7 @@ class _HeldOutDrive:
     @property
     def steps(self) -> int:
         """Number of steps: scans that are read to find the actors, and frames."""
-        return self.feed.reads + len(self.frames)
+        return self.feed.reads_for_actors + len(self.frames)
 
     def tasks(self, run: Run, steps: Callable[[int], None]) -> list[_HeldOutFrame]:
         """Find the actors in the scans that are left; return a task for each frame to measure."""

@@ -15,8 +15,7 @@ import numpy as np
 from carlasc.core import notebook
 from carlasc.core.grids import GridSpec
 from carlasc.errors import count
-from carlasc.groundtruth.reporting.facts import ActorTrack, PoseFacts
-from carlasc.groundtruth.reporting.report import LEFT_OUT, Report
+from carlasc.groundtruth.reporting import LEFT_OUT, ActorTrack, PoseFacts, Report
 from carlasc.inspection.auditing.audit import voxels_of
 from carlasc.inspection.auditing.counting import FALSE_FREE
 from carlasc.inspection.auditing.verdicts import STATES, AuditResult, Verdict

@@ -14,8 +14,7 @@ from carlasc.groundtruth import FrameFailure, FromScans, Voting
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanFrame, ScanSequence
 from carlasc.groundtruth.inputs import GridPlan, without_caches
-from carlasc.groundtruth.reporting.facts import Changes, FrameFacts, sample_frames
-from carlasc.groundtruth.reporting.report import Report
+from carlasc.groundtruth.reporting import Changes, FrameFacts, Report, sample_frames
 from carlasc.inspection.heldout import EVERY
 from carlasc.inspection.heldout import holdout as leave_out
 from carlasc.motion.options import MotionOptions, PoseOptions

@@ -18,8 +18,7 @@ from carlasc.errors import ArgumentError, CarlascError
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.heights import ground_of
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting.facts import digest_of
-from carlasc.groundtruth.reporting.report import Report, short
+from carlasc.groundtruth.reporting import Report, digest_of, short
 from carlasc.inspection.agreement import GridDiagnosis, GridEvidence, GroundBelow, check_actors
 from carlasc.inspection.alignment import PoseDiagnosis, diagnose_poses
 from carlasc.inspection.contents import check_documents, check_frames, check_shapes, check_values

@@ -5,7 +5,6 @@ from .copying import unpack as unpack
 from .downloading import download as download
 from .folder import FolderSink as FolderSink
 from .folder import FolderSource as FolderSource
-from .labelling import label as label
 from .metadata import Axes as Axes
 from .metadata import Metadata as Metadata
 from .opening import as_source as as_source

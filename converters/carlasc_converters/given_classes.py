@@ -8,7 +8,7 @@ from carlasc.converting import converter_names, load_converter, remaps_to_carla
 from carlasc.core.classes import ClassTable, Remap
 from carlasc.core.tables import CARLA
 from carlasc.errors import ArgumentError, DependencyError
-from carlasc.storage.predictions import read_table
+from carlasc.relabelling.predictions import read_table
 
 
 def classes_given(name: str) -> tuple[ClassTable, Remap | None]:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from carlasc.converting import Cloud, FrameHandle
 from carlasc.core.geometry import Transform
 from carlasc.errors import FormatError
+from carlasc.relabelling.predictions import load
 from carlasc.storage.arrays import NUMBERS, ArrayFormat, read_npy
-from carlasc.storage.predictions import load
 from carlasc_converters.files import opening
 from carlasc_converters.point_fields import TimeUnit, named_fields, point_seconds, whole_numbers
 from carlasc_converters.point_files import read_columns

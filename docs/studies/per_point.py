@@ -19,7 +19,7 @@ from movers_rows import BARE, Only
 from carlasc.groundtruth.from_scans.actor_voxels import with_numbers
 from carlasc.groundtruth.from_scans.feed import ScanFeed
 from carlasc.groundtruth.from_scans.motion_pass import find_actors
-from carlasc.groundtruth.labelling_motion import points_of_actors
+from carlasc.relabelling.from_motion import points_of_actors
 
 MOVES_M_S, EVERY = 0.5, 5
 

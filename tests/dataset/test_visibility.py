@@ -11,7 +11,7 @@ from carlasc.dataset import Dataset
 from carlasc.dataset.stacking import stack_scans
 from carlasc.dataset.transforms import flip
 from carlasc.dataset.visibility import HIT, PASSED, UNSEEN, stack_visibility
-from carlasc.groundtruth.voting import Observation
+from carlasc.groundtruth.voting.ballot import Observation
 
 SPEC = GridSpec("cartesian", (16, 16, 4), (-8.0, -8.0, -2.0), (8.0, 8.0, 1.0))
 CYLINDRICAL = GridSpec("cylindrical", (10, 16, 4), (0.0, -np.pi, -2.0), (20.0, np.pi, 1.0))

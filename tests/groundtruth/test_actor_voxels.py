@@ -5,8 +5,7 @@ import pytest
 
 from carlasc.core.geometry import rotation_z, transform_points, translation
 from carlasc.core.grids import GridSpec
-from carlasc.groundtruth.from_scans.actor_voxels import BodyRegions
-from carlasc.groundtruth.from_scans.merging import STATIC
+from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions
 from carlasc.motion import BODY_MARGIN_M, Extent, Track
 
 SPEC = GridSpec("cartesian", (50, 50, 10), (-10, -10, -2), (10, 10, 2))

@@ -28,13 +28,15 @@ POINTS, LABELS, POSE = np.ones((4, 3), np.float32), np.full(4, 7, np.uint8), np.
 
 @pytest.mark.parametrize("free_step_m", [0.0, -1.5, float("nan"), float("inf")])
 def test_a_free_step_that_is_no_positive_number_is_refused(free_step_m: float) -> None:
-    with pytest.raises(ArgumentError, match="free_step_m: expected a positive number"):
+    with pytest.raises(ArgumentError) as error:
         count_votes([], GridSpec.published(), free_step_m=free_step_m)
+    assert error.value.where == "free_step_m"
 
 
 def test_an_unknown_rule_is_refused() -> None:
-    with pytest.raises(ArgumentError, match="expected sensor, sample or ray, found 'point'"):
+    with pytest.raises(ArgumentError) as error:
         count_votes([], GridSpec.published(), rule="point")  # type: ignore[arg-type]
+    assert error.value.where == "rule" and error.value.found == "'point'"
 
 
 def test_a_label_beyond_the_table_is_refused_and_casts_no_vote() -> None:

@@ -8,7 +8,7 @@ import pytest
 from carlasc import GridSpec
 from carlasc.core.tables import CARLA
 from carlasc.groundtruth.voting.ballot import OCCUPIED_DTYPE
-from carlasc.groundtruth.voting.consensus import agree
+from carlasc.groundtruth.voting.certainty import agree
 
 ROAD, SIDEWALK, BUILDING, POLE, OTHER = (
     CARLA.id_of(n) for n in ("Road", "Sidewalk", "Building", "Pole", "Other")

@@ -133,10 +133,9 @@ def test_a_frame_that_cannot_say_how_certain_it_is_fails(drive, monkeypatch, set
 
 @pytest.mark.parametrize("min_confidence", [-0.1, 1, float("nan")])
 def test_a_confidence_is_a_probability_below_1(min_confidence):
-    with pytest.raises(
-        ArgumentError, match="min_confidence: expected a probability from 0 to below 1"
-    ):
+    with pytest.raises(ArgumentError) as error:
         Voting(min_confidence=min_confidence)
+    assert error.value.where == "min_confidence"
 
 
 @pytest.mark.parametrize(
@@ -176,10 +175,9 @@ def test_the_command_names_its_options(tmp_path):
 
 
 def test_fields_of_different_shapes_are_refused():
-    with pytest.raises(
-        FormatError, match=r"evidence views: expected shape \(8, 8, 4\), found \(8, 8\)"
-    ):
+    with pytest.raises(FormatError) as error:
         replace(EVIDENCE, views=np.zeros((8, 8), np.uint16))
+    assert error.value.where == "evidence views" and error.value.found == "(8, 8)"
 
 
 @pytest.mark.parametrize(

@@ -211,23 +211,24 @@ def test_wrong_arguments_are_refused_before_anything_is_written(drive, tmp_path,
             make(drive, **({"out": out} | options))
     with pytest.raises(MissingDataError, match=f"expected the grid other, found {GRID}"):
         make(drive, out, grid="other")
-    with pytest.raises(MissingDataError, match="expected frames in 99:"):
+    with pytest.raises(MissingDataError) as error:
         make(drive, out, frames="99:")
-    with pytest.raises(MissingDataError, match="expected points of something static, found none"):
+    assert error.value.expected.startswith("frames in 99:")
+    with pytest.raises(MissingDataError) as error:
         monkeypatch.setattr(
             "carlasc.groundtruth.from_scans.merging.Merger.static",
             lambda self, frame: np.zeros(len(self.scan_of(frame).points), bool),
         )
         make(drive, out, frames="0:2")
+    assert error.value.expected == "points of something static"
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_map_without_poses_is_one_line(tmp_path):
     folder = write_sequence(tmp_path / "drive", frames=3, poses=False)
-    with pytest.raises(
-        MissingDataError, match=r"poses.txt: expected poses, which merging scans needs, found none"
-    ):
+    with pytest.raises(MissingDataError) as error:
         make(folder, tmp_path / "map.ply")
+    assert error.value.where.endswith("poses.txt") and error.value.found == "none"
 
 
 def test_several_sequences_have_no_one_frame(tmp_path):
@@ -235,20 +236,18 @@ def test_several_sequences_have_no_one_frame(tmp_path):
     (tmp_path / "b").mkdir()
     (tmp_path / "a").rename(tmp_path / "b" / "one")
     write_sequence(tmp_path / "b" / "two", frames=2)
-    with pytest.raises(
-        ArgumentError, match=r"source: expected one sequence, as a map has one frame, found 2"
-    ):
+    with pytest.raises(ArgumentError) as error:
         make(tmp_path / "b", tmp_path / "map.ply")
+    assert error.value.where == "source" and error.value.found.startswith("2 (")
 
 
 def test_what_exists_stays_unless_it_is_to_be_replaced(drive, tmp_path):
     out = tmp_path / "map.npz"
     make(drive, out, frames="0:1", actors=True)
     before = out.read_bytes()
-    with pytest.raises(
-        ConflictError, match="expected nothing, found a file: give `overwrite=True`"
-    ):
+    with pytest.raises(ConflictError) as error:
         make(drive, out, frames="0:2")
+    assert error.value.found == "a file"
     assert out.read_bytes() == before
     make(drive, out, frames="0:2", actors=True, overwrite=True)
     assert out.read_bytes() != before and sorted(path.name for path in tmp_path.iterdir()) == [

@@ -9,9 +9,14 @@ from carlasc.core.geometry import invert, rotation_z, transform_points, translat
 from carlasc.core.grids import GridSpec
 from carlasc.core.tables import CARLA, SEMANTICKITTI
 from carlasc.groundtruth import FromScans
-from carlasc.groundtruth.from_scans.actor_voxels import BodyRegions
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger, PreparedScan
+from carlasc.groundtruth.from_scans.merging import (
+    STATIC,
+    BodyRegions,
+    Instant,
+    Merger,
+    PreparedScan,
+)
 from carlasc.groundtruth.voting.ballot import NOWHERE
 from carlasc.motion import Extent, Track
 from carlasc.motion.tracks import MovingActors
@@ -81,10 +86,9 @@ def regions_of(merging, frame=15):
 def observe(merging, frame=15, window=FRAMES):
     """Return the observations of the static scene and of the actor."""
     now = instant(frame)
-    seen = list(
-        merging.observations(now, window, BodyRegions.at(merging, now, window, SPEC).actors)
-    )
-    return seen[: len(window)], each_voter(seen[len(window) :])
+    bodies = BodyRegions.at(merging, now, window, SPEC).actors
+    in_bodies = each_voter(merging.in_bodies(now, window, bodies))
+    return list(merging.observations(now, window)), in_bodies
 
 
 def each_voter(observations):
@@ -178,7 +182,7 @@ def test_points_on_the_recording_vehicle_are_left_out_of_every_frame():
     merging.actors = MovingActors(own=(np.array([2.0, 7.0, -2.0, 4.0, 9.0, -1.0]),))
     now = instant(15)
     for other in (3, 15):
-        (seen,) = merging.observations(now, [other], {})
+        (seen,) = merging.observations(now, [other])
         assert seen.hits.tolist() == [False, other == 15, True]
 
 
@@ -268,8 +272,8 @@ def test_the_mirror_image_of_an_actor_has_its_points_on_the_other_side():
 
 def test_what_passes_is_where_it_was_seen_and_frees_nothing():
     now = instant(15)
-    passing = list(merger().passing(now, FRAMES))
-    assert len(passing) == 30  # not the frame's own
+    passing = list(merger().moving(now, [frame for frame in FRAMES if frame != 15]))
+    assert len(passing) == 30
     for frame, one in zip([f for f in FRAMES if f != 15], passing, strict=True):
         assert one.free_region == NOWHERE and one.labels.tolist() == [VEHICLE]
         place = transform_points(sensor_pose(15) @ one.grid_T_sensor, one.points)
@@ -392,11 +396,11 @@ class TestFeed:
 
     def test_ground_is_found_only_where_labels_do_not_name_it(self, tmp_path):
         folder = FolderSink(tmp_path).sequence("Val/Street/cartesian")
-        assert self.feed(tmp_path, frames=range(6)).finds_ground
+        assert self.feed(tmp_path, frames=range(6)).must_find_ground
         for frame, labels in ((3, [1, 1]), (4, [ROAD, 1])):
             folder.write("labels", frame, np.array(labels, np.uint32))
             (sequence,) = FolderSource(tmp_path).sequences().values()
-            assert ScanFeed(sequence, FromScans()).finds_ground == (ROAD not in labels)
+            assert ScanFeed(sequence, FromScans()).must_find_ground == (ROAD not in labels)
 
 
 def test_all_points_of_an_actor_vote_for_its_class():
@@ -449,7 +453,7 @@ def test_the_frames_own_rays_all_vote(rays):
     scans = {frame: dense_scan(frame) for frame in (14, 15)}
     merging = Merger(scans.__getitem__, MovingActors(), CARLA, "align")
     merging.rays = rays
-    other, own = merging.observations(instant(15), (14, 15), {})
+    other, own = merging.observations(instant(15), (14, 15))
     assert len(own) == 40_000 and own.weights is None
     assert (len(other) < 40_000) == (rays == "enough")
     if rays == "enough":

@@ -21,15 +21,16 @@ from carlasc.errors import FormatError
 from carlasc.groundtruth import FromGrid, FromScans, Voting, regrid
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
-from carlasc.groundtruth.reporting.facts import (
+from carlasc.groundtruth.reporting import (
     Changes,
+    FileDigest,
     FrameFacts,
+    Report,
     Residual,
     actors_of,
     digest_of,
     sample_frames,
 )
-from carlasc.groundtruth.reporting.report import FileDigest, Report
 from carlasc.storage import FolderSink, layout
 
 FRAMES = 8

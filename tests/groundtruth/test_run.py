@@ -196,14 +196,16 @@ def test_frames_that_the_capture_skipped_keep_their_time(tmp_path):
 @pytest.mark.parametrize("frames", [(200, None), (3, 50)])
 def test_a_range_without_frames_says_which_there_are(tmp_path, frames):
     write_capture(tmp_path)
-    with pytest.raises(MissingDataError, match="expected frames in .*, found only 100 to 102"):
+    with pytest.raises(MissingDataError) as error:
         regrid(tmp_path, SMALL, frames=frames)
+    assert error.value.found == "only 100 to 102"
     assert not (tmp_path / "cartesian").exists()
 
 
 def test_a_sequence_without_any_frame_says_so():
-    with pytest.raises(MissingDataError, match="^a sequence: expected frames, found none$"):
+    with pytest.raises(MissingDataError) as error:
         choose_frames(FrameRange(), np.array([], np.int64), "a sequence")
+    assert error.value.where == "a sequence" and error.value.expected == "frames"
 
 
 def test_several_sequences_keep_their_paths(tmp_path):
@@ -354,13 +356,12 @@ def test_voting_checks_itself(settings, message):
 
 
 def test_a_source_object_must_be_told_where_to_write(golden_capture):
-    with pytest.raises(
-        ArgumentError,
-        match="out: expected where to write, as the source is not a folder, found None",
-    ):
+    with pytest.raises(ArgumentError) as error:
         regrid(FolderSource(golden_capture), SMALL, observe=FromScans())
-    with pytest.raises(ArgumentError, match="source: expected a folder with a capture"):
+    assert error.value.where == "out"
+    with pytest.raises(ArgumentError) as error:
         regrid(FolderSource(golden_capture), SMALL, golden_capture, observe=FromCapture())
+    assert error.value.where == "source"
 
 
 @pytest.mark.parametrize("coordinates", ["cartesian", "cylindrical"])

@@ -202,8 +202,9 @@ def test_stores_of_one_writer_take_what_workers_make(source, tmp_path, kind, wor
 
 @pytest.mark.parametrize("kind", ["h5", "parquet"])
 def test_stores_of_one_writer_refuse_parts(source, tmp_path, kind):
-    with pytest.raises(ArgumentError, match=r"part: expected a folder or a \.zarr store"):
+    with pytest.raises(ArgumentError) as error:
         regrid(source[0], SPEC, tmp_path / f"x.{kind}", run=Run(part=Part(1, 2)))
+    assert error.value.where == "part"
     assert not list(tmp_path.iterdir())
 
 
@@ -215,13 +216,15 @@ def test_a_run_that_cannot_begin_leaves_no_store(tmp_path):
 
 def test_memory_is_of_one_process(source, tmp_path):
     for place in ("memory://run/x.zarr", "memory://run/folder"):
-        with pytest.raises(ArgumentError, match="workers: expected 1 with memory://run/"):
+        with pytest.raises(ArgumentError) as error:
             regrid(source[0], SPEC, place, run=Run(workers=2))
+        assert error.value.where == "workers"
         regrid(source[0], SPEC, place, run=Run(workers=1))
     carlasc.unpack("memory://run/x.zarr", tmp_path / "x", run=Run(workers=1))
     assert read_tree(tmp_path / "x") == source[1]
-    with pytest.raises(ArgumentError, match="workers: expected 1 with memory://run/"):
+    with pytest.raises(ArgumentError) as error:
         carlasc.pack("memory://run/folder", tmp_path / "x.zarr", run=Run(workers=2))
+    assert error.value.where == "workers"
 
 
 def test_a_store_without_its_last_part_is_finished_by_hand(source, tmp_path):

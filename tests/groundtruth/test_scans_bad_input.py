@@ -162,17 +162,16 @@ def test_motion_from_a_field_that_is_not_there_is_one_line(street, motion):
 
 def test_motion_from_numbers_needs_labels(tmp_path):
     street = passing_car.write_sequence(tmp_path, ("instances",), 3)
-    with pytest.raises(
-        MissingDataError,
-        match="expected instances in the sequence, found no field that shows motion",
-    ):
+    with pytest.raises(MissingDataError) as error:
         make(street, frames=None, motion=MotionOptions("instances"))
+    assert error.value.expected == "instances in the sequence"
 
 
 @pytest.mark.parametrize("motion", ["flow", "evidence", "none"])
 def test_a_tube_takes_no_motion(motion):
-    with pytest.raises(ArgumentError, match='^motion: expected none with dynamic "tube"'):
+    with pytest.raises(ArgumentError) as error:
         FromScans(dynamic="tube", motion=MotionOptions(motion))
+    assert error.value.where == "motion"
 
 
 @pytest.mark.parametrize(

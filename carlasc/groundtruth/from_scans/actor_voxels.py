@@ -4,22 +4,19 @@ by the numbers of the data.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from collections.abc import Sequence as Series
-from dataclasses import dataclass, replace
-from typing import Self
+from collections.abc import Iterator
+from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.core.geometry import Transform, invert, multiply, rotate_vectors, transform_points
+from carlasc.core.geometry import invert, multiply, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.core.scans import finite
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
+from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant
 from carlasc.groundtruth.voxel_actors import VoxelActors, centers_of, number_actors
-from carlasc.motion import BODY_MARGIN_M
 from carlasc.motion.tracks import FIRST_FOUND, MovingActors, Track
 from carlasc.storage.protocol import Sequence
 
@@ -95,6 +92,8 @@ def find_voxels(
         velocities.append(
             rotate_vectors(now.grid_T_world, velocity_at(track, now.frame, centers[own], feed))
         )
+    # Bodies are of moving actors, points and boxes of static ones. Each step fills voxels that the
+    # steps before it left without an actor.
     free = movable & (instance == 0)
     _number_points(spec, feed, actors, now, window, free, instance)
     _number_boxes(spec, feed, actors, now, free & (instance == 0), instance)
@@ -110,6 +109,7 @@ def velocity_at(
     row, known = frame - track.first, feed.frames
     near = np.clip([frame - _TURN_FRAMES, frame + _TURN_FRAMES], known[0], known[-1]) - track.first
     before, after = np.clip(near, 0, len(track.world_T_actor) - 1).tolist()
+    # The velocity of a track is that of the origin of its body; the turn adds the rest.
     turn = multiply(track.world_T_actor[after], invert(track.world_T_actor[before]))
     begin, end = np.interp(
         [track.first + before, track.first + after], known, list(feed.times.values())
@@ -146,10 +146,11 @@ def _number_points(
         points, numbers = kept[frame]
         static = ~np.isin(numbers, list(moving))
         points, numbers = points[static], numbers[static]
-        found = spec.flat_index(transform_points(now.grid_T_world, points))
-        used = found >= 0
-        used[used] = free[found[used]]
-        pairs.append(found[used].astype(np.int64) << 32 | numbers[used])
+        flat = spec.flat_index(transform_points(now.grid_T_world, points))
+        used = flat >= 0
+        used[used] = free[flat[used]]
+        # voxel and number in one integer: `unique` of integers is faster than of rows
+        pairs.append(flat[used].astype(np.int64) << 32 | numbers[used])
     keys, counts = np.unique(np.concatenate(pairs), return_counts=True)
     order = np.argsort(counts, kind="stable")  # the most frequent number is written last
     instance[keys[order] >> 32] = (keys[order] & 0xFFFFFFFF).astype(np.uint32)
@@ -174,7 +175,7 @@ def _number_boxes(
     free: NDArray[np.bool_],
     instance: NDArray[np.uint32],
 ) -> None:
-    """Give voxels without an actor the number of the smallest box of the frame that contains them."""
+    """Give voxels without an actor the number of the smallest box that contains them."""
     boxes = feed.sequence.boxes(now.frame) if "boxes" in feed.sequence.fields() else None
     if boxes is None or not len(boxes):
         return
@@ -184,6 +185,7 @@ def _number_boxes(
         centers_of(spec, voxels),
         np.asarray(spec.voxel_size if spec.coordinates == "cartesian" else (0, 0, 0)) / 2,
     )
+    # The largest box first: a smaller box inside of it overwrites its voxels.
     for row in np.argsort(-boxes.sizes.prod(axis=1), kind="stable").tolist():
         if int(boxes.tracks[row]) not in moving:
             box_T_grid = invert(boxes.sensor_T_box[row])
@@ -192,150 +194,3 @@ def _number_boxes(
                 np.abs(transform_points(box_T_grid, centers)) < boxes.sizes[row] / 2 + slack
             ).all(axis=1)
             instance[voxels[inside]] = boxes.tracks[row]
-
-
-@dataclass(frozen=True)
-class BodyRegions:
-    """Which voxels belong to which actor.
-
-    Attributes:
-        of_voxel: (V,) uint16, region of each voxel; STATIC outside of all bodies.
-        actors: number of the actor by region, for the regions that have voxels.
-        hidden: (H,) flat indices of voxels of faces that no scan saw. Rays beside the body pass
-            through them, and do not count there.
-        hidden_ends: (E,) the same for faces that are hidden also in the mirror image of the body.
-    """
-
-    of_voxel: NDArray[np.uint16]
-    actors: Mapping[int, int]
-    hidden: NDArray[np.int64]
-    hidden_ends: NDArray[np.int64]
-
-    @classmethod
-    def at(
-        cls, merger: Merger, now: Instant, window: Collection[int], spec: GridSpec
-    ) -> BodyRegions:
-        """Return the regions of a frame: of the bodies of moving actors, and of moving points
-        without a body.
-
-        Args:
-            merger: the moving actors, and the scans.
-            now: the frame.
-            window: frames whose scans are merged.
-            spec: the grid.
-        """
-        tracks = merger.actors.tracks.items() if merger.dynamic == "align" else ()
-        present = [
-            (number, track, pose)
-            for number, track in tracks
-            if (pose := track.pose(now.frame)) is not None
-        ]
-        regions = cls.of_bodies(spec, now.world_T_grid, present)
-        if merger.dynamic in ("align", "current") and now.frame in window:
-            scan = merger.scan_of(now.frame)
-            moving = scan.points[~merger.static(now.frame)]
-            return regions.with_points(
-                spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving)
-            )
-        return regions
-
-    def with_points(self, spec: GridSpec, points: NDArray[np.floating]) -> BodyRegions:
-        """Return the regions with another one for the voxels of moving points without a body.
-
-        Only the frame's own rays vote there.
-
-        Args:
-            spec: the grid.
-            points: (M, 3) metres, grid frame.
-        """
-        of_voxel = self.of_voxel.copy()
-        voxels = spec.flat_index(points)
-        voxels = voxels[voxels >= 0]
-        of_voxel[voxels[of_voxel[voxels] == STATIC]] = max(self.actors, default=0) + 1
-        return replace(self, of_voxel=of_voxel)
-
-    @classmethod
-    def of_bodies(
-        cls, spec: GridSpec, world_T_grid: Transform, bodies: Series[tuple[int, Track, Transform]]
-    ) -> Self:
-        """Return the regions of bodies: (number, track, world_T_actor) of each actor.
-
-        A body has all voxels that it touches. Where bodies overlap, the smaller body has the voxel.
-        """
-        of_voxel = np.zeros(spec.num_voxels, np.uint16)
-        hidden, hidden_ends = (
-            np.zeros(spec.num_voxels, np.bool_),
-            np.zeros(spec.num_voxels, np.bool_),
-        )
-        size = spec.voxel_size
-        # x and y of the centres of the columns of cells, (C, 2), z of the centres in each, and half
-        # the extent of the cells.
-        columns = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())[
-            :, :, 0, :2
-        ].reshape(-1, 2)
-        columns, heights = (
-            columns.astype(np.float64),
-            spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2],
-        )
-        width = (
-            np.hypot(columns[:, 0], columns[:, 1]) * size[1]
-            if spec.coordinates == "cylindrical"
-            else size[1]
-        )
-        across, up = (
-            np.broadcast_to(np.maximum(size[0], width) / 2, len(columns)),
-            float(size[2] / 2),
-        )
-        largest_first = sorted(bodies, key=lambda body: -float(np.prod(body[1].size)))
-        for region, (_, track, pose) in enumerate(largest_first, 1):
-            actor_T_grid = invert(pose) @ world_T_grid
-            turned = np.abs(actor_T_grid[:3, :3])
-            middle = invert(actor_T_grid)[:2, 3]
-            reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
-            near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
-            cells = np.column_stack(
-                [np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))]
-            )
-            slack = (
-                np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1)
-                + up * turned[:, 2]
-            )
-            body = transform_points(actor_T_grid, cells)
-            inside = ((body > track.lower - slack) & (body < track.upper + slack)).all(axis=1)
-            own = (near[:, None] * len(heights) + np.arange(len(heights))).reshape(-1)[inside]
-            of_voxel[own] = region
-            rear, front, low, high = track.extent.faces
-            mirrored = (rear, front, low or high, low or high)
-            hidden[own] = _on_hidden_face(track, body[inside], slack[inside], track.extent.faces)
-            hidden_ends[own] = _on_hidden_face(track, body[inside], slack[inside], mirrored)
-        present = np.unique(of_voxel[of_voxel != STATIC]).tolist()
-        actors = {region: largest_first[region - 1][0] for region in present}
-        return cls(of_voxel, actors, np.flatnonzero(hidden), np.flatnonzero(hidden_ends))
-
-
-def _on_hidden_face(
-    track: Track,
-    cells: NDArray[np.float64],
-    slack: NDArray[np.float64],
-    faces: tuple[bool, bool, bool, bool],
-) -> NDArray[np.bool_]:
-    """Return (C,) bool: which cells touch an unseen face and no seen face of an actor.
-
-    Args:
-        track: the actor.
-        cells: (C, 3) centres of cells that its body touches, metres, actor frame.
-        slack: (C, 3) half the extent of each cell along the axes of the actor.
-        faces: whether scans saw the rear, the front, the side of low y and the side of high y.
-    """
-    lower, upper = track.lower + BODY_MARGIN_M, track.upper - BODY_MARGIN_M
-    away = np.stack(
-        [
-            cells[:, 0] - lower[0],
-            upper[0] - cells[:, 0],
-            cells[:, 1] - lower[1],
-            upper[1] - cells[:, 1],
-        ]
-    )
-    touches = np.abs(away) <= np.stack([slack[:, 0], slack[:, 0], slack[:, 1], slack[:, 1]])
-    seen = np.array(faces)[:, None]
-    return (touches & ~seen).any(axis=0) & ~(touches & seen).any(axis=0)

@@ -118,6 +118,7 @@ class ScanFeed:
         classes: class table of the labels.
         min_range_m: nearer points are left out, in metres.
         max_range_m: farther points are left out, in metres.
+        key: the same for all copies of a feed.
     """
 
     def __init__(self, sequence: Sequence, options: FromScans) -> None:
@@ -135,10 +136,10 @@ class ScanFeed:
         self._scans: OrderedDict[int, PreparedScan] = OrderedDict()
         self._merger: Merger | None = None
         self._lock = threading.RLock()  # an executor may be of threads
-        self._key = uuid4().hex
+        self.key = uuid4().hex
 
     def __reduce__(self) -> tuple[Callable[..., ScanFeed], tuple[Any, ...]]:
-        return _restore, (self._key, without_caches(self.sequence), self.options)
+        return _restore, (self.key, without_caches(self.sequence), self.options)
 
     def without(self, hidden: Collection[int]) -> ScanFeed:
         """Return a feed without the scans of some frames: they neither vote nor show motion.
@@ -147,7 +148,7 @@ class ScanFeed:
         """
         return ScanFeed(WithoutScans(self.sequence, hidden), replace(self.options, own_path=False))
 
-    def under(self, sequence: Sequence) -> ScanFeed:
+    def with_poses_of(self, sequence: Sequence) -> ScanFeed:
         """Return a feed of the same scans under the poses of `sequence`."""
         other = ScanFeed(sequence, self.options)
         if "digest" in vars(self):
@@ -175,7 +176,7 @@ class ScanFeed:
         return "labels" in self.sequence.fields()
 
     @cached_property
-    def finds_ground(self) -> bool:
+    def must_find_ground(self) -> bool:
         """Whether ground points have to be found: in some scans, no label is of a ground class."""
         if not self.classes.ground:
             return False
@@ -185,18 +186,19 @@ class ScanFeed:
         )
 
     @cached_property
-    def names_ground(self) -> bool:
+    def trusts_ground_labels(self) -> bool:
         """Whether labels name the ground: in some scans, few points on the ground have other
         classes.
         """
         scans = (
             [self._voting_points(frame) for frame in self._sampled] if self.classes.ground else []
         )
-        found = [_labels(scan)[ground_points(scan.points)] for scan in scans]
+        on_ground = [_labels(scan)[ground_points(scan.points)] for scan in scans]
         others = sum(
-            int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground)))) for labels in found
+            int(np.count_nonzero(~np.isin(labels, sorted(self.classes.ground))))
+            for labels in on_ground
         )
-        return self.has_labels and others <= _OTHERWISE * sum(map(len, found))
+        return self.has_labels and others <= _OTHERWISE * sum(map(len, on_ground))
 
     @property
     def _sampled(self) -> list[int]:
@@ -250,7 +252,7 @@ class ScanFeed:
         return self.options.dynamic == "align" if self.motion == ("flow",) else bool(self.motion)
 
     @property
-    def reads(self) -> int:
+    def reads_for_actors(self) -> int:
         """Number of scans that are read to find the actors; fields and evidence of motion take a
         pass each.
         """
@@ -262,6 +264,8 @@ class ScanFeed:
 
     def window_of(self, frame: int) -> list[int]:
         """Return the frames whose scans are merged into a frame, including the frame itself."""
+        # Scans are counted from the frame, not from the first one of the sequence: each frame uses
+        # its own scan.
         first, last = self.options.window
         near = self.frames[(self.frames >= frame + first) & (self.frames <= frame + last)]
         near = near[(near - frame) % self.options.stride == 0]
@@ -274,6 +278,8 @@ class ScanFeed:
 
     def reaching(self, frame: int, spec: GridSpec) -> list[int]:
         """Return the frames of the window whose scans may have points in the frame's grid."""
+        # The farthest corner of the grid and the farthest point of the scan, both as spheres: a
+        # scan that cannot reach the grid costs as much as one that does.
         here = self.pose(frame)
         corners = np.array(np.meshgrid(*zip(spec.lower, spec.upper, strict=True))).reshape(3, -1).T
         across = (
@@ -292,6 +298,7 @@ class ScanFeed:
         """Yield the frames of `others` within `window_m` that are not too close to each other, in
         order of distance from `frame`.
         """
+        # The distance is that along the path. A vehicle that waits gives one scan.
         limit = self.options.window_m or np.inf
         driven, last_taken, previous = 0.0, 0.0, self.pose(frame)[:3, 3]
         for other in others:
@@ -348,6 +355,8 @@ class ScanFeed:
                     origins=scan.others.get("origins"),
                     probabilities=scan.others.get("probabilities"),
                 )
+                # A window of scans and one more: frames are made in order, and the next one needs
+                # all of them but the first.
                 first, last = self.options.window
                 while len(self._scans) > last - first + 2:
                     self._scans.popitem(last=False)
@@ -379,7 +388,7 @@ class ScanFeed:
             explained[segment.members] = True
         ground = (
             np.isin(_labels(scan), sorted(self.classes.ground))
-            if self.names_ground or self.finds_ground
+            if self.trusts_ground_labels or self.must_find_ground
             else None
         )
         labels = _labels(scan) if self.has_labels else None
@@ -404,9 +413,9 @@ class ScanFeed:
             static = static_actor_points(
                 frame, scan, self.pose(frame), self.classes.movable, min_speed_m_s=speed
             )
-        found = self._segments(frame, scan, boxes)
+        segments = self._segments(frame, scan, boxes)
         return ScanMotion(
-            frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in found), static
+            frame, tuple(replace(s, points=thin(s.points, _ACTOR_POINTS)) for s in segments), static
         )
 
     def _segments(self, frame: int, scan: Scan, boxes: Sequence_[Track]) -> list[Segment]:
@@ -429,8 +438,9 @@ class ScanFeed:
         check_finite(scan.points, f"{self.sequence.location}: points of frame {frame}")
         if scan.labels is None:
             scan = replace(scan, labels=np.full(len(scan), self.classes.geometry_id, np.uint32))
-        if self.finds_ground:
+        if self.must_find_ground:
             scan = replace(scan, labels=self._with_ground(scan.points, _labels(scan)))
+        # Checked before points are left out: a wrong id is an error wherever it is.
         labels = _labels(scan)
         self.classes.check(labels, f"{self.sequence.location}: labels of frame {frame}")
         origins = scan.others.get("origins")
@@ -456,11 +466,11 @@ class ScanFeed:
         """Return labels in which points without a class on the ground have a ground class, so that
         they vote as ground.
         """
-        found = np.asarray(labels, np.uint32).copy()
-        found[ground_points(points) & (labels == self.classes.geometry_id)] = min(
+        voting = np.asarray(labels, np.uint32).copy()
+        voting[ground_points(points) & (labels == self.classes.geometry_id)] = min(
             self.classes.ground
         )
-        return found
+        return voting
 
 
 _FEEDS: dict[str, ScanFeed] = {}  # the feed of this process, by the key of its copies: see ScanFeed
@@ -470,7 +480,7 @@ def _restore(key: str, sequence: Sequence, options: FromScans) -> ScanFeed:
     feed = _FEEDS.get(key)
     if feed is None:
         feed = ScanFeed(sequence, options)
-        feed._key = key
+        feed.key = key
         _FEEDS.clear()  # a run processes its sequences one after the other
         _FEEDS[key] = feed
     return feed

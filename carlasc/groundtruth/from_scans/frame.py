@@ -14,21 +14,22 @@ from numpy.typing import NDArray
 from carlasc.core.cells import count_points
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid, GridSpec, VoxelFlag
-from carlasc.groundtruth.from_scans.actor_voxels import BodyRegions, find_voxels
+from carlasc.groundtruth.from_scans.actor_voxels import find_voxels
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.merging import STATIC, Instant, Merger
+from carlasc.groundtruth.from_scans.merging import STATIC, BodyRegions, Instant, Merger
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.voting.ballot import Ballot, Observation, Votes
 from carlasc.groundtruth.voting.certainty import (
     UNKNOWN,
+    ClassConsensus,
     Matter,
     VoxelCertainty,
+    agree,
     class_shares,
     is_occupied,
     matter_of,
     probability,
 )
-from carlasc.groundtruth.voting.consensus import ClassConsensus, agree
 from carlasc.groundtruth.voxel_actors import VoxelActors
 from carlasc.motion.tracks import MovingActors
 
@@ -87,11 +88,12 @@ def merge_frame(
     regions = BodyRegions.at(merger, now, window, plan.spec)
     steps, bodies = _FrameSteps(plan, feed, merger, now, window, regions), regions.actors
     recent = merger.recent(now, window)  # first, to know which voxels they saw
-    ballot = steps.vote(merger.observations(now, recent, {}), count_views=plan.needs_evidence)
+    ballot = steps.vote(merger.observations(now, recent), count_views=plan.needs_evidence)
     seen_now = ballot.seen()
-    others = merger.observations(now, (other for other in window if other not in recent), {})
+    others = merger.observations(now, (other for other in window if other not in recent))
     steps.vote(chain(others, merger.in_bodies(now, window, bodies)), ballot)
     votes, views = ballot.votes(copy=False), ballot.views if plan.needs_evidence else None
+    # The votes are whole now: what follows decides, completes and corrects, in this order.
     del ballot  # frees memory for the next ballots
     if plan.rule != "ray":
         whole = votes.to_grid()
@@ -117,14 +119,16 @@ def merge_frame(
         completions = steps.vote(observations).votes(copy=False)
         completed.append(steps.complete(made, completions))
 
+    # After completion: an inferred body must not stand where the recording vehicle drove.
     if options.own_path and options.dynamic != "tube":
         driven = steps.driven(made)
         made.labels[driven] = 0
         made.set_probability(driven, _OWN_PROBABILITY)
+    # Last, because what the frame's own scan saw is stronger than all inferences above.
     if consensus is not None:
         steps.keep_returns(made, votes, consensus)
     who = steps.actors(made.labels)
-    if feed.finds_ground:  # ground that was found had a class for the votes only
+    if feed.must_find_ground:  # ground that was found had a class for the votes only
         made.labels[np.isin(made.labels, sorted(classes.ground))] = classes.geometry_id
     size = plan.spec.size
     grid = Grid(plan.spec, made.labels.reshape(size), made.counts.reshape(size))
@@ -254,16 +258,17 @@ class _FrameSteps:
             labels = consensus.labels.copy()
         free = votes.free.reshape(-1)
         bodies = np.flatnonzero(np.isin(self.regions.of_voxel, list(self.regions.actors)))
+        # Before `labels` is overwritten by decisions: doubt is about the class that was seen.
         doubtful = self._doubtful(self._evidence(votes, labels, hits, bodies))
-        found = self._evidence(
+        voted = self._evidence(
             votes, labels, hits, np.flatnonzero((labels > 0) | (free > 0) if evidence else labels)
         )
-        labels[found.voxels] = self._decide(found)
+        labels[voted.voxels] = self._decide(voted)
         counts = np.add(hits, free, out=hits)
         made = _UnfinishedGrid(labels, counts)
         if evidence:
             made.occupied = np.full(len(labels), UNKNOWN, np.float32)
-            made.occupied[found.voxels] = self._probability(found)
+            made.occupied[voted.voxels] = self._probability(voted)
         made.forget(doubtful)
         return made
 
@@ -284,18 +289,22 @@ class _FrameSteps:
 
         Voxels with free votes stay unknown.
         """
-        found = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
-        found.matter[found.matter == Matter.BODY] = Matter.MIRRORED
-        unseen = np.isin(found.voxels, self.regions.hidden_ends) & (found.hits == 0)
-        unseen |= np.isin(found.voxels, made.passed)
-        found = found.at((made.counts[found.voxels] == 0) & (found.counts > 0) & ~unseen)
-        is_there = self._decide(found) > 0
-        made.passed = found.voxels[~is_there]
-        found = found.at(is_there)
-        made.labels[found.voxels] = found.labels
-        made.counts[found.voxels] = found.counts
-        made.set_probability(found.voxels, self._probability(found))
-        return found.voxels, votes.occupied[np.isin(votes.occupied["voxel"], found.voxels)]
+        inferred = self._evidence(votes, *votes.elect_occupied(), np.flatnonzero(self.in_body))
+        # A mirrored side is less certain than a seen one, and has its own calibration.
+        inferred.matter[inferred.matter == Matter.BODY] = Matter.MIRRORED
+        unseen = np.isin(inferred.voxels, self.regions.hidden_ends) & (inferred.hits == 0)
+        unseen |= np.isin(inferred.voxels, made.passed)
+        inferred = inferred.at(
+            (made.counts[inferred.voxels] == 0) & (inferred.counts > 0) & ~unseen
+        )
+        is_there = self._decide(inferred) > 0
+        # Rays passed through these mirrored voxels: the surfaces of the next step do not fill them.
+        made.passed = inferred.voxels[~is_there]
+        inferred = inferred.at(is_there)
+        made.labels[inferred.voxels] = inferred.labels
+        made.counts[inferred.voxels] = inferred.counts
+        made.set_probability(inferred.voxels, self._probability(inferred))
+        return inferred.voxels, votes.occupied[np.isin(votes.occupied["voxel"], inferred.voxels)]
 
     def actors(self, labels: NDArray[np.integer]) -> VoxelActors | None:
         """Return the actors in the voxels of (V,) classes; None unless the plan needs them."""
@@ -309,7 +318,7 @@ class _FrameSteps:
     def flags(self, inferred: NDArray[np.int64], contested: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return (V,) uint8: the flags of each voxel."""
         own = [self.now.frame] if self.now.frame in self.window else []
-        now = self.vote(self.merger.observations(self.now, own, {}))
+        now = self.vote(self.merger.observations(self.now, own))
         flags = np.zeros(self.plan.spec.num_voxels, np.uint8)
         for where, flag in (
             (inferred, VoxelFlag.INFERRED),
@@ -345,7 +354,7 @@ class _FrameSteps:
     def _evidence(
         self, votes: Votes, labels: NDArray[Any], hits: NDArray[Any], voxels: NDArray[np.int64]
     ) -> _VoxelEvidence:
-        """Return the evidence of some voxels; `labels` and `hits` are from `Votes.elect_occupied`."""
+        """Return the evidence of some voxels; `labels`, `hits`: from `Votes.elect_occupied`."""
         labels = labels[voxels]
         matter = matter_of(labels, self.in_body[voxels], self.feed.classes)
         return _VoxelEvidence(voxels, labels, hits[voxels], votes.free.reshape(-1)[voxels], matter)
@@ -373,9 +382,8 @@ class _FrameSteps:
         """Return the voxels outside of bodies that moving points are in at other times."""
         if self.feed.options.dynamic != "align":
             return _NO_VOXELS
-        return np.flatnonzero(
-            self.vote(self.merger.passing(self.now, self.window)).hit & ~self.in_body
-        )
+        others = [other for other in self.window if other != self.now.frame]
+        return np.flatnonzero(self.vote(self.merger.moving(self.now, others)).hit & ~self.in_body)
 
     def unseen_now(self, voxels: NDArray[np.int64], recent: list[int]) -> NDArray[np.int64]:
         """Return the voxels of `voxels` in which recent scans have no moving points."""
@@ -397,6 +405,8 @@ class _FrameSteps:
             if self.merger.dynamic != "drop"
             else scan.points[self.merger.static(self.now.frame)]
         )
+        # Other scans may have seen such a voxel free, as a thin object in it stops few rays. A
+        # return is an outlier only if very many rays passed; fewer are enough if it is alone.
         returns = count_points(points, self.now.grid_T_world @ scan.world_T_sensor, spec)
         returned = np.flatnonzero(returns)
         lost = returned[(made.labels[returned] == 0) & (consensus.labels[returned] > 0)]
@@ -414,6 +424,7 @@ class _FrameSteps:
         """Return the occupied voxels on the ego path of other frames, without ground, bodies and
         returns of the frame's own scan.
         """
+        # Samples of the vehicle's volume are half a voxel apart, so that none is left out.
         apart = float(self.plan.spec.voxel_size[[0, 2]].min()) / 2
         axes = [np.arange(a, b + 1e-9, apart) for a, b in zip(_OWN_LOWER, _OWN_UPPER, strict=True)]
         body = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)

@@ -8,19 +8,22 @@ Free space of the static scene from other scans does not count there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Sequence as Series
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
 from carlasc.core.geometry import Transform, invert, transform_points
+from carlasc.core.grids import GridSpec
 from carlasc.core.scans import RaysFromPlace, lengths, runs_of_origins
 from carlasc.groundtruth.options import Dynamic, Rays
 from carlasc.groundtruth.voting.ballot import NOWHERE, Observation
+from carlasc.motion import BODY_MARGIN_M
 from carlasc.motion.tracks import MovingActors, Track
 from carlasc.storage import layout
 
@@ -34,6 +37,7 @@ _AROUND_M = np.array([0.3, 0.3, 0.1])
 _MIRROR, _MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0]), np.array([1, -1, 1], np.float32)
 # area of a sphere around the sensor, over the number of points, in which one ray is enough
 _POINT_M2 = 0.004
+# 2 ** 32 times the fractional parts of the golden ratio and of the square root of 2
 _GOLDEN, _SILVER = 2654435769, 1779033703  # their multiples modulo 2 ** 32 are evenly spread
 
 
@@ -120,6 +124,8 @@ class PreparedScan:
         if probabilities is not None:  # other labels than the likeliest one were found by carlasc
             likely = probabilities[:, 1] / np.float32(layout.CERTAIN)
             sure = np.where(probabilities[:, 0] == labels, likely, np.float32(1)).astype(np.float32)
+        # Rays are kept relative to their origins; the origin is in the pose of the place, so that
+        # the rule of votes is the same for a sensor that moves during the scan.
         ends = points if origins is None or not origins.any() else points - origins
         rays = tuple(
             RaysFromPlace.of(ends, part, origin)
@@ -237,11 +243,8 @@ class Merger:
                 del kept[other]
         self._carried = {key: value for key, value in self._carried.items() if key[1] >= frame}
 
-    def observations(
-        self, now: Instant, window: Iterable[int], bodies: Mapping[int, int]
-    ) -> Iterator[Observation]:
-        """Yield the observations of a frame's grid: each scan of the static scene, then each
-        actor's scans in its body.
+    def observations(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
+        """Yield the observation of the static scene by each scan.
 
         Static surfaces vote everywhere, so the road below an actor is kept. Free space from other
         times does not count in the bodies of actors. The frame's own rays always count.
@@ -249,9 +252,8 @@ class Merger:
         Args:
             now: the frame.
             window: frames of the scans.
-            bodies: number of the actor by region, for the actors that vote in their bodies.
         """
-        window, grid_T_world = list(window), now.grid_T_world
+        grid_T_world = now.grid_T_world
         for other in window:
             scan, own = self.scan_of(other), other == now.frame
             everything = self.dynamic == "tube" or (own and self.dynamic != "drop")
@@ -262,7 +264,6 @@ class Merger:
             votes = self._enough(scan, hits) if sampled else scan.votes_of(self.labels(other), hits)
             places = grid_T_world @ scan.world_T_places
             yield Observation(grid_T_sensor=places, free_region=None if own else STATIC, **votes)
-        yield from self.in_bodies(now, window, bodies)
 
     def _enough(self, scan: PreparedScan, hits: NDArray[np.bool_] | None) -> dict[str, Any]:
         """Return the votes of the rays that are enough: prepared once, for all frames that use
@@ -303,6 +304,8 @@ class Merger:
             pose = track.pose(now.frame)
             if pose is None or (mirror and not (track.rigid and any(track.extent.known))):
                 continue
+            # Rays are carried in the frame of the actor, where they do not depend on the frame that
+            # is made: they are computed once for all frames of the window.
             seen = [carried for other in window for carried in self._carry(number, other, now)]
             if not seen:
                 continue
@@ -319,15 +322,11 @@ class Merger:
                 ends=np.cumsum([len(carried) for carried in seen]),
             )
 
-    def passing(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the moving points of each other scan, at their positions in that scan.
+    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
+        """Yield the moving points of each scan, at their positions in that scan.
 
         No ray votes for free space.
         """
-        yield from self.moving(now, (other for other in window if other != now.frame))
-
-    def moving(self, now: Instant, window: Iterable[int]) -> Iterator[Observation]:
-        """Yield the same of all scans of the window, with the scan of the frame."""
         for other in window:
             scan = self.scan_of(other)
             if other not in self._moving:
@@ -372,6 +371,8 @@ class Merger:
             static[scan.moving] = False
             static[self.actors.is_own(scan.points)] = False
             static[self.actors.moving.get(frame, [])] = False
+            # Wheels touch the ground: ground near a body stays static, or each actor would leave a
+            # hole in the road.
             ground = np.isin(scan.labels, sorted(self.classes.ground))
             for track in self.actors.tracks.values():
                 static[track.members.get(frame, [])] = False
@@ -399,7 +400,7 @@ class Merger:
         track = self.actors.tracks[number]
         if not track.rigid and abs(self.scan_of(other).seconds - now.seconds) > _DEFORMABLE_S:
             return ()
-        pose, found = track.pose(other), list[Observation]()
+        pose, through = track.pose(other), list[Observation]()
         if (number, other) not in self._carried and pose is not None:
             scan = self.scan_of(other)
             own = np.zeros(len(scan.points), np.bool_)
@@ -407,19 +408,170 @@ class Merger:
             for rays, actor_T_place, crossing in scan.through(pose, track.lower, track.upper):
                 if len(crossing):
                     labels, hits = self.labels(other)[rays.part][crossing], own[rays.part][crossing]
-                    found.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
-        return self._carried.setdefault((number, other), tuple(found))
+                    through.append(Observation(rays.points[crossing], labels, actor_T_place, hits))
+        return self._carried.setdefault((number, other), tuple(through))
 
 
 def _points_near(track: Track, scan: PreparedScan) -> NDArray[np.int64]:
     """Return the indices of the points of a scan that are in the body of an actor, or within
     `_AROUND_M` of it.
     """
-    pose, found = track.pose(scan.frame), [np.empty(0, np.int64)]
+    pose, near = track.pose(scan.frame), [np.empty(0, np.int64)]
     if pose is None:
-        return found[0]
+        return near[0]
     lower, upper = track.lower - _AROUND_M, track.upper + _AROUND_M
     for rays, actor_T_place, crossing in scan.through(pose, lower, upper):
         body = transform_points(actor_T_place, rays.points[crossing])
-        found.append(rays.part.start + crossing[((body >= lower) & (body <= upper)).all(axis=1)])
-    return np.concatenate(found)
+        near.append(rays.part.start + crossing[((body >= lower) & (body <= upper)).all(axis=1)])
+    return np.concatenate(near)
+
+
+@dataclass(frozen=True)
+class BodyRegions:
+    """Which voxels belong to which actor.
+
+    Attributes:
+        of_voxel: (V,) uint16, region of each voxel; STATIC outside of all bodies.
+        actors: number of the actor by region, for the regions that have voxels.
+        hidden: (H,) flat indices of voxels of faces that no scan saw. Rays beside the body pass
+            through them, and do not count there.
+        hidden_ends: (E,) the same for faces that are hidden also in the mirror image of the body.
+    """
+
+    of_voxel: NDArray[np.uint16]
+    actors: Mapping[int, int]
+    hidden: NDArray[np.int64]
+    hidden_ends: NDArray[np.int64]
+
+    @classmethod
+    def at(
+        cls, merger: Merger, now: Instant, window: Collection[int], spec: GridSpec
+    ) -> BodyRegions:
+        """Return the regions of a frame: of the bodies of moving actors, and of moving points
+        without a body.
+
+        Args:
+            merger: the moving actors, and the scans.
+            now: the frame.
+            window: frames whose scans are merged.
+            spec: the grid.
+        """
+        tracks = merger.actors.tracks.items() if merger.dynamic == "align" else ()
+        present = [
+            (number, track, pose)
+            for number, track in tracks
+            if (pose := track.pose(now.frame)) is not None
+        ]
+        regions = cls.of_bodies(spec, now.world_T_grid, present)
+        if merger.dynamic in ("align", "current") and now.frame in window:
+            scan = merger.scan_of(now.frame)
+            moving = scan.points[~merger.static(now.frame)]
+            return regions.with_points(
+                spec, transform_points(now.grid_T_world @ scan.world_T_sensor, moving)
+            )
+        return regions
+
+    def with_points(self, spec: GridSpec, points: NDArray[np.floating]) -> BodyRegions:
+        """Return the regions with another one for the voxels of moving points without a body.
+
+        Only the frame's own rays vote there.
+
+        Args:
+            spec: the grid.
+            points: (M, 3) metres, grid frame.
+        """
+        of_voxel = self.of_voxel.copy()
+        voxels = spec.flat_index(points)
+        voxels = voxels[voxels >= 0]
+        of_voxel[voxels[of_voxel[voxels] == STATIC]] = max(self.actors, default=0) + 1
+        return replace(self, of_voxel=of_voxel)
+
+    @classmethod
+    def of_bodies(
+        cls, spec: GridSpec, world_T_grid: Transform, bodies: Series[tuple[int, Track, Transform]]
+    ) -> Self:
+        """Return the regions of bodies: (number, track, world_T_actor) of each actor.
+
+        A body has all voxels that it touches. Where bodies overlap, the smaller body has the voxel.
+        """
+        of_voxel = np.zeros(spec.num_voxels, np.uint16)
+        hidden, hidden_ends = (
+            np.zeros(spec.num_voxels, np.bool_),
+            np.zeros(spec.num_voxels, np.bool_),
+        )
+        size = spec.voxel_size
+        # Cells of a column share x and y: a body is compared with columns first, then with the
+        # cells of the few columns near it. x and y of the centres of the columns of cells, (C, 2),
+        # z of the centres in each, and half the extent of the cells.
+        columns = spec.from_axes(replace(spec, size=(*spec.size[:2], 1)).centers())[
+            :, :, 0, :2
+        ].reshape(-1, 2)
+        columns, heights = (
+            columns.astype(np.float64),
+            spec.lower[2] + (np.arange(spec.size[2]) + 0.5) * size[2],
+        )
+        width = (
+            np.hypot(columns[:, 0], columns[:, 1]) * size[1]
+            if spec.coordinates == "cylindrical"
+            else size[1]
+        )
+        across, up = (
+            np.broadcast_to(np.maximum(size[0], width) / 2, len(columns)),
+            float(size[2] / 2),
+        )
+        largest_first = sorted(bodies, key=lambda body: -float(np.prod(body[1].size)))
+        for region, (_, track, pose) in enumerate(largest_first, 1):
+            actor_T_grid = invert(pose) @ world_T_grid
+            turned = np.abs(actor_T_grid[:3, :3])
+            middle = invert(actor_T_grid)[:2, 3]
+            reach = float(np.linalg.norm(np.maximum(-track.lower, track.upper))) + across + up
+            near = np.flatnonzero((np.abs(columns - middle) < reach[:, None]).all(axis=1))
+            cells = np.column_stack(
+                [np.repeat(columns[near], len(heights), axis=0), np.tile(heights, len(near))]
+            )
+            slack = (
+                np.repeat(across[near], len(heights))[:, None] * turned[:, :2].sum(axis=1)
+                + up * turned[:, 2]
+            )
+            body = transform_points(actor_T_grid, cells)
+            inside = ((body > track.lower - slack) & (body < track.upper + slack)).all(axis=1)
+            # C order: the cells of a column follow each other in the flat index
+            own = (near[:, None] * len(heights) + np.arange(len(heights))).reshape(-1)[inside]
+            of_voxel[own] = region
+            # Vehicles are symmetric about their length only: a side that one scan saw is known on
+            # the other side too, but not the rear from the front.
+            rear, front, low, high = track.extent.faces
+            mirrored = (rear, front, low or high, low or high)
+            hidden[own] = _on_hidden_face(track, body[inside], slack[inside], track.extent.faces)
+            hidden_ends[own] = _on_hidden_face(track, body[inside], slack[inside], mirrored)
+        present = np.unique(of_voxel[of_voxel != STATIC]).tolist()
+        actors = {region: largest_first[region - 1][0] for region in present}
+        return cls(of_voxel, actors, np.flatnonzero(hidden), np.flatnonzero(hidden_ends))
+
+
+def _on_hidden_face(
+    track: Track,
+    cells: NDArray[np.float64],
+    slack: NDArray[np.float64],
+    faces: tuple[bool, bool, bool, bool],
+) -> NDArray[np.bool_]:
+    """Return (C,) bool: which cells touch an unseen face and no seen face of an actor.
+
+    Args:
+        track: the actor.
+        cells: (C, 3) centres of cells that its body touches, metres, actor frame.
+        slack: (C, 3) half the extent of each cell along the axes of the actor.
+        faces: whether scans saw the rear, the front, the side of low y and the side of high y.
+    """
+    lower, upper = track.lower + BODY_MARGIN_M, track.upper - BODY_MARGIN_M
+    away = np.stack(
+        [
+            cells[:, 0] - lower[0],
+            upper[0] - cells[:, 0],
+            cells[:, 1] - lower[1],
+            upper[1] - cells[:, 1],
+        ]
+    )
+    touches = np.abs(away) <= np.stack([slack[:, 0], slack[:, 0], slack[:, 1], slack[:, 1]])
+    seen = np.array(faces)[:, None]
+    return (touches & ~seen).any(axis=0) & ~(touches & seen).any(axis=0)

@@ -64,55 +64,35 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-@dataclass(frozen=True)
-class _FindEvidence:
-    """Finds evidence of motion in the scans of a block, in a worker.
+def _find_evidence(
+    block: tuple[int, ...], feed: ScanFeed, boxes: tuple[Track, ...]
+) -> list[FreeSpaceEvidence]:
+    """Find evidence of motion in the scans of a block, in a worker.
 
     It also reads the scans of some seconds before and after.
     """
-
-    feed: ScanFeed
-    boxes: tuple[Track, ...]
-
-    def __call__(self, block: tuple[int, ...]) -> list[FreeSpaceEvidence]:
-        times = self.feed.times
-        near = [
-            f
-            for f, s in times.items()
-            if times[block[0]] - HORIZON_S <= s <= times[block[-1]] + HORIZON_S
-        ]
-        scans = (self.feed.evidence_scan(frame, self.boxes) for frame in near)
-        chosen = set(block)
-        # labels that are often wrong must not split actors
-        found = find_evidence(
-            scans, movable=self.feed.classes.movable if self.feed.names_ground else ()
-        )
-        return [evidence.thinned() for evidence in found if evidence.frame in chosen]
+    times = feed.times
+    begin, end = times[block[0]] - HORIZON_S, times[block[-1]] + HORIZON_S
+    near = (frame for frame, seconds in times.items() if begin <= seconds <= end)
+    scans = (feed.evidence_scan(frame, boxes) for frame in near)
+    # labels that are often wrong must not split actors
+    movable = feed.classes.movable if feed.trusts_ground_labels else ()
+    chosen = set(block)
+    return [one.thinned() for one in find_evidence(scans, movable=movable) if one.frame in chosen]
 
 
-@dataclass(frozen=True)
-class _MakeTrack:
-    """Estimates the track of one actor, in a worker."""
-
-    times: dict[int, float]
-    deformable: frozenset[int]
-
-    def __call__(self, actor: tuple[Chain, bool | None, float]) -> Track:
-        chain, rigid, confidence = actor
-        return make_track(
-            chain, self.times, deformable=self.deformable, rigid=rigid, confidence=confidence
-        )
+def _make_track(
+    actor: tuple[Chain, bool | None, float], times: dict[int, float], deformable: frozenset[int]
+) -> Track:
+    """Estimate the track of one actor, in a worker."""
+    chain, rigid, confidence = actor
+    return make_track(chain, times, deformable=deformable, rigid=rigid, confidence=confidence)
 
 
-@dataclass(frozen=True)
-class _FollowBox:
-    """Registers the track of a box to the points in it, in a worker."""
-
-    times: dict[int, float]
-
-    def __call__(self, boxed: tuple[Track, list[Segment]]) -> Track:
-        track, segments = boxed
-        return _with_members(register_boxes(track, segments, self.times), segments)
+def _follow_box(boxed: tuple[Track, list[Segment]], times: dict[int, float]) -> Track:
+    """Register the track of a box to the points in it, in a worker."""
+    track, segments = boxed
+    return _with_members(register_boxes(track, segments, times), segments)
 
 
 @dataclass(frozen=True)
@@ -127,7 +107,7 @@ class _MotionPass:
 
     feed: ScanFeed
     run: Run
-    steps: Callable[[int], None] | None
+    steps: Callable[[int], None]
 
     def _each(
         self, function: Callable[[Item], Result], items: Sequence[Item]
@@ -137,18 +117,16 @@ class _MotionPass:
         """
         return closing(run_all(function, items, self.run))
 
-    def _count(self, scans: int) -> None:
-        if self.steps is not None:
-            self.steps(scans)
-
     def linked(self) -> list[Track]:
         """Return the tracks of the actors that flow or instances show."""
         frames, times = list(self.feed.times), self.feed.times
         linker, tracks = Linker(), list[Track]()
         if not {"flow", "instances"} & set(self.feed.motion):
             if "boxes" in self.feed.motion:  # a sequence of boxes without any box
-                self._count(len(frames))
+                self.steps(len(frames))
             return tracks
+        # Linking is in order of time and in this process; segments before it and tracks after it
+        # are made in workers. Batches bound the chains that wait for their track.
         for begin in range(0, len(frames), _BATCH):
             ended: list[Chain] = []
             with self._each(
@@ -156,7 +134,7 @@ class _MotionPass:
             ) as scans:
                 for scan in scans:
                     ended += linker.add(scan.frame, times[scan.frame], scan.segments, scan.static)
-                    self._count(1)
+                    self.steps(1)
             if begin + _BATCH >= len(frames):
                 ended += linker.finish()
             tracks += self._estimate([(linked, None, 1.0) for linked in ended])
@@ -170,11 +148,9 @@ class _MotionPass:
                 for segment in scan.segments:
                     few = replace(segment, points=thin(segment.points, _SHAPE_POINTS))
                     segments.setdefault(segment.instance, []).append(few)
-                self._count(1)
-        follow = _FollowBox(self.feed.times)
-        with self._each(
-            follow, [(track, segments.get(track.instance, [])) for track in boxes]
-        ) as tracks:
+                self.steps(1)
+        boxed = [(track, segments.get(track.instance, [])) for track in boxes]
+        with self._each(partial(_follow_box, times=self.feed.times), boxed) as tracks:
             return with_surfaces(list(tracks))
 
     def found(
@@ -182,14 +158,18 @@ class _MotionPass:
     ) -> tuple[list[Track], dict[int, NDArray[np.integer]], list[NDArray[np.float64]]]:
         """Return the tracks of found actors, and `moving` and `own` of `MovingActors`."""
         frames = list(self.feed.times)
+        # A block reads the seconds around it too: longer blocks repeat less, and shorter ones keep
+        # all processes busy.
         size = min(max(-(-len(frames) // self.run.processes), _BLOCK[0]), _BLOCK[1])
         blocks = [tuple(frames[begin : begin + size]) for begin in range(0, len(frames), size)]
 
+        find = partial(_find_evidence, feed=self.feed, boxes=boxes)
+
         def evidence() -> Iterator[FreeSpaceEvidence]:
-            with self._each(_FindEvidence(self.feed, boxes), blocks) as results:
+            with self._each(find, blocks) as results:
                 for found in chain.from_iterable(results):
                     yield found
-                    self._count(1)
+                    self.steps(1)
 
         classes = self.feed.classes
         label = 0 if self.feed.has_labels else classes.geometry_id
@@ -214,9 +194,8 @@ class _MotionPass:
         return tracks, _untracked(moved, tracks), own
 
     def _estimate(self, actors: Sequence[tuple[Chain, bool | None, float]]) -> list[Track]:
-        with self._each(
-            _MakeTrack(self.feed.times, self.feed.classes.deformable), actors
-        ) as tracks:
+        make = partial(_make_track, times=self.feed.times, deformable=self.feed.classes.deformable)
+        with self._each(make, actors) as tracks:
             return list(tracks)
 
 
@@ -235,7 +214,8 @@ def find_actors(
     Raises:
         FormatError: a scan is not valid.
     """
-    by = _MotionPass(feed, run, steps)
+    # Boxes and fields first: evidence from free space explains only what they leave unexplained.
+    by = _MotionPass(feed, run, steps or (lambda scans: None))
     boxes = _box_tracks(feed)
     moving_boxes = tuple(track for track in boxes if track.moves)
     tracks = by.boxed(boxes, moving_boxes) if boxes else by.linked()
@@ -295,27 +275,31 @@ def _box_tracks(feed: ScanFeed) -> list[Track]:
     if "boxes" not in feed.motion:
         return []
     frames = [frame for frame in feed.sequence.frames("boxes").tolist() if frame in feed.times]
-    boxes = {frame: found for frame in frames if (found := feed.sequence.boxes(frame)) is not None}
-    for frame, found in boxes.items():
-        feed.classes.check(found.labels, f"{feed.sequence.location}: boxes of frame {frame}")
+    boxes = {
+        frame: of_frame for frame in frames if (of_frame := feed.sequence.boxes(frame)) is not None
+    }
+    for frame, of_frame in boxes.items():
+        feed.classes.check(of_frame.labels, f"{feed.sequence.location}: boxes of frame {frame}")
     poses = {frame: feed.pose(frame) for frame in boxes}
     return tracks_from_boxes(boxes, poses, feed.times, deformable=feed.classes.deformable)
 
 
 def read_or_find_actors(
-    feed: ScanFeed, writer: SequenceWriter, run: Run, steps: Callable[[int], None]
+    feed: ScanFeed, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]
 ) -> MovingActors:
     """Return the actors that an earlier run kept for the same scans and options; without any, find
-    and keep them.
+    and keep them. Without a writer, nothing is kept.
     """
+    if writer is None:
+        return find_actors(feed, run, steps)
     about = {"motion": feed.motion, "min_speed_m_s": feed.options.motion.min_speed_m_s}
     key = _key_of(TRACKS, feed, **about)
     actors = read_derived(writer, TRACKS, key, MovingActors.from_bytes)
-    if actors is not None:
-        steps(feed.reads)
-        return actors
-    actors = find_actors(feed, run, steps)
-    writer.write_document(layout.derived(TRACKS, key), actors.to_bytes(key))
+    if actors is None:
+        actors = find_actors(feed, run, steps)
+        writer.write_document(layout.derived(TRACKS, key), actors.to_bytes(key))
+    else:
+        steps(feed.reads_for_actors)
     return actors
 
 
@@ -344,26 +328,22 @@ def refine_sequence(
         if steps is not None:
             steps(len(frames))
         return kept
+    # The digest of scans, not of poses, is in the key: `derived_key` adds the given poses.
     given = np.stack([feed.pose(frame) for frame in frames])
-    with closing(run_all(_ThinScan(feed), frames, run)) as scans:
+    with closing(run_all(partial(_thin_scan, feed=feed), frames, run)) as scans:
         refined = refine_poses(scans, given, always=mode == "always", steps=steps)
     if writer is not None:
         writer.write_document(layout.derived(POSES, key), refined.to_bytes(key))
     return refined
 
 
-@dataclass(frozen=True)
-class _ThinScan:
-    """Reads a scan for the refinement, in a worker."""
-
-    feed: ScanFeed
-
-    def __call__(self, frame: int) -> ThinnedScan:
-        try:
-            points = self.feed.static_points(frame)
-        except CarlascError:  # making the frame raises the same error, which is reported
-            points = np.empty((0, 3), np.float32)
-        return ThinnedScan.of(points, self.feed.pose(frame))
+def _thin_scan(frame: int, feed: ScanFeed) -> ThinnedScan:
+    """Read a scan for the refinement, in a worker."""
+    try:
+        points = feed.static_points(frame)
+    except CarlascError:  # making the frame raises the same error, which is reported
+        points = np.empty((0, 3), np.float32)
+    return ThinnedScan.of(points, feed.pose(frame))
 
 
 def _key_of(name: str, feed: ScanFeed, **settings: Any) -> str:
@@ -384,6 +364,8 @@ def with_refined_poses(
     lines = np.array(
         [sequence.line_of(frame, len(given), layout.POSES) for frame in frames.tolist()]
     )
+    # The corrections are applied on the left, in the world: the motion from a scan to a line
+    # without one stays as it was given.
     row = np.clip(np.searchsorted(lines, np.arange(len(given)), side="right") - 1, 0, None)
     correction = multiply(refined.poses, invert(refined.given))
     poses = multiply(correction[row], given)
@@ -393,18 +375,16 @@ def with_refined_poses(
 
 def pose_notes(refined: RefinedPoses, frames: NDArray[np.int64]) -> Iterator[str]:
     """Yield a line on the result of the refinement; none if the given poses are good."""
-    before, after = (value or 0.0 for value in refined.disagreements_m)
-    left = refined.left(frames)
+    before, after = (f"{100 * (value or 0.0):.1f} cm" for value in refined.disagreements_m)
+    left = ", ".join(f"{a} to {b}" for a, b in refined.left(frames)[:3])
     if refined.refined.any():
-        but = (
-            f"; those of frames {', '.join(f'{a} to {b}' for a, b in left[:3])} were left alone"
-            if left
-            else ""
-        )
-        yield f"poses were refined: neighbouring scans disagreed by {100 * before:.1f} cm, now by {100 * after:.1f} cm{but}"
+        but = f"; those of frames {left} were left alone" if left else ""
+        yield (f"poses were refined: neighbouring scans disagreed by {before}, now by {after}{but}")
     if not refined.fits.all():
         rows = np.flatnonzero(~refined.fits)
-        where = f"frames {frames[rows[0]]} to {frames[rows[-1]]}"
-        yield f"scans do not fit each other under the poses of {where}, which were not refined: check that these belong to them"
-    elif not refined.refined.any() and before > _NOTED_M:
-        yield f"poses could not be refined, although neighbouring scans disagree by {100 * before:.1f} cm"
+        yield (
+            f"scans do not fit each other under the poses of frames {frames[rows[0]]} to "
+            f"{frames[rows[-1]]}, which were not refined: check that these belong to them"
+        )
+    elif not refined.refined.any() and (refined.disagreements_m[0] or 0.0) > _NOTED_M:
+        yield (f"poses could not be refined, although neighbouring scans disagree by {before}")

@@ -38,7 +38,7 @@ from carlasc.groundtruth.inputs import (
     stored_views,
 )
 from carlasc.groundtruth.options import FromScans
-from carlasc.groundtruth.reporting.facts import PoseFacts, Residual
+from carlasc.groundtruth.reporting import PoseFacts, Residual
 from carlasc.motion import LONGEST_M, ground_points
 from carlasc.motion.odometry import estimate_poses
 from carlasc.motion.refinement import MIN_SCANS, RefinedPoses
@@ -81,6 +81,8 @@ class ScanFrame(FrameInput):
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
         feed = self.inputs.feed
+        # Only the actors of the window go to the worker: those of a long drive take megabytes, and
+        # each frame is pickled on its own.
         first, last = feed.options.window
         near = self.inputs.actors.between(self.number + first, self.number + last)
         return type(self), (ScanWindow(feed, near), self.number, self.source_frame)
@@ -108,6 +110,8 @@ class ScanFrame(FrameInput):
         """Return the grid without every tenth of the scans of other frames."""
         feed = self.inputs.feed
         window = feed.reaching(self.number, plan.spec)
+        # Every tenth one, from the middle of the first ten: never the scan of the frame itself,
+        # which says most about its grid.
         others = [frame for frame in window if frame != self.number]
         left_out = set(others[_TENTH // 2 :: _TENTH])
         kept = [frame for frame in window if frame not in left_out]
@@ -117,7 +121,8 @@ class ScanFrame(FrameInput):
         """Return how well the observations of the moving actors in the frame align with the next
         ones, by number of the actor.
         """
-        feed, frame, found = self.inputs.feed, self.number, {}
+        feed, frame, by_actor = self.inputs.feed, self.number, {}
+        # Later scans in the window only: a worker has no others of a track.
         last = frame + feed.options.window[1]
         for number, track in self.inputs.actors.tracks.items():
             later = min((other for other in track.members if frame < other <= last), default=None)
@@ -134,8 +139,8 @@ class ScanFrame(FrameInput):
                 )
                 for f, members in ((frame, own), (later, others))
             )
-            found[number] = Residual.between(one, other, here, there)
-        return found
+            by_actor[number] = Residual.between(one, other, here, there)
+        return by_actor
 
 
 class ScanSequence(StoredSequence):
@@ -192,11 +197,13 @@ class ScanSequence(StoredSequence):
         """Number of scans that the passes before the grids read: to refine poses, and to find
         actors.
         """
-        return self.feed.reads + (len(self.feed.frames) if self.refines else 0)
+        return self.feed.reads_for_actors + (len(self.feed.frames) if self.refines else 0)
 
-    def prepare(self, writer: SequenceWriter, run: Run, steps: Callable[[int], None]) -> None:
+    def prepare(
+        self, writer: SequenceWriter | None, run: Run, steps: Callable[[int], None]
+    ) -> None:
         """Refine the poses of the sequence, and find its actors, or read the results of an earlier
-        run.
+        run with `writer`.
         """
         self.refine(writer, run, steps)
         if self.feed.needs_actors:
@@ -218,7 +225,7 @@ class ScanSequence(StoredSequence):
             return
         self.refined = refine_sequence(self.feed, writer, run, steps)
         if self.refined.refined.any():
-            self.feed = self.feed.under(
+            self.feed = self.feed.with_poses_of(
                 with_refined_poses(self.posed, self.feed.frames, self.refined)
             )
 
@@ -232,16 +239,12 @@ class ScanSequence(StoredSequence):
 
     def record(self) -> dict[str, Any]:
         """Return how scans are merged."""
-        options = self.options
-        record: dict[str, Any] = {
-            "observe": "scans",
-            "motion": "+".join(self.feed.motion) or "none",
-        }
-        record |= {"dynamic": options.dynamic}
-        if options.dynamic == "align":
-            record |= {"complete": options.complete}
-        if not options.own_path:
-            record |= {"own_path": False}
+        # Values that change nothing are left out: runs with and without them continue each other.
+        options, record = self.options, dict[str, Any]()
+        motion = "+".join(self.feed.motion) or "none"
+        record |= {"observe": "scans", "motion": motion, "dynamic": options.dynamic}
+        record |= {"complete": options.complete} if options.dynamic == "align" else {}
+        record |= {} if options.own_path else {"own_path": False}
         record |= {"rays": options.rays} if options.rays != "all" else {}
         record |= {"poses": "kiss-icp"} if self.estimates_poses else {}
         record |= {"refine": options.poses.refine} if self.refines else {}
@@ -293,14 +296,16 @@ class ScanSequence(StoredSequence):
         )
         if self.feed.has_labels and not self.feed.motion and self.options.dynamic != "tube":
             notes.append(f"{where}: no field shows motion: all points were treated as static")
-        found = sum(track.instance >= FIRST_FOUND for track in self.actors.tracks.values())
+        actors = sum(track.instance >= FIRST_FOUND for track in self.actors.tracks.values())
         left_out = sum(len(points) for points in self.actors.moving.values())
-        if "evidence" in self.feed.motion and (found or left_out):
+        if "evidence" in self.feed.motion and (actors or left_out):
             doubtful = sum(
                 is_doubtful(actor["confidence"]) for actor in self.actors.summary if actor["moves"]
             )
-            shown = [f"{found} actors that move ({doubtful} of them doubtful)"] if found else []
-            shown += [f"{left_out} {'more ' if found else ''}points that moved"] if left_out else []
+            shown = [f"{actors} actors that move ({doubtful} of them doubtful)"] if actors else []
+            shown += (
+                [f"{left_out} {'more ' if actors else ''}points that moved"] if left_out else []
+            )
             out = ": these points were left out of other frames" if left_out else ""
             notes.append(
                 f"{where}: free space shows {' and '.join(shown)}, although no field of the data "
@@ -325,22 +330,20 @@ class ScanSequence(StoredSequence):
         Scans that cannot be read are skipped here.
         """
         feed, spec = self.feed, self.plan.spec
-        chosen = feed.frames[
-            np.unique(np.linspace(0, len(feed.frames) - 1, _LOOKED_AT).astype(int))
-        ]
+        # the first, the last, and the one in the middle
+        rows = np.unique(np.linspace(0, len(feed.frames) - 1, _LOOKED_AT).astype(int))
         heights = [np.empty(0, np.float32)]
-        for frame in chosen.tolist():
+        for frame in feed.frames[rows].tolist():
             try:
-                scan = feed.sequence.scan(frame, () if feed.finds_ground else ("labels",))
+                scan = feed.sequence.scan(frame, () if feed.must_find_ground else ("labels",))
             except CarlascError:
                 continue
             points, labels, classes = scan.points, scan.labels, sorted(feed.classes.ground)
             ground = (
                 ground_points(points) if labels is None or not classes else np.isin(labels, classes)
             )
-            heights.append(
-                points[ground & (np.hypot(points[:, 0], points[:, 1]) < abs(spec.upper[0])), 2]
-            )
+            ground &= np.hypot(points[:, 0], points[:, 1]) < abs(spec.upper[0])
+            heights.append(points[ground, 2])
         below = np.concatenate(heights) < spec.lower[2]
         return float(below.mean()) if len(below) else 0.0
 
@@ -435,8 +438,10 @@ def check_trajectory(sequence: Sequence, options: FromScans) -> None:
 
 def _check_speed(sequence: Sequence, frames: NDArray[np.int64], where: str) -> None:
     poses = np.stack([sequence.read_pose(int(frame)) for frame in frames])
+    # Speeds, not distances: frames may be missing, and then the distance is longer.
     elapsed_s = np.diff(sequence.times_of(frames))
     speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / elapsed_s
+    # The trace of R1' R0 is 1 + 2 cos(angle) of the rotation between them.
     traces = np.einsum("fij,fij->f", poses[1:, :3, :3], poses[:-1, :3, :3])
     turn = np.arccos(np.clip((traces - 1) / 2, -1, 1)) / elapsed_s
     jumps = np.flatnonzero((speed > _MAX_SPEED_M_S) | (turn > _MAX_TURN_RAD_S))

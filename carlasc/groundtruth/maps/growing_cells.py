@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from carlasc.storage.cloud_files import POINT_DTYPE
+from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE
 
 Part = tuple[int, int, int]
 """Cells that are kept together: a group (`STATIC`, or the number of an actor), and x and y of a

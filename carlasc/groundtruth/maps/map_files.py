@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 from carlasc.core.classes import ClassTable
 from carlasc.core.grids import Grid
 from carlasc.errors import ArgumentError, ConflictError, import_extra
-from carlasc.storage.cloud_files import POINT_ENDINGS, PointPieces, write_octomap, write_points
+from carlasc.groundtruth.maps.cloud_files import (
+    POINT_ENDINGS,
+    PointPieces,
+    write_octomap,
+    write_points,
+)
 from carlasc.storage.files import write_output, writing
 
 OCTOMAP = ".bt"
@@ -108,9 +113,12 @@ class MapFiles:
                 found=", ".join(map(str, paths.values())),
             )
         if distance is not None and grid is None:
-            advice = "scans alone do not tell free space from unknown space: make a grid with `carlasc regrid`"
             raise ArgumentError(
-                "distance", expected="the `grid` whose voxels it is of", found="none", advice=advice
+                "distance",
+                expected="the `grid` whose voxels it is of",
+                found="none",
+                advice="scans alone do not tell free space from unknown space: make a grid with "
+                "`carlasc regrid`",
             )
         if actors and (
             grid is not None or "out" not in paths or paths["out"].suffix.lower() == OCTOMAP
@@ -224,11 +232,11 @@ class SurfaceMesh:
             0,
         )
         for corner, volume in _blocks(cells, labels):
-            found, triangles, own = _march(volume)
-            nodes.append(found + _STEPS * corner)
+            vertices, triangles, own = _march(volume)
+            nodes.append(vertices + _STEPS * corner)
             faces.append(triangles + count)
             classes.append(own)
-            count += len(found)
+            count += len(vertices)
         whole, first, place = np.unique(
             np.concatenate(nodes), axis=0, return_index=True, return_inverse=True
         )
@@ -291,16 +299,16 @@ def _march(
     measure = import_extra("skimage.measure", "mesh")
     if not volume.any():
         return np.empty((0, 3), np.int64), np.empty((0, 3), np.int64), np.empty(0, np.int64)
-    found, triangles, _, _ = measure.marching_cubes(
+    vertices, triangles, _, _ = measure.marching_cubes(
         (volume > 0).astype(np.float32), 0.5, gradient_direction="ascent"
     )
-    ends = np.stack([np.floor(found), np.ceil(found)]).astype(np.int64)
-    labels = np.zeros(len(found), np.int64)
+    ends = np.stack([np.floor(vertices), np.ceil(vertices)]).astype(np.int64)
+    labels = np.zeros(len(vertices), np.int64)
     # one corner is occupied: most vertices are on edges of a cube
     for corner in np.ndindex(2, 2, 2):
         near = volume[tuple(ends[side, :, axis] for axis, side in enumerate(corner))]
         labels = np.maximum(labels, near)
-    return np.rint(_STEPS * found).astype(np.int64), triangles.astype(np.int64), labels
+    return np.rint(_STEPS * vertices).astype(np.int64), triangles.astype(np.int64), labels
 
 
 def write_distances(path: str | os.PathLike[str], grid: Grid) -> None:

@@ -24,9 +24,9 @@ from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError, MissingDataError
 from carlasc.groundtruth.from_scans.feed import ScanFeed, WithoutScans
 from carlasc.groundtruth.from_scans.merging import Merger
-from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanSequence, scan_sequences
 from carlasc.groundtruth.inputs import GridPlan, choose_frames
+from carlasc.groundtruth.maps.cloud_files import POINT_DTYPE, PointPieces, write_points
 from carlasc.groundtruth.maps.growing_cells import (
     STATIC,
     GrowingCells,
@@ -43,7 +43,6 @@ from carlasc.motion.tracks import MovingActors
 from carlasc.running.processes import one_pool, run_all
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
-from carlasc.storage.cloud_files import POINT_DTYPE, PointPieces, write_points
 from carlasc.storage.files import to_json, write_atomic, writing
 from carlasc.storage.protocol import Sequence, Source
 
@@ -210,9 +209,7 @@ class DriveMap:
         progress = StepCounter(run.progress, inputs.steps_before + len(self.frames))
         progress(0)
         with one_pool(run) as pool:
-            inputs.refine(None, pool, progress)
-            if inputs.feed.needs_actors:
-                inputs.actors = find_actors(inputs.feed, pool, progress)
+            inputs.prepare(None, pool, progress)
             blocks = [
                 tuple(self.frames[first : first + _BLOCK])
                 for first in range(0, len(self.frames), _BLOCK)
@@ -311,8 +308,8 @@ class _AddScans:
     ) -> list[tuple[Part, NDArray[Any]]]:
         frames, actors = block
         merger = Merger(self.feed.read, actors, self.feed.classes, "align")
-        found = [rows for frame in frames for rows in self._rows(merger, frame)]
-        parts, rows = zip(*found, strict=True)
+        of_scans = [rows for frame in frames for rows in self._rows(merger, frame)]
+        parts, rows = zip(*of_scans, strict=True)
         return split(np.concatenate(parts), np.concatenate(rows))
 
     def _rows(self, merger: Merger, frame: int) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
@@ -321,7 +318,7 @@ class _AddScans:
         """
         feed, scan = self.feed, self.feed.read(frame)
         labels, static = merger.labels(frame), merger.static(frame)
-        if feed.finds_ground:  # ground that was found had a class for the votes only
+        if feed.must_find_ground:  # ground that was found had a class for the votes only
             labels[np.isin(labels, sorted(feed.classes.ground))] = feed.classes.geometry_id
         world = transform_points(scan.world_T_sensor, scan.points.astype(np.float64))
         chosen: list[tuple[int, NDArray[Any], NDArray[np.float64]]] = [

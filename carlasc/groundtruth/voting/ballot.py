@@ -25,9 +25,10 @@ from carlasc.errors import ArgumentError, FormatError
 from carlasc.storage.field_files import VOTES_DTYPE, WIDE_VOTES_DTYPE
 
 _MOST_VOTES = int(np.iinfo(VOTES_DTYPE["votes"]).max)
-_ALL, _ALL_ONE = np.empty(0, np.bool_), np.empty(0, np.uint8)
-_ALL_SURE, _NONE = np.empty(0, np.float32), np.empty(0, np.int64)
-_FEW = 8  # voxels are few if they are so many times fewer than all
+_NONE = np.empty(0, np.int64)
+# Voxels outside of a region are few if they are so many times fewer than all: then it is faster to
+# count every sample and to restore these voxels afterwards than to look up the region of each one.
+_FEW = 8
 NOWHERE = 65534
 """A region without voxels: rays with it do not vote."""
 OCCUPIED_DTYPE = np.dtype(
@@ -191,6 +192,7 @@ class Ballot:
         count_views: bool = False,
         keep_boxes: bool = False,
     ) -> None:
+        # Numba is loaded here, not with the module: options of commands import names of rules only.
         from carlasc.core.cells import Cells
         from carlasc.groundtruth.voting import filled, kernel
 
@@ -207,6 +209,8 @@ class Ballot:
         )
         self.num_observations = 0
         once = rule == "sensor"
+        # The arrays of free space have one element more than there are voxels: samples outside of
+        # the grid count there, so that the inner loop needs no branch.
         viewed = spec.num_voxels + 1 if count_views else 0
         self._cells, self._outside = Cells.of(spec), dict[int, NDArray[np.int64]]()
         self._boxes = filled.no_boxes(spec.num_voxels) if keep_boxes else None
@@ -251,17 +255,11 @@ class Ballot:
         ends = np.array([len(observation)]) if observation.ends is None else observation.ends
         self._make_room(len(observation))
         cast = kernel.Voters(
-            np.require(observation.points, np.float32, ["C", "A", "W"]).reshape(-1),
-            np.require(observation.labels, np.uint16, ["C", "A", "W"]),
-            _ALL
-            if observation.hits is None
-            else np.require(observation.hits, np.bool_, ["C", "A", "W"]),
-            _ALL_SURE
-            if observation.sure is None
-            else np.require(observation.sure, np.float32, ["C", "A", "W"]),
-            _ALL_ONE
-            if observation.weights is None
-            else np.require(observation.weights, np.uint8, ["C", "A", "W"]),
+            _ready(observation.points, np.float32).reshape(-1),
+            _ready(observation.labels, np.uint16),
+            _ready(observation.hits, np.bool_),
+            _ready(observation.sure, np.float32),
+            _ready(observation.weights, np.uint8),
             np.ascontiguousarray(observation.grid_T_sensor, np.float64)
             .reshape(-1, 16)[:, :12]
             .copy(),
@@ -279,6 +277,7 @@ class Ballot:
         )
         if self._boxes is not None:
             filled.widen_boxes(cast, self._cells, hit_region, self._tally.regions, self._boxes)
+        # Each origin of rays is a voter, with a number of its own: `once` compares these numbers.
         self.num_observations += len(ends)
 
     def _apart(self, region: int) -> NDArray[np.int64]:
@@ -308,15 +307,9 @@ class Ballot:
 
         return self._tally.heads != kernel.NONE
 
-    def seen(self, voxels: NDArray[np.integer] | slice = slice(None)) -> NDArray[np.bool_]:
-        """Return (N,) bool: which of (N,) voxels, flat indices, have votes; by default of all
-        voxels.
-        """
-        from carlasc.groundtruth.voting import kernel
-
-        seen: NDArray[np.bool_] = self._tally.heads[voxels] != kernel.NONE
-        seen |= self._tally.free[:-1][voxels] > 0
-        return seen
+    def seen(self) -> NDArray[np.bool_]:
+        """Return (V,) bool: which voxels have votes."""
+        return self.hit | (self._tally.free[:-1] > 0)
 
     def votes(self, *, copy: bool = True) -> Votes:
         """Return the votes so far.
@@ -327,6 +320,8 @@ class Ballot:
         """
         from carlasc.groundtruth.voting import kernel
 
+        # The lists of candidates are in the order of their first votes; `collect` sorts them, so
+        # that rows do not depend on the order of observations.
         candidates = self._tally.candidates[: self._tally.used[0]]
         occupied = np.empty(len(candidates), OCCUPIED_DTYPE)
         kernel.collect(self._tally.heads, candidates, occupied)
@@ -338,11 +333,20 @@ class Ballot:
         """Make room for one more candidate per point, which is the most that an observation can
         add.
         """
+        # The compiled loops cannot grow an array. Doubling copies each candidate once on average.
         used, candidates = int(self._tally.used[0]), self._tally.candidates
         if used + points > len(candidates):
             grown = np.empty(2 * (used + points), candidates.dtype)
             grown[:used] = candidates[:used]
             self._tally = self._tally._replace(candidates=grown)
+
+
+def _ready(values: NDArray[Any] | None, dtype: type[np.generic]) -> NDArray[Any]:
+    """Return an array as the compiled loops take it; empty for None.
+
+    Numba compiles a loop again for each layout of its arrays, read-only ones too.
+    """
+    return np.empty(0, dtype) if values is None else np.require(values, dtype, ["C", "A", "W"])
 
 
 @dataclass(frozen=True, eq=False)

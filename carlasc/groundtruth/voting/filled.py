@@ -37,6 +37,8 @@ def widen_boxes(
         boxes: (V, 6) uint8; widened: first and last x, y, z in 1/256 of a voxel, from its lower
             corner.
     """
+    # The rule of `find_voxel`, whose quotients are needed here too. Points that rounding puts
+    # beyond the last cell widen no box.
     points, labels, hits, _, _, poses, ends = cast
     scaled, begin = np.empty(3), 0
     for place in range(len(ends)):

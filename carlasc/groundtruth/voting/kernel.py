@@ -139,6 +139,7 @@ def vote_occupied(
     """Add the votes of the points of a block for their classes, in the voxels of a region; `hits`
     chooses points, unless it is empty.
     """
+    # `entry` is the candidate of the pair (last, label) for which the point before voted.
     entry, last, label = 0, NONE, np.uint16(0)
     for i in range(len(labels)):
         if rays.state[i] == DROPPED or (len(hits) and not hits[i]):
@@ -156,6 +157,7 @@ def vote_occupied(
                 count_view(voxel, voter, tally)
             elif not tally.once:  # neighbouring points are often in one voxel
                 tally.candidates[entry].votes += weight
+            # The doubt is summed, not the certainty: it is 0 for labels without probabilities.
             if len(sure):
                 tally.candidates[entry].doubt += np.float32(weight) * (np.float32(1) - sure[i])
 
@@ -173,6 +175,8 @@ def vote_for(voxel: int, label: int, weight: int, voter: int, tally: Tally) -> i
         candidates[entry].votes = candidates[entry].voters = 0
         candidates[entry].doubt = 0
         candidates[entry].voxel = voxel
+        # A new candidate becomes the head of the list: classes seen last are looked up first, and
+        # points that follow each other often have one class.
         candidates[entry].next = tally.heads[voxel]
         candidates[entry].voter = NONE
         candidates[entry].label = label
@@ -218,6 +222,8 @@ def vote_free(
         while step <= last:
             # These loops are inline: in a function, Numba would count a reference to the array at
             # every call.
+            # A whole chunk is computed also at the end of a ray, without a branch; `number` leaves
+            # out the samples after the last one.
             lowest = np.int32(0)
             if view.cylindrical:
                 for j in range(CHUNK):
@@ -230,6 +236,7 @@ def vote_free(
                     voxels[j] = place_cartesian(x - back * dx, y - back * dy, z - back * dz, view)
                     lowest = min(lowest, voxels[j])
             number = int(min(float(CHUNK), last - step + 1.0))
+            # DOUBTFUL is the only negative index: the lowest one says whether any is.
             if lowest == DOUBTFUL:
                 for j in range(number):
                     if voxels[j] == DOUBTFUL:
@@ -281,6 +288,7 @@ def vote_free_by_rule(
         step, last = narrow(
             step, last, starts[axis], stride, view.low[axis] - slack, view.high[axis] + slack
         )
+    # The range is wider than needed; the rule decides for each sample.
     step = np.floor(step)
     kept = step < 2.0**52  # above it, step + 1 may be equal to step
     while kept and step <= last + 1.0:
@@ -317,21 +325,23 @@ def vote(
         tally: the votes so far, with room for N more candidates.
     """
     points, labels, hits, sure, weights, poses, ends = cast
-    rays, found, begin = empty_rays(BLOCK), np.empty(BLOCK, np.int32), 0
+    rays, voxels, begin = empty_rays(BLOCK), np.empty(BLOCK, np.int32), 0
+    # The votes of the voxels of `apart` before this observation.
     kept = tally.free[apart]
     for place in range(len(ends)):
         p = poses[place]
         pose = (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11])
         view = view_from(pose, cells)
+        # Blocks fit into the cache: what one of the passes over a block writes, the next one reads.
         while begin < ends[place]:
             end = min(begin + BLOCK, ends[place])
             corner, block = points[3 * begin : 3 * end], labels[begin:end]
             clip(corner, block, free_step_m, view, rays)
-            place_points(rays, view, found[: end - begin])
+            place_points(rays, view, voxels[: end - begin])
             own, likely, count = hits[begin:end], sure[begin:end], weights[begin:end]
             now = voter + place
             vote_occupied(
-                corner, block, own, likely, count, rays, found, pose, cells, now, hit_region, tally
+                corner, block, own, likely, count, rays, voxels, pose, cells, now, hit_region, tally
             )
             if free_region != NOT_AT_ALL:
                 counted = ANYWHERE if len(apart) else free_region
@@ -379,6 +389,7 @@ def collect(heads: NDArray[np.int32], candidates: NDArray[Any], rows: NDArray[An
     end = 0
     for head in heads:
         begin, entry = end, head
+        # Insertion sort: rows from `begin` to `end` are sorted by label. Lists are short.
         while entry != NONE:
             row = end
             while row > begin and rows[row - 1].label > candidates[entry].label:
@@ -407,6 +418,7 @@ def elect(rows: NDArray[Any], labels: NDArray[Any], counts: NDArray[Any]) -> Non
     row = 0
     while row < len(rows):
         voxel = rows[row].voxel
+        # Labels rise within a voxel, and only more votes replace a class: ties go to the lowest.
         label, most = np.uint16(0), np.int64(counts[voxel])
         while row < len(rows) and rows[row].voxel == voxel:
             votes = rows[row].votes
@@ -430,6 +442,7 @@ def interleave(free: NDArray[Any], rows: NDArray[Any], votes: NDArray[Any], most
     """
     row, end = 0, 0
     for voxel in range(len(free)):
+        # `row` is the first row of this voxel or of a later one; free space is label 0, the lowest.
         if free[voxel]:
             votes[end].voxel, votes[end].label, votes[end].votes = (
                 voxel,

@@ -51,6 +51,7 @@ _NEAR_AXIS = 256.0
 @inlined
 def unit_ray(x: Real, y: Real, z: Real) -> tuple[Real, Real, Real, Real]:
     """Return the norm of a point and the unit ray to it, all float32."""
+    # Points are float32, and NumPy computes with them in float32: the published grids were made so.
     norm = np.sqrt(x * x + y * y + z * z)
     return norm, x / norm, y / norm, z / norm
 
@@ -207,6 +208,8 @@ def narrow(
     The range is empty if there is no such step. A coordinate that stays on a bound (0 / 0) does not
     change the range.
     """
+    # Comparisons with NaN are false, so 0 / 0 leaves both ends as they are. One division and two
+    # products are faster than two divisions, and the margin of the box covers the rounding.
     inverse = 1.0 / stride
     a, b = (start - low) * inverse, (start - high) * inverse
     near, far = (a, b) if a < b else (b, a)
@@ -230,6 +233,8 @@ def clip(
         norm, ux, uy, uz = unit_ray(x, y, z)
         cx, cy, cz = transform(view.pose, x, y, z)
         ox, oy, oz = view.pose[3], view.pose[7], view.pose[11]
+        # The transform of the unit ray minus the position of the sensor is the direction of the
+        # ray.
         px, py, pz = transform(view.pose, ux, uy, uz)
         dx, dy, dz = (px - ox) * free_step_m, (py - oy) * free_step_m, (pz - oz) * free_step_m
 
@@ -277,6 +282,8 @@ def place_cylindrical(x: float, y: float, w: float, view: GridView) -> np.int32:
     """Return the voxel of a sample given in metres in x and y, and cells in z, as `place_cartesian`
     does.
     """
+    # Near the axis, a small error of x or y is a large one of the azimuth: `off` of 1 makes these
+    # samples DOUBTFUL.
     radius = np.sqrt(x * x + y * y)
     v = fast_azimuth(x, y) * view.scale[1] - view.offset[1]
     off = from_middle(v)
@@ -290,6 +297,7 @@ def voxel_of(u: float, v: float, w: float, off: float, view: GridView) -> np.int
     """Return the voxel of a sample given in cells; DOUBTFUL also if `off`, a distance from the
     middle of a cell, is too large.
     """
+    # Only selections, no branches: the loop over a chunk is vectorised then.
     i, j, k = np.floor(u), np.floor(v), np.floor(w)
     a, b, c = from_middle(u), from_middle(v), from_middle(w)
     a = a if a > b else b

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.groundtruth.reporting.report import Report
+from carlasc.groundtruth.reporting import Report
 from carlasc.inspection.cards.licenses import License, LicensedPart, licensed_parts
 from carlasc.inspection.overview import GridOverview, Overview, info
 from carlasc.inspection.reports import report_beside

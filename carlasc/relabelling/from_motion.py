@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,15 +15,14 @@ from carlasc.core.frames import FrameRange
 from carlasc.core.geometry import invert, rotate_vectors, transform_points
 from carlasc.core.grids import GridSpec
 from carlasc.errors import ArgumentError
-from carlasc.groundtruth.from_scans.actor_voxels import velocity_at, with_numbers
+from carlasc.groundtruth.from_scans.actor_voxels import velocity_at
 from carlasc.groundtruth.from_scans.feed import ScanFeed
-from carlasc.groundtruth.from_scans.motion_pass import find_actors
 from carlasc.groundtruth.from_scans.sequences import ScanSequence
 from carlasc.groundtruth.inputs import GridPlan
 from carlasc.groundtruth.options import FromScans, Voting
 from carlasc.motion.ground import ground_points
 from carlasc.motion.tracks import MovingActors, Track
-from carlasc.running.processes import one_pool
+from carlasc.relabelling.copies import timed, write_in_stages
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.derived_copies import (
@@ -98,12 +97,7 @@ def label_motion(
         )
     source = as_source(source)
     given = sequences_with_scans(source)
-    plan = GridPlan(
-        GridSpec.published(), layout.EVALUATION, observe, Voting(keep_actors=True), FrameRange()
-    )
-    inputs = {path: ScanSequence(one, plan, observe) for path, one in given.items()}
-    for one in inputs.values():
-        _ = one.feed.motion  # raises errors before anything is written
+    inputs = scan_sequences_of(given, observe)
     copy = DerivedCopy.begin(
         source,
         out,
@@ -113,75 +107,65 @@ def label_motion(
         overwrite=overwrite,
         run=run,
     )
+
+    def find(
+        path: str, writer: SequenceWriter | None, pool: Run, step: StepCounter
+    ) -> _MovingSequence:
+        inputs[path].prepare(writer, pool, step)
+        return _MovingSequence(given[path], inputs[path].feed, inputs[path].actors)
+
     scans = sum(one.steps_before for one in inputs.values())
-    files = sum(
-        len(one.frames("points" if name in _WRITTEN else name))
-        for one in given.values()
-        for name in {name for name in one.fields() if "/" not in name} | set(_WRITTEN)
-    )
-    step, moving, notes = (
-        StepCounter(run.progress, scans + files),
-        dict[str, _MovingSequence](),
-        list[str](),
-    )
-    with one_pool(run) as pool:
-        for path, one in inputs.items():
-            find_moving(one, copy.writer(path), pool, step)
-            moving[path] = _MovingSequence(given[path], one.feed, one.actors)
-            notes += [note for note in one.notes() if "grids" not in note]
-        tables = {
-            one.metadata.classes.name for one in given.values() if not one.metadata.classes.standing
-        }
-        if tables and any("labels" in one.fields() for one in given.values()):
-            found = (
-                f"the classes {', '.join(sorted(tables))} do not separate moving and static actors"
-            )
-            notes.append(f"{found}: labels do not change; instances and flow show motion")
-        after = replace(pool, progress=step.stage(files))
-        copied = copy.write(moving, after)
+    moving, copied = write_in_stages(copy, given, find, run, scans=scans, made=_WRITTEN)
+    notes = [note for one in inputs.values() for note in one.notes() if "grids" not in note]
+    tables = [one.metadata.classes for one in given.values()]
+    lacking = sorted({table.name for table in tables if not table.standing})
+    if lacking and any("labels" in one.fields() for one in given.values()):
+        notes.append(
+            f"the classes {', '.join(lacking)} do not separate moving and static actors: labels do "
+            f"not change; instances and flow show motion"
+        )
     return MotionResult(
-        **vars(copied) | {"elapsed_s": time.perf_counter() - began},
+        **timed(copied, began),
         actors=sum(len(set(one.actors.numbers.values())) for one in moving.values()),
         notes=notes,
     )
 
 
-def find_moving(
-    inputs: ScanSequence, writer: SequenceWriter | None, run: Run, step: Callable[[int], None]
-) -> None:
-    """Find the actors of a sequence, or read the result that an interrupted run kept with `writer`."""
-    if writer is not None:
-        inputs.prepare(writer, run, step)
-        return
-    inputs.refine(None, run, step)
-    inputs.actors = with_numbers(find_actors(inputs.feed, run, step), inputs.feed)
+def scan_sequences_of(given: Mapping[str, Sequence], observe: FromScans) -> dict[str, ScanSequence]:
+    """Return sequences whose actors can be found and numbered, by path.
+
+    It raises the errors of their poses, times and fields, before anything is written.
+    """
+    voting = Voting(keep_actors=True)
+    plan = GridPlan(GridSpec.published(), layout.EVALUATION, observe, voting, FrameRange())
+    inputs = {path: ScanSequence(one, plan, observe) for path, one in given.items()}
+    for one in inputs.values():
+        _ = one.feed.motion
+    return inputs
 
 
 class _MovingSequence(DerivedSequence):
     """A sequence with the instances and the flow of the actors that were found."""
 
     def __init__(self, whole: Sequence, feed: ScanFeed, actors: MovingActors) -> None:
-        extra = {
-            **whole.metadata.extra,
-            "motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}",
-        }
+        words = {"motion": f"{_FOUND}{' and '.join(feed.motion) or 'nothing'}"}
+        metadata = replace(whole.metadata, extra={**whole.metadata.extra, **words})
         made = dict.fromkeys(_WRITTEN, whole.frames("points"))
         if whole.metadata.classes.standing and "labels" in whole.fields():
             made["labels"] = whole.frames("labels")
-        texts = {layout.METADATA: replace(whole.metadata, extra=extra).to_json()}
-        super().__init__(whole, texts, made=made)
+        super().__init__(whole, {layout.METADATA: metadata.to_json()}, made=made)
         self._feed, self.actors = feed, actors
 
     def make(self, frame: int) -> dict[str, NDArray[Any]]:
         """Return the new fields of a frame, and its labels if they change."""
         instances, flow = points_of_actors(self._feed, self.actors.between(frame, frame), frame)
-        found: dict[str, NDArray[Any]] = {"instances": instances, "flow": flow}
+        fields: dict[str, NDArray[Any]] = {"instances": instances, "flow": flow}
         if frame in self.made.get("labels", ()):
             labels = self.whole.read("labels", frame).astype(np.uint32)
             for moving, standing in self.whole.metadata.classes.standing.items():
                 labels[(labels == standing) & flow.any(axis=1)] = moving
-            found["labels"] = labels
-        return found
+            fields["labels"] = labels
+        return fields
 
 
 def points_of_actors(
@@ -199,61 +183,39 @@ def points_of_actors(
     """
     fields = {"labels", "instances"} & feed.sequence.fields()
     scan, pose = feed.sequence.scan(frame, tuple(sorted(fields))), feed.pose(frame)
-    moving = {track.instance for track in actors.tracks.values()}
-    numbers = (
-        np.zeros(len(scan), np.uint32)
-        if scan.instances is None
-        else scan.instances.astype(np.uint32)
-    )
-    numbers[np.isin(numbers, list(moving))] = 0  # points of moving actors get the numbers of tracks
+    moving = [track.instance for track in actors.tracks.values()]
+    numbers = np.zeros(len(scan), np.uint32)
+    if scan.instances is not None:  # points of moving actors get the numbers of tracks
+        numbers[:] = np.where(np.isin(scan.instances, moving), 0, scan.instances)
     flow, world = np.zeros((len(scan), 3)), transform_points(pose, scan.points)
     classes = feed.classes
-    if scan.labels is not None and feed.names_ground and classes.ground:
+    if scan.labels is not None and feed.trusts_ground_labels and classes.ground:
         ground = np.isin(scan.labels, sorted(classes.ground))
     else:
         ground = ground_points(scan.points)
         if scan.labels is not None:  # wheels are near the ground, but not ground
             ground &= ~np.isin(scan.labels, sorted(classes.movable))
     if "boxes" in feed.sequence.fields() and (boxes := feed.sequence.boxes(frame)) is not None:
-        static = boxes.select(~np.isin(boxes.tracks, list(moving)))
+        static = boxes.select(~np.isin(boxes.tracks, moving))
         row = static.owners(scan.points)
         boxed = (row >= 0) & (numbers == 0) & ~ground
         numbers[boxed] = static.tracks[row[boxed]]
-    rows = _Rows(scan.points)
+    # Merging leaves out some points and sorts the others. Points are found again by their
+    # coordinates: equal points have the same place among all points in order.
+    both = np.concatenate([scan.points, feed.read(frame).points])
+    order, is_new = np.lexsort(both.T), np.ones(len(both), np.bool_)
+    is_new[1:] = (both[order[1:]] != both[order[:-1]]).any(axis=1)
+    place = np.empty(len(both), np.int64)
+    place[order] = np.cumsum(is_new)
+    of_scan, of_merged = np.split(place, [len(scan)])
     tracks = [(n, t) for n, t in actors.tracks.items() if t.pose(frame) is not None]
     for number, track in sorted(tracks, key=lambda item: -float(np.prod(item[1].size))):
         own = _inside(track, frame, world) & ~ground
-        if track.members.get(frame) is not None:
-            own[rows.of(feed.read(frame).points[track.members[frame]])] = True
+        own |= np.isin(of_scan, of_merged[track.members.get(frame, [])])
         velocity = rotate_vectors(invert(pose), velocity_at(track, frame, world[own], feed))
         is_fast = np.square(velocity).sum(axis=1) > feed.options.motion.min_speed_m_s**2
         numbers[own], flow[own] = actors.numbers[number], np.where(is_fast[:, None], velocity, 0)
     return numbers, flow.astype(np.float32)
-
-
-class _Rows:
-    """Finds points of a scan by their coordinates, after merging left out some points and sorted
-    others.
-    """
-
-    def __init__(self, points: NDArray[np.float32]) -> None:
-        keys = _keys(points)
-        self._order = np.argsort(keys, kind="stable")
-        self._sorted = keys[self._order]
-
-    def of(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the indices of all points of the scan with the coordinates of (M, 3) points."""
-        keys = np.unique(_keys(points))
-        first, last = (np.searchsorted(self._sorted, keys, side) for side in ("left", "right"))
-        found = [
-            self._order[begin:end] for begin, end in zip(first.tolist(), last.tolist(), strict=True)
-        ]
-        return np.concatenate([np.empty(0, np.int64), *found])
-
-
-def _keys(points: NDArray[np.float32]) -> NDArray[Any]:
-    rows = np.ascontiguousarray(points[:, :3], "<f4")
-    return rows.view([("", rows.dtype)] * 3).reshape(-1)
 
 
 def _inside(track: Track, frame: int, world: NDArray[np.float64]) -> NDArray[np.bool_]:

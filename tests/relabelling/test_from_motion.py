@@ -126,10 +126,12 @@ def test_classes_of_what_moves_are_used_where_the_table_has_them_and_reach_the_f
 
 def test_what_exists_is_replaced_only_if_this_made_it(numbered, tmp_path):
     folder, _ = numbered
-    with pytest.raises(ConflictError, match="expected a new path"):
+    with pytest.raises(ConflictError) as error:
         carlasc.label_motion(folder / "in", folder / "out", run=ONE)
-    with pytest.raises(ConflictError, match="a data set with motion found by carlasc to overwrite"):
+    assert error.value.expected == "a new path"
+    with pytest.raises(ConflictError) as error:
         carlasc.label_motion(folder / "out", folder / "in", overwrite=True, run=ONE)
+    assert error.value.expected == "a data set with motion found by carlasc to overwrite"
 
 
 @pytest.mark.parametrize(
@@ -137,8 +139,9 @@ def test_what_exists_is_replaced_only_if_this_made_it(numbered, tmp_path):
 )
 def test_something_must_show_what_moves(numbered, options):
     folder, _ = numbered
-    with pytest.raises(ArgumentError, match="observe: expected dynamic"):
+    with pytest.raises(ArgumentError) as error:
         carlasc.label_motion(folder / "in", folder / "other", observe=FromScans(**options))
+    assert error.value.where == "observe"
     assert not (folder / "other").exists()
 
 

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from hashlib import blake2b
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +25,11 @@ from carlasc.groundtruth.from_scans.sequences import (
     with_estimated_poses,
 )
 from carlasc.groundtruth.options import FromScans
+from carlasc.groundtruth.reporting import digest_of_bytes
 from carlasc.motion.mounting import Mounting, find_mounting
 from carlasc.motion.options import PoseOptions
 from carlasc.motion.refinement import RefinedPoses
-from carlasc.running.processes import one_pool
+from carlasc.relabelling.copies import timed, write_in_stages
 from carlasc.running.spreading import Run, StepCounter
 from carlasc.storage import as_source, layout
 from carlasc.storage.derived_copies import (
@@ -45,11 +44,7 @@ from carlasc.storage.sinks import SequenceWriter
 
 _RUN = 60  # number of scans in a run, for the mounting of the sensor
 # words for poses in carlasc.json
-_ESTIMATED, _REFINED, _LEFT = (
-    "kiss-icp",
-    "refined",
-    "left as given",
-)
+_ESTIMATED, _REFINED, _LEFT = "kiss-icp", "refined", "left as given"
 
 
 @dataclass
@@ -115,27 +110,31 @@ def refine(
     for one in given.values():
         if not must_estimate(one, options):
             check_trajectory(one, options)
+    texts = [
+        f"{path}/{name}\0".encode(errors="surrogateescape") + one.read_document(name)
+        for path, one in given.items()
+        for name in sorted(one.documents())
+        if "/" not in name
+    ]
     copy = DerivedCopy.begin(
         source,
         out,
-        {"poses": vars(poses), "texts": _digest(given)},
+        {"poses": vars(poses), "texts": digest_of_bytes(b"\0".join(texts)).hex()},
         kind="refined poses",
         is_kind=_is_refined,
         overwrite=overwrite,
         run=run,
     )
+
+    def find(
+        path: str, writer: SequenceWriter | None, pool: Run, step: StepCounter
+    ) -> _RefinedSequence:
+        return _refine(given[path], options, writer, pool, step)
+
     scans = sum(len(one.frames("points")) for one in given.values())
-    files = sum(
-        len(one.frames(name)) for one in given.values() for name in one.fields() if "/" not in name
-    )
-    step, refined = StepCounter(run.progress, scans + files), dict[str, _RefinedSequence]()
-    with one_pool(run) as pool:
-        for path, one in given.items():
-            refined[path] = _refine(one, options, copy.writer(path), pool, step)
-        after = replace(pool, progress=step.stage(files))
-        copied = copy.write(refined, after)
+    refined, copied = write_in_stages(copy, given, find, run, scans=scans)
     return RefineResult(
-        **vars(copied) | {"elapsed_s": time.perf_counter() - began},
+        **timed(copied, began),
         refined=[path for path, one in refined.items() if one.scans],
         scans=sum(one.scans for one in refined.values()),
         notes=[f"{path or one.name or one.location}: {one.note}" for path, one in refined.items()],
@@ -155,20 +154,16 @@ class _RefinedSequence(DerivedSequence):
     ) -> None:
         estimated = posed is not whole and not corrected
         self.scans = len(change.refined) if corrected else int(change.refined.sum())
-        self.note = next(pose_notes(change, whole.frames("points")), None) or _left(change)
-        self.note = f"{corrected}; {self.note}" if corrected else self.note
-        said = whole.metadata.extra.get("poses")
+        notes = [corrected] if corrected else []
+        words = str(whole.metadata.extra.get("poses", _LEFT)).split(", ")
         if estimated:
-            said, self.note = (
-                _ESTIMATED,
-                f"poses were estimated from the scans ({_ESTIMATED}); {self.note}",
-            )
-        words = [] if said is None else [word for word in str(said).split(", ") if word != _LEFT]
-        words += [] if _REFINED in words else [_REFINED if self.scans else _LEFT]
-        metadata = replace(
-            whole.metadata, extra={**whole.metadata.extra, "poses": ", ".join(words)}
-        )
-        texts = {layout.METADATA: metadata.to_json()}
+            notes, words = [f"poses were estimated from the scans ({_ESTIMATED})"], [_ESTIMATED]
+        words = [word for word in words if word != _LEFT]
+        if _REFINED not in words:
+            words.append(_REFINED if self.scans else _LEFT)
+        self.note = "; ".join([*notes, *_notes(change, whole.frames("points"))])
+        extra = {**whole.metadata.extra, "poses": ", ".join(words)}
+        texts = {layout.METADATA: replace(whole.metadata, extra=extra).to_json()}
         if self.scans or estimated or corrected:
             texts[layout.POSES] = layout.encode_poses(_poses(posed, change))
         super().__init__(whole, texts)
@@ -179,7 +174,7 @@ def _refine(
     options: FromScans,
     writer: SequenceWriter | None,
     run: Run,
-    step: Callable[[int], None],
+    step: StepCounter,
 ) -> _RefinedSequence:
     """Refine the poses of a sequence, or read the result that an interrupted run kept with
     `writer`.
@@ -199,18 +194,11 @@ def _refine(
         change, poses=mounting.correct(change.given, seconds), refined=np.ones_like(change.refined)
     )
     corrected = with_refined_poses(posed, feed.frames, mounted)
-    change = refine_sequence(feed.under(corrected), writer, run)
-    wrong = [
-        f"{name} {value}"
-        for (name, value), is_wrong in zip(mounting.describe().items(), mounting.wrong, strict=True)
-        if is_wrong
-    ]
-    return _RefinedSequence(
-        sequence,
-        corrected,
-        change,
-        f"poses were corrected for the sensor in their frame: {', '.join(wrong)}",
-    )
+    change = refine_sequence(feed.with_poses_of(corrected), writer, run)
+    offsets = zip(mounting.describe().items(), mounting.wrong, strict=True)
+    wrong = ", ".join(f"{name} {value}" for (name, value), is_wrong in offsets if is_wrong)
+    note = f"poses were corrected for the sensor in their frame: {wrong}"
+    return _RefinedSequence(sequence, corrected, change, note)
 
 
 def _mounting(feed: ScanFeed, change: RefinedPoses) -> Mounting | None:
@@ -240,26 +228,16 @@ def _poses(posed: Sequence, change: RefinedPoses) -> NDArray[np.float64]:
     return poses
 
 
-def _left(change: RefinedPoses) -> str:
-    """Return the note on poses that were not changed."""
+def _notes(change: RefinedPoses, frames: NDArray[np.int64]) -> list[str]:
+    """Return the first note on the result of a refinement, or one on poses that did not change."""
+    if notes := list(pose_notes(change, frames)):
+        return notes[:1]
     before, _ = change.disagreements_m
-    if before is None:
-        return "poses left as they are: the distance between neighbouring scans is unknown"
-    return f"poses left as they are: neighbouring scans disagree by {100 * before:.1f} cm"
+    what = "the distance between neighbouring scans is unknown"
+    if before is not None:
+        what = f"neighbouring scans disagree by {100 * before:.1f} cm"
+    return [f"poses left as they are: {what}"]
 
 
 def _is_refined(metadata: Metadata) -> bool:
     return str(metadata.extra.get("poses")).rpartition(", ")[2] in (_REFINED, _LEFT)
-
-
-def _digest(sequences: Mapping[str, Sequence]) -> str:
-    """Return a digest of the text files of sequences."""
-    digest = blake2b(digest_size=16)
-    for path, one in sequences.items():
-        for name in sorted(name for name in one.documents() if "/" not in name):
-            digest.update(
-                f"{path}/{name}\0".encode(errors="surrogateescape")
-                + one.read_document(name)
-                + b"\0"
-            )
-    return digest.hexdigest()

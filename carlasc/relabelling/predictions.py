@@ -1,4 +1,5 @@
-"""Files of network predictions: a class per point, and optional probabilities.
+"""`label`: a copy of a data set with the labels of files of network predictions: a class per point,
+and optional probabilities.
 
 See `docs/commands/label.md`.
 """
@@ -6,22 +7,32 @@ See `docs/commands/label.md`.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlasc.core.classes import ClassTable
-from carlasc.core.frames import FrameRange
-from carlasc.core.tables import TABLES, table_from_json, to_table
+from carlasc.core.frames import FrameRange, Frames
+from carlasc.core.tables import TABLES, remaps_between, table_from_json, to_table
 from carlasc.errors import ArgumentError, FormatError, MissingDataError
-from carlasc.storage import layout
+from carlasc.relabelling.copies import (
+    PREDICTED_FIELDS,
+    LabelResult,
+    PredictedSequence,
+    begin_predicted,
+    digest_of_files,
+)
+from carlasc.running.spreading import Run
+from carlasc.storage import as_source, layout
 from carlasc.storage.arrays import NUMBERS, WHOLE_NUMBERS, ArrayFormat, open_npz, read_npy
+from carlasc.storage.derived_copies import sequences_with_scans
 from carlasc.storage.files import parse_json
-from carlasc.storage.protocol import Sequence
+from carlasc.storage.protocol import Sequence, Source
 
 SUFFIXES = (".label", ".npy", ".npz")
 _LEAVES = ("labels", "predictions")  # names of folders with the files of one sequence
@@ -29,6 +40,71 @@ _FLOATS = tuple(kind for kind in NUMBERS if kind not in WHOLE_NUMBERS)
 _TOLERANCE = 1e-3  # allowed deviation of the sum of probabilities of a point from 1
 _PAIRS = 3  # number of classes per point that are stored with their probabilities
 _NAMED = 5  # number of frames that a message lists
+
+
+def label(
+    source: str | os.PathLike[str] | Source,
+    out: str | os.PathLike[str],
+    predictions: str | os.PathLike[str],
+    *,
+    classes: str | os.PathLike[str] | ClassTable | None = None,
+    logits: bool = False,
+    by: str | None = None,
+    frames: Frames = None,
+    overwrite: bool = False,
+    run: Run = Run(),  # noqa: B008 (frozen)
+) -> LabelResult:
+    """Write a copy of a data set with the predicted labels of a network. The source is not changed.
+
+    Unchanged files are hard links to the files of the source, if both are folders of one file
+    system. Do not edit files of either in place; carlasc never does. Grids are left out, because
+    they were made from other labels. An interrupted run leaves `<out>.part`; the same call finishes
+    it.
+
+    Args:
+        source: the data set with the points: anything that `carlasc.open` takes, or a source.
+        out: the folder to write: a path, or a URL of an object store.
+        predictions: a folder with one file per frame, in folders such as `<split>/<sequence>/` or
+            `<sequence>/predictions/`; for a single sequence they may be in the folder itself.
+            `.label`: uint32 per point, of which the lower 16 bits are the class. `.npy`: (N,) class
+            ids, or (N, C) probabilities by class id. `.npz`: `labels` (N,), `probabilities` (N, C),
+            or both.
+        classes: class table of the predictions: its name, a JSON file, or a table. Labels are
+            converted to the table of the sequence if a remap exists; otherwise the result has the
+            table of the predictions. None: the table of each sequence.
+        logits: the predicted class scores are logits (before the softmax).
+        by: name of the network, for the metadata, reports and cards. None: the name of the folder
+            of predictions.
+        frames: range of frames that get labels; each needs a file. Other frames are copied without
+            labels.
+        overwrite: replace a data set at `out` that `label` has made.
+        run: how the work is distributed. Progress counts files.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ArgumentError: `classes` or `by` is not valid.
+        ConflictError: something exists at `out`, `out` lies inside `source`, or an interrupted run
+            had other predictions.
+        MissingDataError: a frame has no predictions.
+        FormatError: a file of predictions does not fit its scan or its class table.
+        StorageError: the files cannot be written.
+    """
+    began = time.perf_counter()
+    source, root = as_source(source), Path(predictions)
+    by = root.resolve().name if by is None else by
+    table = None if classes is None else read_table(classes)
+    chosen, scans = FrameRange.of(frames), sequences_with_scans(source)
+    files = find_predictions(root, scans, chosen)
+    sequences = {
+        path: _LabelledSequence(one, files[path], PredictionReader.of(table, one, logits), by)
+        for path, one in scans.items()
+    }
+    paths = (one.path(frame) for one in files.values() for frame in one.frames)
+    settings = {"frames": str(chosen), "logits": logits, "predictions": digest_of_files(paths)}
+    copy = begin_predicted(source, out, {**settings, "by": by}, table, overwrite, run)
+    return LabelResult.of(copy.write(sequences, run), began, by, sequences.values())
 
 
 @dataclass(frozen=True)
@@ -77,15 +153,13 @@ def find_predictions(
                 by_folder[parts] = PredictedFiles(Path(folder), suffix, tuple(numbers))
     result, lacking = {}, []
     for path, sequence in sequences.items():
+        # names of splits and coordinates that do not belong to the sequence
+        others = {*layout.SPLITS, *layout.COORDINATES} - {sequence.split, sequence.coordinates}
         matching = [
-            parts
-            for parts in by_folder
-            if sequence.name in parts and not _others(sequence) & set(parts)
+            parts for parts in by_folder if sequence.name in parts and not others & set(parts)
         ]
         if not matching and len(sequences) == 1:
-            matching = [
-                parts for parts in by_folder if parts in ((), *((leaf,) for leaf in _LEAVES))
-            ]
+            matching = [parts for parts in by_folder if "/".join(parts) in ("", *_LEAVES)]
         matching = [parts for parts in matching if parts and parts[-1] in _LEAVES] or matching
         if len(matching) != 1:
             folders = (
@@ -94,9 +168,8 @@ def find_predictions(
                 )
                 or "none"
             )
-            others = ", ".join(SUFFIXES[1:])
-            name = f"{sequence.name}/000000{SUFFIXES[0]}"
-            expected = f"one folder of files such as {name} ({others})"
+            expected = f"one folder of files such as {sequence.name}/000000{SUFFIXES[0]} "
+            expected += f"({', '.join(SUFFIXES[1:])})"
             raise (FormatError if matching else MissingDataError)(
                 root, expected=expected, found=folders
             )
@@ -119,11 +192,6 @@ def find_predictions(
     return result
 
 
-def _others(sequence: Sequence) -> set[str]:
-    """Return the names of splits and coordinates that do not belong to the sequence."""
-    return {*layout.SPLITS, *layout.COORDINATES} - {sequence.split or "", sequence.coordinates}
-
-
 def read_table(classes: str | os.PathLike[str] | ClassTable) -> ClassTable:
     """Return a class table, given as a table, its name, or a JSON file: a class table in the form
     of carlasc.json, or a carlasc.json.
@@ -132,8 +200,10 @@ def read_table(classes: str | os.PathLike[str] | ClassTable) -> ClassTable:
         ArgumentError: `classes` is neither a known name nor a file.
         FormatError: the file holds no class table.
     """
-    if isinstance(classes, ClassTable) or str(classes) in TABLES:
-        return classes if isinstance(classes, ClassTable) else TABLES[str(classes)]
+    if isinstance(classes, ClassTable):
+        return classes
+    if str(classes) in TABLES:
+        return TABLES[str(classes)]
     if not (path := Path(classes)).is_file():
         raise ArgumentError(
             "classes",
@@ -158,6 +228,20 @@ class PredictionReader:
     target: ClassTable
     logits: bool = False
 
+    @classmethod
+    def of(cls, given: ClassTable | None, sequence: Sequence, logits: bool) -> Self:
+        """Return a reader of predictions for a sequence.
+
+        It converts labels to the table of the sequence, if a remap from the given table exists.
+        """
+        own = sequence.metadata.classes
+        classes = given or own
+        try:
+            remaps_between(classes, own)
+        except ArgumentError:
+            return cls(classes, classes, logits)
+        return cls(classes, own, logits)
+
     def read(self, path: Path, count: int) -> tuple[NDArray[np.uint32], NDArray[np.uint16] | None]:
         """Return the (N,) labels of the `count` points of a scan, and the (N, 6) field
         `probabilities`, or None if the file has none.
@@ -179,10 +263,9 @@ class PredictionReader:
         if labels is None:
             raise FormatError(path, expected="labels or probabilities", found="neither")
         self.check(np.unique(labels), str(path))
-        converted = to_table(labels.astype(np.uint32), self.classes, self.target, str(path)).astype(
-            np.uint32
-        )
-        return converted, None if scores is None else self.pairs(scores, str(path))
+        converted = to_table(labels.astype(np.uint32), self.classes, self.target, str(path))
+        pairs = None if scores is None else self.pairs(scores, str(path))
+        return converted.astype(np.uint32), pairs
 
     def check(self, ids: NDArray[np.integer], where: str) -> None:
         """Check that the class table of the files contains the ids.
@@ -212,8 +295,8 @@ class PredictionReader:
         if wrong.any():
             row = int(wrong.argmax())
             found = f"a sum of {sums[row]:g} and a minimum of {shares[row].min():g} at point {row}"
-            total = f"sum to 1 within {_TOLERANCE} per point"
-            expected = f"class probabilities that are at least 0 and {total}"
+            expected = "class probabilities that are at least 0 and sum to 1 within "
+            expected += f"{_TOLERANCE} per point"
             advice = (
                 "" if self.logits else "give `logits=True` if these are scores before the softmax"
             )
@@ -247,14 +330,13 @@ def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
     """Return the labels, (N,) integers, and the scores, (N, C) floats, of a file; None for what it
     does not contain.
     """
-    labels: NDArray[Any] | None = None
-    scores: NDArray[Any] | None = None
     if path.suffix == ".npz":
+        forms = ArrayFormat(WHOLE_NUMBERS, (None,)), ArrayFormat(_FLOATS, (None, None))
         with open_npz(path) as archive:
-            if "labels" in archive.names:
-                labels = archive.read("labels", ArrayFormat(WHOLE_NUMBERS, (None,)))
-            if "probabilities" in archive.names:
-                scores = archive.read("probabilities", ArrayFormat(_FLOATS, (None, None)))
+            labels, scores = (
+                archive.read(name, form) if name in archive.names else None
+                for name, form in zip(("labels", "probabilities"), forms, strict=True)
+            )
         return labels, scores
     if path.suffix == ".npy":
         array = read_npy(path, ArrayFormat(NUMBERS, None))
@@ -273,3 +355,39 @@ def load(path: Path) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
             path, expected="a multiple of 4 bytes (uint32 per point)", found=str(len(data))
         )
     return np.frombuffer(data, "<u4") & np.uint32(0xFFFF), None
+
+
+class _LabelledSequence(PredictedSequence):
+    """A sequence with the labels of files of predictions.
+
+    Attributes:
+        files: the files of predictions.
+        reader: reads them.
+    """
+
+    def __init__(
+        self, whole: Sequence, files: PredictedFiles, reader: PredictionReader, by: str
+    ) -> None:
+        # all files are like the first
+        has_shares = bool(files.frames) and load(files.path(files.frames[0]))[1] is not None
+        made = PREDICTED_FIELDS[: 1 + has_shares] if files.frames else ()
+        super().__init__(
+            whole, reader.target, by, dict.fromkeys(made, np.array(files.frames, np.int64))
+        )
+        self.files, self.reader = files, reader
+
+    def make(self, frame: int) -> dict[str, NDArray[Any]]:
+        """Return the labels of a frame, and the probabilities if the files have them."""
+        path = self.files.path(frame)
+        labels, pairs = self.reader.read(path, len(self.whole.read("points", frame)))
+        if (pairs is not None) != ("probabilities" in self.made):
+            kinds = (
+                ("probabilities", "labels only") if pairs is None else ("labels", "probabilities")
+            )
+            raise FormatError(
+                path,
+                expected=f"{kinds[0]}, as in the first file",
+                found=kinds[1],
+                advice="predict all frames in the same form",
+            )
+        return {"labels": labels} | ({} if pairs is None else {"probabilities": pairs})

@@ -1,0 +1,742 @@
+"""The report of a grid: carlasc-report.json, which every run writes beside the grid, and the facts
+that it is made from, of each frame and of each moving actor.
+
+A frame is measured while it is made, or from its files if it exists already.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from hashlib import blake2b
+from itertools import groupby
+from typing import Any, Self, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlasc.core.classes import ClassTable
+from carlasc.core.geometry import Transform, invert, thin, transform_points
+from carlasc.core.grids import Grid, GridSpec, VoxelFlag
+from carlasc.core.plain import from_plain
+from carlasc.errors import FormatError, carlasc_version, reading
+from carlasc.motion.refinement import RefinedPoses
+from carlasc.storage import layout
+from carlasc.storage.files import parse_json, to_json
+
+# of one observation: points that are used, and points whose distance is measured
+_MOST_POINTS, _MOST_ASKED = (
+    600,
+    50,
+)
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How well an observation of an actor aligns with the next one.
+
+    Attributes:
+        moving_m: sum of the distances from points of one to the nearest points of the other, with
+            the motion removed, metres.
+        static_m: the same without removing the motion.
+        count: number of these points.
+    """
+
+    moving_m: float
+    static_m: float
+    count: int
+
+    @classmethod
+    def between(
+        cls,
+        one: NDArray[np.floating],
+        other: NDArray[np.floating],
+        world_T_actor: Transform,
+        world_T_next: Transform,
+    ) -> Residual:
+        """Compare two observations.
+
+        Args:
+            one: (N, 3) points of an observation, metres, world.
+            other: (M, 3) points of the next one.
+            world_T_actor: (4, 4) pose of the actor at the first observation.
+            world_T_next: (4, 4) its pose at the next one.
+        """
+        one, other = thin(one, _MOST_POINTS), thin(other, _MOST_POINTS)
+        static = _distances(one, other)
+        moving = _distances(
+            transform_points(invert(world_T_actor), one),
+            transform_points(invert(world_T_next), other),
+        )
+        return cls(float(moving.sum()), float(static.sum()), len(moving))
+
+
+@dataclass(frozen=True)
+class ActorTrack:
+    """A moving actor that was tracked.
+
+    Attributes:
+        label: name of its class.
+        instance: its number in the data; 0 if actors are not numbered.
+        first: frame of its first observation.
+        last: frame of its last observation.
+        observations: number of scans that see it.
+        points: number of its points in all observations.
+        speed_m_s: its median speed, metres per second.
+        size_m: length, width and height of its body, metres.
+        seen_m: length, width and height of its visible part, metres.
+        faces: number of its visible sides: front, rear, left and right.
+        residual_m: how well neighbouring observations align with the motion removed: mean distance
+            from a point of one to the nearest point of the one before or after, metres; None if
+            none were compared. It is at least the distance between neighbouring points.
+        residual_static_m: the same without removing the motion. With a correct motion, `residual_m`
+            is smaller.
+        confidence: probability that it is real, from 0 to 1; 1 for an actor of the data.
+    """
+
+    label: str
+    instance: int
+    first: int
+    last: int
+    observations: int
+    points: int
+    speed_m_s: float
+    size_m: tuple[float, float, float]
+    seen_m: tuple[float, float, float]
+    faces: int
+    residual_m: float | None
+    residual_static_m: float | None
+    confidence: float
+
+    @classmethod
+    def of(
+        cls, summary: Mapping[str, Any], residuals: Sequence[Residual], classes: ClassTable
+    ) -> ActorTrack:
+        """Return the actor that a summary of the tracks describes."""
+        count = sum(residual.count for residual in residuals)
+        same = ("instance", "first", "last", "points", "speed_m_s", "faces", "confidence")
+        return cls(
+            **{name: summary[name] for name in same},
+            label=classes.names.get(summary["label"], str(summary["label"])),
+            observations=summary["scans"],
+            size_m=tuple(summary["size_m"]),
+            seen_m=tuple(summary["seen_m"]),
+            residual_m=round(sum(r.moving_m for r in residuals) / count, 4) if count else None,
+            residual_static_m=round(sum(r.static_m for r in residuals) / count, 4)
+            if count
+            else None,
+        )
+
+
+def actors_of(
+    summaries: Sequence[Mapping[str, Any]],
+    residuals: Iterable[Mapping[int, Residual]],
+    classes: ClassTable,
+) -> tuple[ActorTrack, ...]:
+    """Return the moving actors, in order of their first observation.
+
+    Args:
+        summaries: the facts of each actor, by its number.
+        residuals: how well the observations in each frame align with the next ones, by number.
+        classes: class table of the labels.
+    """
+    by_actor: dict[int, list[Residual]] = {}
+    for frame in residuals:
+        for number, residual in frame.items():
+            by_actor.setdefault(number, []).append(residual)
+    actors = [
+        ActorTrack.of(s, by_actor.get(i, []), classes)
+        for i, s in enumerate(summaries)
+        if s["moves"]
+    ]
+    return tuple(sorted(actors, key=lambda actor: (actor.first, actor.label, actor.instance)))
+
+
+def _distances(one: NDArray[np.floating], other: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the distances from some points of each observation to the nearest point of the other,
+    metres.
+    """
+    nearest_m = []
+    for asked, others in ((one, other), (other, one)):
+        squares = np.square(thin(asked, _MOST_ASKED)[:, None] - others[None]).sum(axis=2)
+        nearest_m.append(np.sqrt(squares.min(axis=1)))
+    return np.concatenate(nearest_m)
+
+
+POWERS = 24
+"""Number of bins of the histogram of votes: 1, 2 to 3, 4 to 7, ..."""
+_DIGEST_BYTES = 16
+_DRIFT = 100  # number of scans over which a drift of the height is measured
+_SAMPLED = 40  # one of so many frames is made again without a tenth of the scans
+
+
+@dataclass(frozen=True)
+class Changes:
+    """How a grid changes if a tenth of the other scans is left out.
+
+    Attributes:
+        known: number of voxels that are known in both grids.
+        changed: how many of them have another label.
+    """
+
+    known: int
+    changed: int
+
+    @classmethod
+    def between(cls, grid: Grid, other: Grid) -> Changes:
+        """Compare two grids of the same geometry."""
+        both = grid.known & other.known
+        return cls(int(both.sum()), int((both & (grid.labels != other.labels)).sum()))
+
+
+@dataclass(frozen=True)
+class PoseFacts:
+    """How well neighbouring scans agree, and how their poses were refined.
+
+    Attributes:
+        before_m: mean distance of scans from the surfaces of their neighbours, under the given
+            poses, in metres; None if it is unknown.
+        after_m: the same under the poses that were used.
+        changed_m: (x, y, z) root mean square change of the motion from each scan to the next one,
+            in metres on the axes of the sensor.
+        changed_rad: (roll, pitch, yaw) the same for the rotation, in radians.
+        height_drift_m: greatest change of the difference between given and used height within 100
+            scans, in metres.
+        left: first and last frame of the stretches that keep the given motion.
+    """
+
+    before_m: float | None
+    after_m: float | None
+    changed_m: tuple[float, float, float]
+    changed_rad: tuple[float, float, float]
+    height_drift_m: float
+    left: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, refined: RefinedPoses, frames: NDArray[np.int64]) -> PoseFacts:
+        """Return the facts of refined poses; `frames` are the numbers of their frames."""
+        x, y, z, roll, pitch, yaw = np.sqrt(np.square(refined.changes()).mean(axis=0)).tolist()
+        off = refined.given[:, 2, 3] - refined.poses[:, 2, 3]
+        windows = np.lib.stride_tricks.sliding_window_view(off, min(_DRIFT, len(off)))
+        drift = float(np.ptp(windows, axis=1).max())
+        return cls(
+            *refined.disagreements_m, (x, y, z), (roll, pitch, yaw), drift, refined.left(frames)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFacts:
+    """The facts of one frame for a report.
+
+    Attributes:
+        frame: frame number.
+        digests: digest of each field's file, by the name of the field.
+        known: number of known voxels.
+        classes: (K,) int64 known voxels of each class, free space first.
+        votes: (POWERS,) int64 histogram of the votes of known voxels, by powers of two.
+        votes_sum: sum of these votes; 0 if the grid has no counts.
+        changes: how the grid changes if a tenth of the scans is left out; None if this was not
+            measured.
+        residuals: how well the observations of moving actors align with the next ones, by number of
+            the actor.
+        inferred: number of known voxels that were inferred, not seen; None if the grid does not
+            say.
+    """
+
+    frame: int
+    digests: Mapping[str, bytes]
+    known: int
+    classes: NDArray[np.int64]
+    votes: NDArray[np.int64]
+    votes_sum: float
+    changes: Changes | None = None
+    residuals: Mapping[int, Residual] = field(default_factory=dict)
+    inferred: int | None = None
+
+    @classmethod
+    def of(
+        cls,
+        frame: int,
+        arrays: Mapping[str, NDArray[Any]],
+        grid: str,
+        spec: GridSpec,
+        classes: ClassTable,
+        changes: Changes | None = None,
+        residuals: Mapping[int, Residual] | None = None,
+    ) -> FrameFacts:
+        """Measure a frame.
+
+        Args:
+            frame: frame number.
+            arrays: the fields of the frame, by name; those of the grid among them.
+            grid: name of the grid's folder.
+            spec: geometry of the grid.
+            classes: class table of the grid's labels.
+            changes: as in the attributes.
+            residuals: as in the attributes.
+
+        Raises:
+            FormatError: an array does not fit its field, or a label is not in the class table.
+        """
+        digests = {name: digest_of(name, array) for name, array in arrays.items()}
+        labels = np.asarray(arrays[f"{grid}/labels"]).reshape(-1)
+        counts = arrays.get(f"{grid}/counts")
+        votes, votes_sum = np.zeros(POWERS, np.int64), 0.0
+        if counts is not None:
+            seen = np.asarray(counts).reshape(-1)
+            labels, seen = labels[seen > 0], seen[seen > 0]
+            powers = np.clip(np.frexp(seen.astype(np.float32))[1] - 1, 0, POWERS - 1)
+            votes, votes_sum = (
+                np.bincount(powers, minlength=POWERS),
+                float(seen.sum(dtype=np.float64)),
+            )
+        # counting a label of 2**32 - 1 would take 32 GB
+        classes.check(labels, f"{grid}: frame {frame}")
+        by_class = np.bincount(labels, minlength=classes.num_channels)
+        inferred = _count_inferred(arrays.get(f"{grid}/flags"), counts)
+        return cls(
+            frame,
+            digests,
+            len(labels),
+            by_class,
+            votes,
+            votes_sum,
+            changes,
+            residuals or {},
+            inferred,
+        )
+
+
+def _count_inferred(flags: NDArray[Any] | None, counts: NDArray[Any] | None) -> int | None:
+    """Return the number of known voxels that were inferred, not seen; None if the grid does not
+    say.
+    """
+    if flags is None:
+        return None
+    inferred = (np.asarray(flags).reshape(-1) & int(VoxelFlag.INFERRED)) > 0
+    return int(
+        np.count_nonzero(
+            inferred if counts is None else inferred & (np.asarray(counts).reshape(-1) > 0)
+        )
+    )
+
+
+def sample_frames(numbers: Sequence[int]) -> frozenset[int]:
+    """Return the frames that are made again without a tenth of the scans.
+
+    The choice depends on the frame numbers, so that runs over parts of a sequence choose the same
+    frames. A short range has one such frame.
+    """
+    chosen = frozenset(n for n in numbers if n % _SAMPLED == _SAMPLED // 2)
+    return chosen or frozenset(numbers[len(numbers) // 2 :][:1])
+
+
+def digest_of(field: str, array: NDArray[Any]) -> bytes:
+    """Return the digest (BLAKE2b, 16 bytes) of a field of a frame: the digest of its published
+    file, for all stores.
+
+    Votes are compressed in their file, so their digest is that of their rows.
+
+    Raises:
+        FormatError: the array does not fit the field.
+    """
+    entry = layout.field_named(field)
+    data = (
+        np.ascontiguousarray(array).tobytes()
+        if entry.kind in ("votes", "velocities")
+        else entry.encode(array, field)
+    )
+    return digest_of_bytes(data)
+
+
+def digest_of_bytes(data: bytes | memoryview) -> bytes:
+    """Return the digest (BLAKE2b, 16 bytes) of the bytes of a file."""
+    return blake2b(data, digest_size=_DIGEST_BYTES).digest()
+
+
+REPORT_FORMAT = 1
+"""Version of carlasc-report.json: of its keys and their meaning."""
+LEFT_OUT = 0.1
+"""Share of the scans that is left out where convergence is measured."""
+_MOST_FRAMES = 10_000_000  # of a sequence: a small file must not fill the memory with frames
+_SHORT = 8  # hexadecimal digits of the digest of one frame
+_ABSENT = "-" * _SHORT
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """The voxels of all frames together.
+
+    Attributes:
+        voxels: number of voxels.
+        known: number of known voxels, which have at least one vote.
+        classes: number of known voxels of each class that occurs, by name; free space is the class
+            with id 0.
+        occupied: number of known voxels that are not free.
+        mean_votes: mean number of votes of a known voxel, the nearest to its number of views that a
+            grid keeps; None without counts.
+        votes: number of known voxels with 1 vote, 2 to 3, 4 to 7, and so on, up to the last bin
+            that is not empty.
+    """
+
+    voxels: int
+    known: int
+    classes: Mapping[str, int]
+    occupied: int
+    mean_votes: float | None
+    votes: tuple[int, ...]
+
+    @property
+    def known_share(self) -> float:
+        """Share of the voxels that are known."""
+        return self.known / self.voxels if self.voxels else 0.0
+
+    @property
+    def occupied_share(self) -> float:
+        """Share of the known voxels that are occupied."""
+        return self.occupied / self.known if self.known else 0.0
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How grids change if a tenth of the scans of other frames is left out, on some frames.
+
+    Attributes:
+        frames: number of frames on which this was measured.
+        known: number of voxels that are known with and without these scans.
+        changed: number of these with another label without the scans.
+    """
+
+    frames: int
+    known: int
+    changed: int
+
+    @property
+    def changed_share(self) -> float:
+        """Share of the voxels known in both whose label changes."""
+        return self.changed / self.known if self.known else 0.0
+
+
+@dataclass(frozen=True)
+class Digests:
+    """Digests (BLAKE2b) of one field.
+
+    Attributes:
+        all: 32 hexadecimal digits for the field as a whole.
+        frames: 8 digits for each frame of the report, in their order; "--------" for a frame
+            without the field.
+    """
+
+    all: str
+    frames: str
+
+    def of(self, row: int) -> str | None:
+        """Return the digits of the row-th frame of the report; None without the field."""
+        digits = self.frames[_SHORT * row : _SHORT * (row + 1)]
+        return None if digits == _ABSENT else digits
+
+
+@dataclass(frozen=True)
+class FileDigest:
+    """The digest of a text file and its size. poses.txt and times.txt may get more lines later, so
+    the size belongs to the digest.
+
+    Attributes:
+        size: size of the file, in bytes.
+        digest: digest of these bytes, 32 hexadecimal digits.
+    """
+
+    size: int
+    digest: str
+
+    @classmethod
+    def of(cls, data: bytes) -> Self:
+        """Return the digest of a file."""
+        return cls(len(data), digest_of_bytes(data).hex())
+
+    def matches(self, data: bytes) -> bool:
+        """Return whether a file starts with the bytes of the digest."""
+        return self.of(data[: self.size]) == self
+
+
+class _HeldOutRays(TypedDict):
+    """The scores of the rays of left-out scans in a grid; see `carlasc.inspection.RayShares`."""
+
+    returns: int
+    free: float | None
+    unknown: float | None
+    occupied: float | None
+    passed: float | None
+    passed_object: float | None
+    missed: float | None
+    error_median_m: float | None
+    error_90_m: float | None
+
+
+class _Swept(TypedDict):
+    """The score of the space that the vehicle drove through."""
+
+    occupied_share: float | None
+
+
+class _HeldOut(TypedDict):
+    """Held-out scores as JSON has them."""
+
+    rays: _HeldOutRays
+    by_class: Mapping[str, _HeldOutRays]
+    by_distance: Mapping[str, _HeldOutRays]
+    swept: _Swept
+
+
+@dataclass(frozen=True)
+class Report:
+    """The report of a grid of one sequence: its content, how it was made, and digests of its files.
+
+    Attributes:
+        grid: name of the grid's folder.
+        frames: numbers of the frames that the report covers, sorted.
+        settings: content of params.json.
+        coverage: known and occupied voxels, and their votes.
+        convergence: how grids change if scans are left out; None for grids that are not made from
+            scans.
+        actors: moving actors that were tracked; None if actors were not tracked.
+        poses: how well scans agree, and how their poses were refined; None if refinement is off.
+        inferred_share: share of the known voxels that were inferred, not seen; None if the grid
+            does not say.
+        holdout: held-out scores, as `carlasc.inspection.HeldOutScores.to_dict` returns them; None
+            if they were not measured.
+        digests: digests of each field beside the grid and of the grid, by name.
+        documents: digest of each text file that belongs to the grid, by name.
+        versions: versions of carlasc, NumPy, Numba and Python that made the report.
+    """
+
+    grid: str
+    frames: tuple[int, ...]
+    settings: Mapping[str, Any]
+    coverage: Coverage
+    convergence: Convergence | None
+    actors: tuple[ActorTrack, ...] | None
+    poses: PoseFacts | None
+    inferred_share: float | None
+    holdout: Mapping[str, Any] | None
+    digests: Mapping[str, Digests]
+    documents: Mapping[str, FileDigest]
+    versions: Mapping[str, str]
+
+    @classmethod
+    def make(
+        cls,
+        grid: str,
+        facts: Iterable[FrameFacts],
+        settings: Mapping[str, Any],
+        classes: ClassTable,
+        documents: Mapping[str, bytes],
+        *,
+        actors: Sequence[Mapping[str, Any]] | None = None,
+        poses: PoseFacts | None = None,
+        holdout: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """Make a report.
+
+        Args:
+            grid: name of the grid's folder.
+            facts: the facts of each frame, in any order.
+            settings: content of params.json.
+            classes: class table of the grid's labels.
+            documents: the text files that belong to the grid, by name.
+            actors: the facts of each actor, by number; None if actors were not tracked.
+            poses: as in the attributes.
+            holdout: as in the attributes.
+        """
+        rows = sorted(facts, key=lambda row: row.frame)
+        frames = tuple(row.frame for row in rows)
+        changes = [row.changes for row in rows if row.changes is not None]
+        names = sorted({name for row in rows for name in row.digests})
+        return cls(
+            grid=grid,
+            frames=frames,
+            settings=dict(settings),
+            coverage=_coverage(rows, settings, classes),
+            convergence=Convergence(
+                len(changes), sum(c.known for c in changes), sum(c.changed for c in changes)
+            )
+            if changes
+            else None,
+            actors=None
+            if actors is None
+            else actors_of(actors, (row.residuals for row in rows), classes),
+            poses=poses,
+            inferred_share=_inferred_share(rows),
+            holdout=holdout,
+            digests={name: _digests(rows, name) for name in names},
+            documents={name: FileDigest.of(data) for name, data in sorted(documents.items())},
+            versions=_versions(),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        coverage, convergence = self.coverage, self.convergence
+        own = f"{self.grid}/"
+        digests = {name: asdict(value) for name, value in self.digests.items()}
+        return {
+            "format": REPORT_FORMAT,
+            "grid": self.grid,
+            "frames": [list(span) for span in _spans(self.frames)],
+            "settings": dict(self.settings),
+            "coverage": {
+                **asdict(coverage),
+                "known_share": coverage.known_share,
+                "occupied_share": coverage.occupied_share,
+            },
+            "convergence": None
+            if convergence is None
+            else {
+                "left_out": LEFT_OUT,
+                **asdict(convergence),
+                "changed_share": convergence.changed_share,
+            },
+            "actors": None if self.actors is None else [asdict(actor) for actor in self.actors],
+            "poses": None if self.poses is None else asdict(self.poses),
+            "inferred_share": self.inferred_share,
+            "holdout": None if self.holdout is None else dict(self.holdout),
+            "inputs": {name: value for name, value in digests.items() if not name.startswith(own)},
+            "outputs": {name: value for name, value in digests.items() if name.startswith(own)},
+            "documents": {name: asdict(value) for name, value in self.documents.items()},
+            "versions": dict(self.versions),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], where: str = "report") -> Self:
+        """Return the report that `to_dict` describes; `where` is the file named in errors.
+
+        Raises:
+            FormatError: the values are not those of a report, or a newer version of carlasc wrote
+                them.
+        """
+        version = values.get("format")
+        if version != REPORT_FORMAT:
+            newer = isinstance(version, int) and version > REPORT_FORMAT
+            raise FormatError(
+                where,
+                expected=f"a report of format {REPORT_FORMAT}",
+                found=f"format {version}",
+                advice="upgrade carlasc" if newer else "make it again with `remake=True`",
+            )
+        with reading(where, "a report", "make it again with `remake=True`"):
+            GridSpec.from_params(values["settings"], where)
+            kinds: dict[str, Any] = {
+                "grid": str,
+                "settings": Mapping[str, Any],
+                "coverage": Coverage,
+                "convergence": Convergence | None,
+                "actors": tuple[ActorTrack, ...] | None,
+                "poses": PoseFacts | None,
+                "inferred_share": float | None,
+                "holdout": _HeldOut | None,
+                "inputs": Mapping[str, Digests],
+                "outputs": Mapping[str, Digests],
+                "documents": Mapping[str, FileDigest],
+                "versions": Mapping[str, str],
+            }
+            parts = {name: from_plain(values[name], kind, name) for name, kind in kinds.items()}
+            digests = {**parts.pop("inputs"), **parts.pop("outputs")}
+            return cls(frames=_frames(values["frames"]), digests=digests, **parts)
+
+    def to_json(self) -> bytes:
+        """Return the bytes of carlasc-report.json."""
+        return to_json(self.to_dict())
+
+    @classmethod
+    def from_json(cls, data: bytes, where: str) -> Self:
+        """Read carlasc-report.json; `where` is the file named in errors.
+
+        Raises:
+            FormatError: it holds something else.
+        """
+        return cls.from_dict(parse_json(data, where), where)
+
+
+def short(digest: bytes) -> str:
+    """Return the digits of the digest of a frame in `Digests.frames`."""
+    return digest.hex()[:_SHORT]
+
+
+def _coverage(rows: list[FrameFacts], settings: Mapping[str, Any], classes: ClassTable) -> Coverage:
+    by_class: NDArray[np.int64] = sum(
+        (row.classes for row in rows), start=np.zeros(classes.num_channels, np.int64)
+    )
+    votes = sum((row.votes for row in rows), start=np.zeros(1, np.int64))
+    known, total = sum(row.known for row in rows), sum(row.votes_sum for row in rows)
+    voxels = len(rows) * int(np.prod(settings["grid_size"], dtype=np.int64))
+    return Coverage(
+        voxels=voxels,
+        known=known,
+        classes={
+            classes.names.get(i, str(i)): int(by_class[i])
+            for i in np.flatnonzero(by_class).tolist()
+        },
+        occupied=known - int(by_class[0]),
+        mean_votes=round(total / known, 4) if known and total else None,
+        votes=tuple(np.trim_zeros(votes, "b").tolist()),
+    )
+
+
+def _inferred_share(rows: list[FrameFacts]) -> float | None:
+    """Return the share of the known voxels that were inferred; None if a frame does not say."""
+    counts, known = (
+        [row.inferred for row in rows if row.inferred is not None],
+        sum(row.known for row in rows),
+    )
+    return sum(counts) / known if known and len(counts) == len(rows) else None
+
+
+def _digests(rows: list[FrameFacts], name: str) -> Digests:
+    whole, frames = blake2b(digest_size=16), []
+    for row in rows:
+        digest = row.digests.get(name)
+        frames.append(_ABSENT if digest is None else short(digest))
+        if digest is not None:
+            whole.update(row.frame.to_bytes(8, "little") + digest)
+    return Digests(whole.hexdigest(), "".join(frames))
+
+
+def _versions() -> dict[str, str]:
+    import numba
+
+    return {
+        "carlasc": carlasc_version(),
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def _spans(frames: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Return half-open ranges of consecutive frame numbers."""
+    runs = [
+        [frame for _, frame in run]
+        for _, run in groupby(enumerate(frames), lambda pair: pair[1] - pair[0])
+    ]
+    return [(run[0], run[-1] + 1) for run in runs]
+
+
+def _frames(spans: Any) -> tuple[int, ...]:
+    """Return the frame numbers of half-open ranges.
+
+    Raises:
+        ValueError: the ranges are not valid, or have too many frames.
+    """
+    ranges = [
+        range(start, stop)
+        for start, stop in from_plain(spans, tuple[tuple[int, int], ...], "frames")
+    ]
+    if (
+        not all(0 <= span.start <= span.stop for span in ranges)
+        or sum(map(len, ranges)) > _MOST_FRAMES
+    ):
+        raise ValueError(
+            f"{len(ranges)} ranges of frames with negative numbers, or of more than {_MOST_FRAMES} "
+            f"frames"
+        )
+    return tuple(frame for span in ranges for frame in span)
